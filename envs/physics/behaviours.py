@@ -1,0 +1,92 @@
+"""Scripted behaviours of the bench: the expert, and a dial that bends it towards noise and chance.
+
+A behaviour sees the true state and returns one absolute 14-D command per control step.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.physics.tasks import Layout, Push
+
+Array = NDArray[np.float64]
+SPEED = 0.025  # m a gripper moves per control step at most
+_STANDOFF = 0.055  # m from block centre to fingertip centre when the push begins
+_LATERAL = 0.012  # m off the push line at which the gripper still counts as aligned
+
+
+class PushExpert:
+    """Go behind the block as seen from the target, then push through it, steering back onto the line at every step."""
+
+    def __init__(self, task: Push, layout: Layout):
+        self.task, self.layout = task, layout
+        self.behind = False
+
+    def fingertip(self, block: Array, tip: Array) -> Array:
+        """The next fingertip position [2] in metres of the near arm, from block and fingertip positions [2]."""
+        target = self.layout.target
+        gap = target - block
+        distance = float(np.hypot(*gap))
+        if distance < 0.012:
+            return tip  # there: stay
+        line = gap / max(distance, 1e-6)
+        normal = np.array([-line[1], line[0]])
+        offset = tip - block
+        along, across = float(offset @ line), float(offset @ normal)
+        reach = self.layout.block_half + 0.012
+        if self.behind and (along > -0.5 * reach or abs(across) > 0.03):
+            self.behind = False
+        if not self.behind and along < -reach and abs(across) < _LATERAL:
+            self.behind = True
+        if self.behind:
+            # Lead the block towards the line: push a little from the side it has drifted to.
+            goal = target - line * reach - normal * across * 1.5
+            speed = min(SPEED, 0.010 + 0.5 * distance)
+        elif along > -reach and abs(across) < self.layout.block_half + 0.03:
+            side = 1.0 if across >= 0 else -1.0  # beside or ahead of it: go round
+            goal = block + normal * side * (self.layout.block_half + 0.06) - line * 0.08
+            speed = SPEED
+        else:
+            goal = block - line * _STANDOFF
+            speed = SPEED
+        step = goal - tip
+        length = float(np.hypot(*step))
+        return tip + step * min(1.0, speed / max(length, 1e-9))
+
+
+class Behaviour:
+    """An episode's behaviour, from the expert (dial = 0) through noise to chance (dial = 1).
+
+    The dial scales a slowly varying offset on the commanded fingertip, shifts where the expert believes block
+    and target to be, and gives the chance that the whole episode follows random way-points near the block.
+
+    Args:
+        dial: 0 is the expert, 1 pays no heed to the task.
+    """
+
+    def __init__(self, task: Push, layout: Layout, dial: float, rng: np.random.Generator):
+        if not 0.0 <= dial <= 1.0:
+            raise ValueError(f"behaviour dial {dial} must lie in [0, 1]: 0 is the expert, 1 is random")
+        believed = layout
+        if dial > 0:
+            shift = rng.normal(0.0, 0.05 * dial, 2)
+            believed = Layout(**{**vars(layout), "target": layout.target + shift})
+        self.expert = PushExpert(task, believed)
+        self.layout, self.dial, self.rng = layout, dial, rng
+        self.drift = np.zeros(2)
+        self.bias = rng.normal(0.0, 0.05 * dial, 2)
+        self.random = dial >= 1.0
+        self.waypoint: Array | None = None
+
+    def fingertip(self, block: Array, tip: Array) -> Array:
+        """The next fingertip position [2] of the near arm in metres."""
+        if self.random:
+            if self.waypoint is None or np.hypot(*(self.waypoint - tip)) < 0.02 or self.rng.random() < 0.05:
+                self.waypoint = block + self.rng.normal(0.0, 0.09, 2)
+            step = self.waypoint - tip
+            goal = tip + step * min(1.0, SPEED / max(float(np.hypot(*step)), 1e-9))
+        else:
+            goal = self.expert.fingertip(block + self.bias, tip)
+        self.drift = 0.8 * self.drift + self.rng.normal(0.0, 0.008 * self.dial, 2)
+        return goal + self.drift

@@ -1,0 +1,71 @@
+"""Offscreen OpenGL: one context per process and picture size, shared by every bench of that process."""
+
+from __future__ import annotations
+
+import os
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+
+class MissingGL(RuntimeError):
+    """No usable OpenGL driver; the message says what to install."""
+
+
+class Offscreen:
+    """Renders any model that has the same assets as the one it was made with.
+
+    MuJoCo's own Renderer is tied to one model and makes one GL context each; a batch of benches would
+    exhaust the driver.
+
+    Raises:
+        MissingGL: if no EGL or OSMesa driver answers.
+    """
+
+    def __init__(self, model: mujoco.MjModel, size: tuple[int, int]):
+        height, width = size
+        try:
+            self._gl = mujoco.GLContext(width, height)
+            self._gl.make_current()
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
+        except Exception as error:
+            raise MissingGL(
+                f"OpenGL does not start with MUJOCO_GL={os.environ.get('MUJOCO_GL')} ({error}). "
+                "Install the software driver: apt-get install -y libegl1 libgl1-mesa-dri, "
+                "or set MUJOCO_GL=osmesa and install libosmesa6."
+            ) from error
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._scene = mujoco.MjvScene(model, maxgeom=200)
+        self._option = mujoco.MjvOption()
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+        self._pixels = np.empty((height, width, 3), np.uint8)
+
+    def render(self, model: mujoco.MjModel, data: mujoco.MjData, views: tuple[str, ...], shadows: bool) -> NDArray[np.uint8]:
+        """Pictures uint8 [V, 3, H, W] of the named cameras."""
+        self._gl.make_current()
+        height, width, _ = self._pixels.shape
+        out = np.empty((len(views), 3, height, width), np.uint8)
+        for k, view in enumerate(views):
+            self._camera.fixedcamid = model.camera(view).id
+            mujoco.mjv_updateScene(
+                model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
+            )
+            # Shadows cost eight times everything else, and updating the scene switches them on again.
+            self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+            mujoco.mjr_render(self._rect, self._scene, self._context)
+            mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
+            out[k] = self._pixels[::-1].transpose(2, 0, 1)
+        return out
+
+
+_CONTEXTS: dict[tuple[int, int], Offscreen] = {}
+
+
+def offscreen_for(model: mujoco.MjModel, size: tuple[int, int]) -> Offscreen:
+    """The process's context for pictures of `size` = (height, width), made at first use."""
+    if size not in _CONTEXTS:
+        _CONTEXTS[size] = Offscreen(model, size)
+    return _CONTEXTS[size]

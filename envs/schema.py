@@ -1,0 +1,97 @@
+"""Names and layouts that every part of Worldloop shares: TensorDict keys, action and state layouts, rewards.
+
+Keys are those of TorchRL's VLA stack (torchrl.data.vla) where one exists, so that its policies and losses plug in.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import torch
+from torch import Tensor
+from torchrl.data.vla import ACTION_CHUNK_KEY, IMAGE_KEY, INSTRUCTION_KEY, STATE_KEY
+
+ACTION_DIM = 14  # [x, y, z, roll, pitch, yaw, gripper] of the left, then the right arm; metres, radians, 0 open..1 closed
+STATE_DIM = 16  # [left joints 7, left gripper, right joints 7, right gripper]; radians, 0 open..1 closed
+GRIPPER_DIMS = (6, 13)
+
+CHUNK = ACTION_CHUNK_KEY  # ("vla_action", "chunk") float32 [B, K, 14]
+LOG_PROB = ("vla_action", "log_probs")  # float32 [B]
+IMAGE = IMAGE_KEY  # ("observation", "image") uint8 [B, V, 3, H, W]: the last frame of each view
+STATE = STATE_KEY  # ("observation", "state") float32 [B, 16]
+COMMAND = ("observation", "command")  # float32 [B, 14]: the absolute command now in force
+INSTRUCTION = INSTRUCTION_KEY  # "language_instruction": one string per episode
+INTRINSIC = ("camera", "intrinsic")  # float32 [B, V, 3, 3] pixels
+C2W = ("camera", "c2w")  # float32 [B, V, 4, 4] camera to world, OpenCV convention, at the last frame
+EPISODE = "episode_seed"  # int64 [B, 1]: episodes with equal seeds start from the same frame
+SUCCESS = "success"  # bool [B, 1]
+PROGRESS = "progress"  # float32 [B, 1] in 0..1
+JUDGE_STATUS = "judge_status"  # int64 [B, 1], see Status
+POSE_MAP = "pose_map"  # uint8 [B, K, V, 3, H, W], on the inverse path only
+CHUNK_C2W = "chunk_c2w"  # float32 [B, K, V, 4, 4], on the inverse path only
+FRAMES = ("world", "frames")  # uint8 [B, K, V, 3, H, W], between simulator and transforms only
+FEATURES = ("world", "features")  # float32 [B, F], between simulator and transforms only
+
+
+class Status(Enum):
+    """What a judge says of its own verdict; ERROR is never a zero reward, the episode is dropped and counted."""
+
+    OK = 0
+    ABSTAIN = 1
+    ERROR = 2
+
+
+class ActionMode(str, Enum):
+    """How the numbers of a chunk are meant.
+
+    RELATIVE: offsets from the command in force when the chunk starts (xyz and Euler angles added, gripper absolute).
+    ABSOLUTE: end-effector poses in the world frame.
+    """
+
+    RELATIVE = "relative"
+    ABSOLUTE = "absolute"
+
+
+def to_absolute(chunk: Tensor, command: Tensor, mode: ActionMode) -> Tensor:
+    """Absolute commands [..., K, 14] of a chunk [..., K, 14], given the command in force [..., 14]."""
+    if mode is ActionMode.ABSOLUTE:
+        return chunk
+    base = command.clone()
+    base[..., list(GRIPPER_DIMS)] = 0.0
+    return chunk + base.unsqueeze(-2)
+
+
+def to_relative(commands: Tensor, command: Tensor) -> Tensor:
+    """The inverse of `to_absolute` for ActionMode.RELATIVE."""
+    base = command.clone()
+    base[..., list(GRIPPER_DIMS)] = 0.0
+    return commands - base.unsqueeze(-2)
+
+
+def check_chunk(chunk: Tensor) -> None:
+    """Refuse chunks of the wrong width or with NaN.
+
+    Raises:
+        ValueError: naming what is wrong.
+    """
+    if chunk.shape[-1] != ACTION_DIM:
+        raise ValueError(f"an action chunk is [..., K, {ACTION_DIM}] = [x,y,z,roll,pitch,yaw,g]x2, got {tuple(chunk.shape)}")
+    if not torch.isfinite(chunk).all():
+        bad = int((~torch.isfinite(chunk)).sum())
+        raise ValueError(f"an action chunk holds {bad} values that are NaN or infinite; the policy has diverged")
+
+
+class Rewards:
+    """One reward for both worlds: progress gained in the chunk, plus a bonus when the episode succeeds.
+
+    Args:
+        progress: weight of the change of progress; summed over an episode it telescopes, so it cannot be farmed.
+        success: bonus at success.
+    """
+
+    def __init__(self, progress: float = 1.0, success: float = 1.0):
+        self.progress, self.success = progress, success
+
+    def __call__(self, before: Tensor, after: Tensor, success: Tensor) -> Tensor:
+        """Reward float32 [..., 1] from progress before and after [..., 1] and success bool [..., 1]."""
+        return self.progress * (after - before) + self.success * success.to(after.dtype)
