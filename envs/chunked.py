@@ -11,7 +11,8 @@ from tensordict import NonTensorData, NonTensorStack, TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Categorical, Composite, NonTensor, Unbounded
 from torchrl.envs import EnvBase
 
-from envs.schema import ACTION_DIM, EPISODE, INSTRUCTION, STATE_DIM, ActionMode
+from envs.language import VOCABULARY, WORDS, tokenize
+from envs.schema import ACTION_DIM, EPISODE, INSTRUCTION, STATE_DIM, TOKENS, ActionMode
 
 
 class ChunkedEnv(EnvBase):
@@ -62,6 +63,7 @@ class ChunkedEnv(EnvBase):
                 image=Bounded(0, 255, (*shape, views, 3, height, width), dtype=torch.uint8),
                 state=Unbounded((*shape, STATE_DIM)),
                 command=Unbounded((*shape, ACTION_DIM)),
+                tokens=Bounded(0, VOCABULARY - 1, (*shape, WORDS), dtype=torch.int64),
                 shape=shape,
             ),
             camera=Composite(
@@ -111,5 +113,6 @@ class ChunkedEnv(EnvBase):
 
     def _with_identity(self, out: TensorDict, instructions: Sequence[str]) -> TensorDict:
         out[EPISODE] = self._seeds.to(self.device).unsqueeze(-1)
+        out[TOKENS] = torch.stack([tokenize(text) for text in instructions]).to(self.device)
         out.set(INSTRUCTION, NonTensorStack(*[NonTensorData(text, device=self.device) for text in instructions]))
         return out

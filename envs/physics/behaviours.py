@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from envs.physics.tasks import Layout, Push
 
 Array = NDArray[np.float64]
-SPEED = 0.025  # m a gripper moves per control step at most
+SPEED = 0.022  # m a gripper moves per control step at most
 _STANDOFF = 0.055  # m from block centre to fingertip centre when the push begins
 _LATERAL = 0.012  # m off the push line at which the gripper still counts as aligned
 

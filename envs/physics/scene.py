@@ -13,7 +13,7 @@ ARMS = ("left", "right")
 VIEWS = ("head", "hand_left", "hand_right")
 FINGER_TRAVEL = 0.035  # m each finger moves from closed (gripper = 1) to open (gripper = 0)
 HOME = np.array([0.0, -0.35, 0.0, 2.1, 0.0, np.pi - 1.75, 0.0])  # joint posture the IK null space prefers
-BASE = {"left": (-0.30, 0.22), "right": (-0.30, -0.22)}
+BASE = {"left": (-0.28, 0.36), "right": (-0.28, -0.36)}
 
 # (name, offset from the parent body, hinge axis, range, actuator gain)
 _JOINTS = (
@@ -33,7 +33,7 @@ def _arm(side: str, colour: str) -> str:
     links = []
     for index, (name, pos, axis, rng, _) in enumerate(_JOINTS):
         length = 0.05 if index == 5 else (0.03 if index == 6 else 0.20)
-        radius = 0.055 - 0.004 * index
+        radius = 0.036 - 0.003 * index
         rgba = colour if index % 2 else "0.88 0.89 0.91 1"
         links.append(
             f'<body name="{side}_link{name}" pos="{pos}" gravcomp="1">'
@@ -48,11 +48,11 @@ def _arm(side: str, colour: str) -> str:
         for tag, sign in (("a", 1), ("b", -1))
     )
     return (
-        f'<body name="{side}_base" pos="{x} {y} 0"><geom type="cylinder" size="0.075 0.06" pos="0 0 0.06" rgba="0.35 0.36 0.40 1" class="link"/>'
+        f'<body name="{side}_base" pos="{x} {y} 0"><geom type="cylinder" size="0.06 0.06" pos="0 0 0.06" rgba="0.35 0.36 0.40 1" class="link"/>'
         + "".join(links)
         + f'<body name="{side}_flange" pos="0 0 0.03" quat="0 0 0 1" gravcomp="1"><site name="{side}_flange" size="0.004" rgba="0 0 0 0"/>'
-        f'<geom type="box" size="0.022 0.055 0.018" pos="0 0 0.045" rgba="{colour}" mass="0.3" class="link"/>'
-        f'<camera name="hand_{side}" pos="-0.085 0 0.02" xyaxes="0 1 0 0.906 0 -0.423" fovy="75"/>'
+        f'<geom type="box" size="0.016 0.040 0.014" pos="0 0 0.045" rgba="{colour}" mass="0.3" class="link"/>'
+        f'<camera name="hand_{side}" pos="0.09 0 -0.05" xyaxes="0 1 0 0.97 0 0.25" fovy="62"/>'
         + fingers
         + "</body>"
         + closing
@@ -101,7 +101,7 @@ def build_mjcf(timestep: float = 0.005) -> str:
     <geom name="table" type="box" size="0.55 0.62 0.02" pos="0.15 0 -0.02" rgba="0.72 0.60 0.46 1" friction="0.45 0.01 0.001" contype="1" conaffinity="3"/>
     <geom type="box" size="0.04 0.04 0.355" pos="0.60 0.52 -0.395" rgba="0.4 0.4 0.42 1" class="link"/>
     <geom type="box" size="0.04 0.04 0.355" pos="0.60 -0.52 -0.395" rgba="0.4 0.4 0.42 1" class="link"/>
-    <camera name="head" pos="-0.02 0 0.86" xyaxes="0 -1 0 0.943 0 0.333" fovy="48"/>
+    <camera name="head" pos="0.50 0 0.88" xyaxes="0 -1 0 0.956 0 -0.292" fovy="43"/>
     <camera name="beauty" pos="1.05 -0.75 0.70" xyaxes="0.62 0.785 0 -0.33 0.26 0.907" fovy="45"/>
     <site name="target" type="cylinder" size="0.04 0.0008" pos="0.3 0 0.0008" rgba="0.2 0.7 0.3 1"/>
     {_arm("left", "0.25 0.38 0.78 1")}

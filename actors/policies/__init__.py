@@ -1,0 +1,1 @@
+"""Policies: what turns views, state and words into chunks of actions."""

@@ -1,0 +1,77 @@
+"""Small image and word encoders that judges and policies share; positions survive them as soft key-points."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from envs.language import VOCABULARY
+
+
+class SpatialEncoder(nn.Module):
+    """Pictures to key-point coordinates and pooled features (Finn et al. 2016, spatial soft-argmax).
+
+    Args:
+        points: number of soft key-points.
+        width: channels at half resolution; twice as many at a quarter.
+
+    Forward takes float [B, 3, H, W] in -1..1 and returns float32 [B, 2 * points + 2 * width].
+    """
+
+    def __init__(self, points: int = 32, width: int = 32):
+        super().__init__()
+        self.stem = nn.Conv2d(3, width, 5, stride=2, padding=2)
+        self.mid = nn.Conv2d(width, 2 * width, 3, stride=2, padding=1)
+        self.deep = nn.Conv2d(2 * width, 2 * width, 3, padding=1)
+        self.norm1, self.norm2, self.norm3 = nn.GroupNorm(4, width), nn.GroupNorm(8, 2 * width), nn.GroupNorm(8, 2 * width)
+        self.fine = nn.Conv2d(width, width, 1)
+        self.heat = nn.Conv2d(2 * width, points, 1)
+        self.lift = nn.Conv2d(2 * width, width, 1)
+        self.heat_fine = nn.Conv2d(width, points, 3, padding=1)
+        self.temperature = nn.Parameter(torch.zeros(points))
+        self.out_features = 2 * points + 2 * width
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        x = F.silu(self.norm1(self.stem(pictures.contiguous(memory_format=torch.channels_last))))
+        y = F.silu(self.norm2(self.mid(x)))
+        y = y + F.silu(self.norm3(self.deep(y)))
+        # Coarse features say what it is, fine ones where exactly.
+        up = F.interpolate(self.lift(y), size=x.shape[-2:], mode="nearest")
+        heat = self.heat_fine(F.silu(self.fine(x) + up)).float()
+        height, width = heat.shape[-2:]
+        share = (heat.flatten(2) * self.temperature.exp()[None, :, None]).softmax(-1)
+        v = torch.linspace(-1, 1, height, device=heat.device)
+        u = torch.linspace(-1, 1, width, device=heat.device)
+        grid = share.unflatten(-1, (height, width))
+        points = torch.cat(((grid.sum(-2) * u).sum(-1), (grid.sum(-1) * v).sum(-1)), -1)
+        return torch.cat((points, y.float().mean((-2, -1))), -1)
+
+
+class PatchEncoder(nn.Module):
+    """A cheap encoder of a side view: float [B, 3, H, W] in -1..1 to float32 [B, out]."""
+
+    def __init__(self, out: int = 32, width: int = 16):
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(3, width, 8, stride=4, padding=2), nn.SiLU(), nn.Conv2d(width, 2 * width, 4, stride=4), nn.SiLU(), nn.AdaptiveAvgPool2d(4), nn.Flatten(), nn.Linear(32 * width, out)
+        )
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        return self.layers(pictures).float()
+
+
+class WordEncoder(nn.Module):
+    """Mean of word embeddings: tokens int64 [B, WORDS] to float32 [B, out]."""
+
+    def __init__(self, out: int = 32):
+        super().__init__()
+        self.table = nn.EmbeddingBag(VOCABULARY, out, mode="mean", padding_idx=0)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        return self.table(tokens)
+
+
+def to_signed(frames: Tensor) -> Tensor:
+    """uint8 pictures as float32 in -1..1."""
+    return frames.float().div(127.5).sub(1.0)

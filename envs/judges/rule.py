@@ -1,0 +1,34 @@
+"""The rule judge: the true distance between block and target, behind the interface of the learned one."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from envs.judges.base import Judge, Verdict, ok_status
+from envs.physics.tasks import Push
+
+
+class RuleJudge(Judge):
+    """Applies the task's own rule to true positions; can judge physics only.
+
+    Args:
+        task: whose radius and scale apply.
+    """
+
+    def __init__(self, task: Push | None = None):
+        self.task = task or Push()
+        super().__init__(threshold=0.5, hold=self.task.hold)
+
+    def score(self, frames: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
+        """See Judge.score.
+
+        Raises:
+            ValueError: without true positions, as in imagination.
+        """
+        if objects is None:
+            raise ValueError("judge=rule needs true object positions, which only physics has; use judge=learned for imagined video")
+        distance = (objects[..., 0, :2] - objects[..., 1, :2]).norm(dim=-1)
+        success = (distance < self.task.radius).float()
+        progress = (1 - distance / self.task.scale).clamp(0, 1)
+        return Verdict(success, progress, ok_status(torch.where(torch.isfinite(distance), success, torch.nan)))

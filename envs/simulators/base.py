@@ -1,0 +1,180 @@
+"""The contract of a learned world, and the sparse memory that every engine shares.
+
+A simulator is a function of explicit state: `reset` makes the state of a batch of sessions, `step` turns it and a
+chunk of commands into frames, features and the next state. The state is a TensorDict with one row per session, so
+resetting some sessions is a masked write, and all randomness comes from (session seed, chunk index).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from envs.episodes.clips import memory_indices
+
+
+@dataclass(frozen=True)
+class WorldShape:
+    """What a simulator shows.
+
+    Args:
+        views: number of cameras, V.
+        size: (height, width) of every view in pixels.
+        chunk: frames per step, K.
+        memory: sparse memory frames, M; the first frame is always one of them.
+        fps: frames per second.
+    """
+
+    views: int = 3
+    size: tuple[int, int] = (64, 64)
+    chunk: int = 8
+    memory: int = 4
+    fps: float = 10.0
+
+
+class Simulator(nn.Module):
+    """Base of all learned worlds; a subclass implements `predict`.
+
+    Args:
+        shape: what it shows.
+    """
+
+    feature_shape: tuple[int, ...]
+
+    def __init__(self, shape: WorldShape):
+        super().__init__()
+        self.shape = shape
+
+    # -- what a subclass gives -----------------------------------------------------------------------------------
+    def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
+        """Generate the frames of one chunk.
+
+        Args:
+            inputs: TensorDict [B] with memory (frames, pose_map uint8 [M, V, 3, H, W], c2w [M, V, 4, 4]),
+                future (pose_map uint8 [K, V, 3, H, W], c2w [K, V, 4, 4], commands [K, 14]), now (command [14], state [16]),
+                intrinsic [V, 3, 3], seed int64 [], chunk_index int64 [].
+
+        Returns:
+            frames float32 [B, K, V, 3, H, W] in 0..1 and features float32 [B, *feature_shape] for the state expert.
+        """
+        raise NotImplementedError
+
+    def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        """Training loss of a clip (see ClipStore.clips) and figures to log."""
+        raise NotImplementedError
+
+    # -- the contract --------------------------------------------------------------------------------------------
+    def reset(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor, command: Tensor, state: Tensor, pose_map: Tensor, seed: Tensor) -> TensorDict:
+        """Begin sessions from first frames.
+
+        Args:
+            frames: uint8 [B, V, 3, H, W].
+            intrinsic: [B, V, 3, 3] pixels; c2w: [B, V, 4, 4].
+            command: [B, 14] command in force; state: [B, 16] joint state.
+            pose_map: uint8 [B, V, 3, H, W] of that command.
+            seed: int64 [B].
+
+        Returns:
+            The sessions' state, a TensorDict [B].
+        """
+        size = frames.shape[:1]
+        return TensorDict(
+            {
+                "history": TensorDict(
+                    {"frames": frames[:, None], "pose_map": pose_map[:, None], "c2w": c2w[:, None].float(), "commands": command[:, None].float(), "states": state[:, None].float()},
+                    [*size, 1],
+                ),
+                "length": torch.ones(size, dtype=torch.int64, device=frames.device),
+                "intrinsic": intrinsic.float(),
+                "seed": seed.reshape(size),
+                "chunk_index": torch.zeros(size, dtype=torch.int64, device=frames.device),
+            },
+            size,
+        )
+
+    @torch.no_grad()
+    def step(self, state: TensorDict, commands: Tensor, pose_map: Tensor, c2w: Tensor) -> tuple[Tensor, Tensor, TensorDict]:
+        """Advance every session by one chunk; `state` is used up, its buffers go into the one returned.
+
+        Args:
+            commands: [B, K, 14] absolute; pose_map: uint8 [B, K, V, 3, H, W]; c2w: [B, K, V, 4, 4].
+
+        Returns:
+            frames uint8 [B, K, V, 3, H, W], features [B, *feature_shape], next state. The joint states of the new
+            frames are unknown here and repeat the last; the state expert fills them in (`remember_states`).
+        """
+        batch, count = commands.shape[:2]
+        rows = torch.arange(batch, device=commands.device)
+        length = state["length"]
+        memory = memory_indices(length, self.shape.memory)
+        history = state["history"]
+        now = history[rows, length - 1]
+        inputs = TensorDict(
+            {
+                "memory": history[rows[:, None], memory].select("frames", "pose_map", "c2w"),
+                "future": TensorDict({"pose_map": pose_map, "c2w": c2w, "commands": commands}, [batch]),
+                "now": TensorDict({"command": now["commands"], "state": now["states"]}, [batch]),
+                "intrinsic": state["intrinsic"],
+                "seed": state["seed"],
+                "chunk_index": state["chunk_index"],
+            },
+            [batch],
+        )
+        frames, features = self.predict(inputs)
+        pictures = (frames.clamp(0, 1) * 255).round().to(torch.uint8)
+        need = int(length.max()) + count
+        if need > history.shape[1]:  # room for twice as many chunks, so that long rollouts copy seldom
+            room = max(need, 2 * history.shape[1]) - history.shape[1]
+            history = torch.cat([history, torch.zeros_like(history[:, :1]).expand(batch, room).clone()], 1)
+        at = length[:, None] + torch.arange(count, device=length.device)
+        new = {"frames": pictures, "pose_map": pose_map, "c2w": c2w, "commands": commands, "states": now["states"][:, None].expand(-1, count, -1)}
+        for name, value in new.items():
+            history[name][rows[:, None], at] = value
+        state = TensorDict(
+            {"history": history, "length": length + count, "intrinsic": state["intrinsic"], "seed": state["seed"], "chunk_index": state["chunk_index"] + 1}, [batch]
+        )
+        return pictures, features.float(), state
+
+    @staticmethod
+    def remember_states(state: TensorDict, decoded: Tensor) -> None:
+        """Write the decoded joint states [B, K, 16] of the last chunk into the sessions' history."""
+        batch, count = decoded.shape[:2]
+        rows = torch.arange(batch, device=decoded.device)[:, None]
+        at = state["length"][:, None] - count + torch.arange(count, device=decoded.device)
+        state["history", "states"][rows, at] = decoded
+
+    @staticmethod
+    def recent(state: TensorDict, count: int) -> TensorDict:
+        """The last `count` commands and states [B, count, ...] of each session, the first repeated where there are fewer."""
+        length = state["length"]
+        rows = torch.arange(len(length), device=length.device)[:, None]
+        at = (length[:, None] - count + torch.arange(count, device=length.device)).clamp(min=0)
+        return state["history"][rows, at].select("commands", "states")
+
+    @staticmethod
+    def replace(state: TensorDict, mask: Tensor, fresh: TensorDict) -> TensorDict:
+        """The state with the sessions of `mask` [B] replaced by those of `fresh` (one row per True, in order)."""
+        capacity = state["history"].shape[1]
+        for name in ("length", "intrinsic", "seed", "chunk_index"):
+            state[name][mask] = fresh[name].to(state[name].dtype)
+        for name in state["history"].keys():
+            state["history", name][mask.nonzero().flatten(), 0] = fresh["history", name][:, 0]
+        assert capacity >= 1
+        return state
+
+
+def foreground_weight(frames: Tensor, gain: float) -> Tensor:
+    """Loss weights [..., 1, H, W] that lift whatever differs from the picture's median colour.
+
+    Block, target and grippers cover a few per cent of the pixels; unweighted losses are won by the table alone.
+
+    Args:
+        frames: float [..., 3, H, W] in 0..1.
+        gain: weight of a pixel that differs fully, above the 1 of the median colour.
+    """
+    median = frames.flatten(-2).median(-1).values[..., None, None]
+    deviation = (frames - median).abs().amax(-3, keepdim=True)
+    return 1.0 + gain * (deviation * 2.5).clamp(max=1.0)

@@ -1,0 +1,35 @@
+"""The contract of what decodes joint states from a simulator's features."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+class StateDecoder(nn.Module):
+    """Turns features and commands into joint states.
+
+    Args:
+        memory: frames of command and state history it reads.
+    """
+
+    def __init__(self, memory: int):
+        super().__init__()
+        self.memory = memory
+
+    def decode(self, features: Tensor, commands: Tensor, past_commands: Tensor, past_states: Tensor, seed: Tensor, chunk_index: Tensor) -> Tensor:
+        """Joint states of one chunk.
+
+        Args:
+            features: [B, *feature_shape] of the simulator.
+            commands: [B, K, 14] absolute; past_commands: [B, M, 14] and past_states: [B, M, 16] up to the chunk's start.
+            seed, chunk_index: int64 [B], all the randomness there is.
+
+        Returns:
+            float32 [B, K, 16].
+        """
+        raise NotImplementedError
+
+    def loss(self, features: Tensor, commands: Tensor, past_commands: Tensor, past_states: Tensor, truth: Tensor, valid: Tensor, generator: torch.Generator) -> Tensor:
+        """Training loss against true states [B, K, 16], where valid [B, K]."""
+        raise NotImplementedError

@@ -1,0 +1,17 @@
+"""What turns a bare WorldEnv into an environment for policies: conditioning, proprioception, reward."""
+
+from torchrl.envs import Compose
+
+from envs.judges import Judge
+from envs.schema import Rewards
+from envs.simulators.state_base import StateDecoder
+from envs.transforms.judge_reward import JudgeReward
+from envs.transforms.pose_map import PoseMapTransform
+from envs.transforms.state_expert import StateExpertTransform
+
+__all__ = ["JudgeReward", "PoseMapTransform", "StateExpertTransform", "world_transforms"]
+
+
+def world_transforms(decoder: StateDecoder, judge: Judge, rewards: Rewards, views: tuple[str, ...]) -> Compose:
+    """The three transforms in their order: commands to pose maps going in, joint states and rewards coming out."""
+    return Compose(PoseMapTransform(views), StateExpertTransform(decoder), JudgeReward(judge, rewards))

@@ -1,0 +1,39 @@
+"""The forward path's first half: joint states decoded from the simulator's features, for the policy to see."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import Transform
+
+from envs.schema import FEATURES, STATE
+from envs.simulators.state_base import StateDecoder
+
+
+class StateExpertTransform(Transform):
+    """Writes the decoded joint state of the last frame, and remembers all of the chunk's in the session.
+
+    Args:
+        decoder: trained on the simulator whose features it reads.
+    """
+
+    def __init__(self, decoder: StateDecoder):
+        super().__init__(in_keys=[FEATURES], out_keys=[STATE])
+        self.decoder = decoder
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        world = self.parent.base_env
+        session: TensorDict = world.session
+        count = world.chunk
+        recent = world.simulator.recent(session, self.decoder.memory + count)
+        history = recent[:, : self.decoder.memory]
+        with torch.no_grad():
+            states = self.decoder.decode(
+                next_tensordict[FEATURES], recent["commands"][:, -count:], history["commands"], history["states"], session["seed"], session["chunk_index"]
+            )
+        world.simulator.remember_states(session, states)
+        next_tensordict[STATE] = states[:, -1]
+        return next_tensordict
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return tensordict_reset  # the first state is real
