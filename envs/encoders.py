@@ -73,5 +73,5 @@ class WordEncoder(nn.Module):
 
 
 def to_signed(frames: Tensor) -> Tensor:
-    """uint8 pictures as float32 in -1..1."""
-    return frames.float().div(127.5).sub(1.0)
+    """uint8 pictures as float32 in -1..1; floats are taken to be so already."""
+    return frames if frames.is_floating_point() else frames.float().div(127.5).sub(1.0)

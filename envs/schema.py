@@ -5,6 +5,7 @@ Keys are those of TorchRL's VLA stack (torchrl.data.vla) where one exists, so th
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import Enum
 
 import torch
@@ -13,7 +14,6 @@ from torchrl.data.vla import ACTION_CHUNK_KEY, IMAGE_KEY, INSTRUCTION_KEY, STATE
 
 ACTION_DIM = 14  # [x, y, z, roll, pitch, yaw, gripper] of the left, then the right arm; metres, radians, 0 open..1 closed
 STATE_DIM = 16  # [left joints 7, left gripper, right joints 7, right gripper]; radians, 0 open..1 closed
-GRIPPER_DIMS = (6, 13)
 
 CHUNK = ACTION_CHUNK_KEY  # ("vla_action", "chunk") float32 [B, K, 14]
 LOG_PROB = ("vla_action", "log_probs")  # float32 [B]
@@ -46,7 +46,7 @@ class Status(Enum):
 class ActionMode(str, Enum):
     """How the numbers of a chunk are meant.
 
-    RELATIVE: offsets from the command in force when the chunk starts (xyz and Euler angles added, gripper absolute).
+    RELATIVE: offsets from the command in force when the chunk starts, added number by number (Euler angles and grippers too).
     ABSOLUTE: end-effector poses in the world frame.
     """
 
@@ -58,16 +58,12 @@ def to_absolute(chunk: Tensor, command: Tensor, mode: ActionMode) -> Tensor:
     """Absolute commands [..., K, 14] of a chunk [..., K, 14], given the command in force [..., 14]."""
     if mode is ActionMode.ABSOLUTE:
         return chunk
-    base = command.clone()
-    base[..., list(GRIPPER_DIMS)] = 0.0
-    return chunk + base.unsqueeze(-2)
+    return chunk + command.unsqueeze(-2)
 
 
 def to_relative(commands: Tensor, command: Tensor) -> Tensor:
     """The inverse of `to_absolute` for ActionMode.RELATIVE."""
-    base = command.clone()
-    base[..., list(GRIPPER_DIMS)] = 0.0
-    return commands - base.unsqueeze(-2)
+    return commands - command.unsqueeze(-2)
 
 
 def check_chunk(chunk: Tensor) -> None:
@@ -83,6 +79,7 @@ def check_chunk(chunk: Tensor) -> None:
         raise ValueError(f"an action chunk holds {bad} values that are NaN or infinite; the policy has diverged")
 
 
+@dataclass(frozen=True)
 class Rewards:
     """One reward for both worlds: progress gained in the chunk, plus a bonus when the episode succeeds.
 
@@ -91,8 +88,8 @@ class Rewards:
         success: bonus at success.
     """
 
-    def __init__(self, progress: float = 1.0, success: float = 1.0):
-        self.progress, self.success = progress, success
+    progress: float = 1.0
+    success: float = 1.0
 
     def __call__(self, before: Tensor, after: Tensor, success: Tensor) -> Tensor:
         """Reward float32 [..., 1] from progress before and after [..., 1] and success bool [..., 1]."""

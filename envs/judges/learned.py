@@ -32,7 +32,7 @@ class LearnedJudge(Judge):
 
     def forward(self, frames: Tensor, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Logits of success and of progress, float32 [N], for frames uint8 or float (-1..1) [N, V, 3, H, W] and tokens [N, WORDS]."""
-        pictures = to_signed(frames) if frames.dtype == torch.uint8 else frames
+        pictures = to_signed(frames)
         parts = [self.main(pictures[:, 0])] + [side(pictures[:, k + 1]) for k, side in enumerate(self.sides)]
         out = self.head(torch.cat([*parts, self.words(tokens)], -1)).float()
         return out[:, 0], out[:, 1]

@@ -62,6 +62,10 @@ class Simulator(nn.Module):
         """
         raise NotImplementedError
 
+    def features(self, inputs: TensorDict) -> Tensor:
+        """Only the features of `predict`, for training the state expert."""
+        return self.predict(inputs)[1]
+
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """Training loss of a clip (see ClipStore.clips) and figures to log."""
         raise NotImplementedError
@@ -167,14 +171,17 @@ class Simulator(nn.Module):
 
 
 def foreground_weight(frames: Tensor, gain: float) -> Tensor:
-    """Loss weights [..., 1, H, W] that lift whatever differs from the picture's median colour.
+    """Loss weights [..., 1, H, W] that lift whatever differs from the picture's median colour, most of all in hue.
 
-    Block, target and grippers cover a few per cent of the pixels; unweighted losses are won by the table alone.
+    Block and target cover one per cent of the pixels, arms ten; unweighted losses are won by the table alone, and
+    losses that ask for any difference by the arms.
 
     Args:
         frames: float [..., 3, H, W] in 0..1.
-        gain: weight of a pixel that differs fully, above the 1 of the median colour.
+        gain: weight of a pixel of a fully different hue, above the 1 of the median colour; a grey difference gets a quarter.
     """
     median = frames.flatten(-2).median(-1).values[..., None, None]
-    deviation = (frames - median).abs().amax(-3, keepdim=True)
-    return 1.0 + gain * (deviation * 2.5).clamp(max=1.0)
+    gap = frames - median
+    grey = gap.mean(-3, keepdim=True)
+    hue = (gap - grey).abs().amax(-3, keepdim=True)
+    return 1.0 + gain * ((hue * 4).clamp(max=1.0) + (grey.abs() * 2.5).clamp(max=1.0) / 4)

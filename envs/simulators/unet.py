@@ -1,7 +1,9 @@
 """The strong cheap engine: a U-Net that predicts a whole chunk in one deterministic pass.
 
-Each view is folded by its own stride (the head keeps more detail), memory and future pose maps ride along as
-channels, commands modulate every block, and the output is added to the last remembered frame.
+Each view is folded into channels (side views at half the detail), memory and future pose maps ride along as
+channels, and commands modulate every block. A pixel of the output is a soft choice between five sources: the last
+frame as it is, the last frame moved by a predicted flow, the first frame, the median colour, and a drawn colour.
+Things that move are then copied instead of remembered by the network, which learns far faster than a residual does.
 """
 
 from __future__ import annotations
@@ -23,16 +25,23 @@ class UNetConfig:
     """Size of the U-Net.
 
     Args:
-        strides: fold of each view; views of the finest stride are refined at that resolution, the others come from the bottleneck.
+        shrink: how much smaller each view is looked at and drawn; 1 is full detail, which the view that decides should have.
         width: channels at the fine level; the coarse level has twice as many.
         blocks: residual blocks per fine half, and in the bottleneck.
         foreground: extra loss weight of what differs from the median colour.
+        emphasis: loss weight of each view.
     """
 
-    strides: tuple[int, ...] = (4, 8, 8)
+    shrink: tuple[int, ...] = (1, 2, 2)
     width: int = 96
     blocks: tuple[int, int] = (2, 4)
     foreground: float = 8.0
+    emphasis: tuple[float, ...] = (1.0, 0.4, 0.4)
+
+
+_FOLD = 4  # pixels folded into channels, both ways
+_CHANNELS = 5 + 2 + 3  # logits of the sources, flow, drawn colour
+_REACH = 8.0  # pixels one unit of flow moves
 
 
 class _Block(nn.Module):
@@ -55,6 +64,26 @@ class _Block(nn.Module):
         return x + h
 
 
+def _compose(drawn: Tensor, last: Tensor, first: Tensor) -> Tensor:
+    """Frames [B, K, 3, H, W] from the output maps [B, K, 10, H, W] of one view and its last and first frame [B, 3, H, W]."""
+    batch, chunk, _, height, width = drawn.shape
+    share = drawn[:, :, :5].softmax(2)
+    v, u = torch.meshgrid(
+        torch.linspace(-1 + 1 / height, 1 - 1 / height, height, device=drawn.device),
+        torch.linspace(-1 + 1 / width, 1 - 1 / width, width, device=drawn.device),
+        indexing="ij",
+    )
+    flow = drawn[:, :, 5:7] * (2 * _REACH)
+    grid = torch.stack((u + flow[:, :, 0] / width, v + flow[:, :, 1] / height), -1)
+    # All frames of a chunk are sampled from one picture: stack them as rows of one tall grid.
+    moved = F.grid_sample(last, grid.flatten(1, 2), padding_mode="border", align_corners=False)
+    moved = moved.unflatten(2, (chunk, height)).transpose(1, 2)
+    median = first.flatten(2).median(-1).values[:, None, :, None, None]
+    colour = 0.5 + 0.5 * drawn[:, :, 7:10]
+    still, past = last[:, None], first[:, None]
+    return share[:, :, :1] * still + share[:, :, 1:2] * moved + share[:, :, 2:3] * past + share[:, :, 3:4] * median + share[:, :, 4:5] * colour
+
+
 class UNetSimulator(Simulator):
     """One-pass deterministic video predictor over all views; see UNetConfig.
 
@@ -66,15 +95,16 @@ class UNetSimulator(Simulator):
     def __init__(self, shape: WorldShape, config: UNetConfig | None = None):
         super().__init__(shape)
         self.config = config = config or UNetConfig()
-        if len(config.strides) != shape.views:
-            raise ValueError(f"simulator.strides has {len(config.strides)} entries for {shape.views} views; give one per view")
-        self.fine, self.coarse = min(config.strides), 2 * min(config.strides)
+        if len(config.shrink) != shape.views or len(config.emphasis) != shape.views:
+            raise ValueError(f"simulator.shrink and simulator.emphasis need one entry per view; there are {shape.views} views")
+        if not set(config.shrink) <= {1, 2}:
+            raise ValueError(f"simulator.shrink={list(config.shrink)} may hold 1 (full detail) and 2 (half) only")
         wide = 2 * config.width
         pictures = 3 * (2 * shape.memory + shape.chunk)  # memory frames and pose maps, future pose maps
         cond = 256
         self.feature_shape = (wide + cond,)
         self.actions = nn.Sequential(nn.Linear((shape.chunk + 1) * ACTION_DIM, cond), nn.SiLU(), nn.Linear(cond, cond))
-        self.embed = nn.ModuleList(nn.Conv2d(pictures * s * s, config.width if s == self.fine else wide, 1) for s in config.strides)
+        self.embed = nn.ModuleList(nn.Conv2d(pictures * _FOLD**2, config.width if s == 1 else wide, 1) for s in config.shrink)
         self.rays = nn.Conv2d(12 * shape.views, wide, 1)
         self.down = nn.Conv2d(config.width, wide, 2, stride=2)
         self.up = nn.Conv2d(wide, config.width * 4, 1)
@@ -84,27 +114,46 @@ class UNetSimulator(Simulator):
         self.deep = nn.ModuleList(_Block(wide, cond) for _ in range(deep))
         self.fine_out = nn.ModuleList(_Block(config.width, cond) for _ in range(fine))
         self.heads = nn.ModuleList(
-            nn.Sequential(nn.GroupNorm(8, w), nn.SiLU(), nn.Conv2d(w, 3 * shape.chunk * s * s, 1))
-            for s, w in ((s, config.width if s == self.fine else wide) for s in config.strides)
+            nn.Sequential(nn.GroupNorm(8, w), nn.SiLU(), nn.Conv2d(w, _CHANNELS * shape.chunk * _FOLD**2, 1))
+            for w in (config.width if s == 1 else wide for s in config.shrink)
         )
-        for head in self.heads:  # start from "nothing moves"; random output takes hundreds of steps to unlearn
+        for head in self.heads:
+            # Start from "nothing moves"; random output takes hundreds of steps to unlearn.
             nn.init.zeros_(head[-1].weight)
-            nn.init.zeros_(head[-1].bias)
+            bias = torch.zeros(shape.chunk, _CHANNELS, _FOLD**2)
+            bias[:, 0] = 3.0
+            head[-1].bias.data.copy_(bias.flatten())
 
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; features are the pooled bottleneck beside the action embedding."""
+        views, features = self.views(inputs)
+        return self._enlarge(views), features
+
+    def _enlarge(self, views: list[Tensor]) -> Tensor:
+        full = [
+            view if s == 1 else F.interpolate(view.flatten(0, 1), scale_factor=s, mode="bilinear", align_corners=False).unflatten(0, view.shape[:2])
+            for s, view in zip(self.config.shrink, views, strict=True)
+        ]
+        return torch.stack(full, 2)
+
+    def views(self, inputs: TensorDict) -> tuple[list[Tensor], Tensor]:
+        """Frames of each view [B, K, 3, H / shrink, W / shrink], not yet enlarged, and the features."""
         memory, future = inputs["memory"], inputs["future"]
-        batch, chunk = inputs.shape[0], self.shape.chunk
-        last = memory["frames"][:, -1].float() / 255
+        chunk = self.shape.chunk
         stack = torch.cat([memory["frames"], memory["pose_map"], future["pose_map"]], 1)  # uint8 [B, 2M+K, V, 3, H, W]
         relative = to_relative(future["commands"], inputs["now", "command"]) * 10.0  # decimetres
         cond = self.actions(torch.cat([relative.flatten(1), inputs["now", "command"]], 1))
         fine: list[Tensor] = []
         deep = [self.rays(self._rays(inputs))]
-        for view, (stride, embed) in enumerate(zip(self.config.strides, self.embed, strict=True)):
-            pictures = stack[:, :, view].flatten(1, 2).float().div_(127.5).sub_(1.0)
-            folded = F.pixel_unshuffle(pictures, stride).contiguous(memory_format=torch.channels_last)
-            (fine if stride == self.fine else deep).append(embed(folded))
+        ends: list[tuple[Tensor, Tensor]] = []
+        for view, (shrink, embed) in enumerate(zip(self.config.shrink, self.embed, strict=True)):
+            pictures = stack[:, :, view].flatten(1, 2).float().div_(255.0)
+            if shrink > 1:
+                pictures = F.avg_pool2d(pictures, shrink)
+            latest = 3 * (self.shape.memory - 1)
+            ends.append((pictures[:, :3], pictures[:, latest : latest + 3]))
+            folded = F.pixel_unshuffle(pictures * 2 - 1, _FOLD).contiguous(memory_format=torch.channels_last)
+            (fine if shrink == 1 else deep).append(embed(folded))
         x = torch.stack(fine).sum(0)
         for block in self.fine_in:
             x = block(x, cond)
@@ -115,16 +164,16 @@ class UNetSimulator(Simulator):
         for block in self.fine_out:
             x = block(x, cond)
         views = []
-        for view, (stride, head) in enumerate(zip(self.config.strides, self.heads, strict=True)):
-            change = F.pixel_shuffle(head(x if stride == self.fine else z), stride).float()
-            views.append(last[:, None, view] + change.unflatten(1, (chunk, 3)))
+        for shrink, head, (first, last) in zip(self.config.shrink, self.heads, ends, strict=True):
+            drawn = F.pixel_shuffle(head(x if shrink == 1 else z), _FOLD).float()
+            views.append(_compose(drawn.unflatten(1, (chunk, _CHANNELS)), last, first))
         features = torch.cat([z.float().mean((-2, -1)), cond.float()], 1)
-        return torch.stack(views, 2), features
+        return views, features
 
     def _rays(self, inputs: TensorDict) -> Tensor:
         """Ray maps [B, V * 12, h, w] of the last remembered and the last future frame at the bottleneck's resolution."""
         c2w = torch.stack([inputs["memory", "c2w"][:, -1], inputs["future", "c2w"][:, -1]], 2)  # [B, V, 2, 4, 4]
-        rays = render_ray_map(inputs["intrinsic"], c2w, self.shape.size, stride=self.coarse)
+        rays = render_ray_map(inputs["intrinsic"], c2w, self.shape.size, stride=2 * _FOLD)
         return rays.flatten(1, 3)
 
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
@@ -148,16 +197,23 @@ class UNetSimulator(Simulator):
             future = TensorDict({k: clip["future", k][:, part] for k in ("pose_map", "c2w", "commands")}, clip.shape)
             now = TensorDict({"command": command, "state": state}, clip.shape)
             inputs = TensorDict({"memory": memory, "future": future, "now": now, "intrinsic": clip["intrinsic"]}, clip.shape)
-            frames, _ = self.predict(inputs)
-            truth = clip["future", "frames"][:, part].float() / 255
-            weight = foreground_weight(truth, self.config.foreground)
-            weight = weight * clip["future", "valid"][:, part, None, None, None, None]
-            # An absolute error alone never leaves "nothing moves", the median of sparse change; squares do.
-            gap = frames - truth
-            error = gap.abs() + 50 * gap.square()
-            losses.append((error * weight).sum() / weight.sum().clamp(min=1) / 3)
-            pictures = (frames.detach().clamp(0, 1) * 255).round().to(torch.uint8)
-            drawn = pictures if drawn is None else torch.cat([drawn, pictures], 1)
+            views, _ = self.views(inputs)
+            valid = clip["future", "valid"][:, part, None, None, None]
+            error, norm = torch.zeros(()), torch.zeros(())
+            for view, (frames, shrink, emphasis) in enumerate(zip(views, self.config.shrink, self.config.emphasis, strict=True)):
+                truth = clip["future", "frames"][:, part, view].float() / 255
+                if shrink > 1:
+                    truth = F.avg_pool2d(truth.flatten(0, 1), shrink).unflatten(0, truth.shape[:2])
+                weight = foreground_weight(truth, self.config.foreground) * valid * emphasis
+                # An absolute error alone never leaves "nothing moves", the median of sparse change; squares do.
+                gap = frames - truth
+                error = error + ((gap.abs() + 50 * gap.square()) * weight).sum()
+                norm = norm + 3 * weight.sum()
+            losses.append(error / norm.clamp(min=1))
+            if number + 1 < chunks:
+                with torch.no_grad():
+                    pictures = (self._enlarge(views).clamp(0, 1) * 255).round().to(torch.uint8)
+                drawn = pictures if drawn is None else torch.cat([drawn, pictures], 1)
             command = clip["future", "commands"][:, part.stop - 1]
         total = torch.stack(losses).mean()
         return total, {"vision/first": losses[0].detach(), "vision/last": losses[-1].detach()}

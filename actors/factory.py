@@ -1,0 +1,173 @@
+"""Builds worlds and policies from the config, in any process: no code travels, only numbers and this module's name."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from safetensors.torch import load_file
+from torch import nn
+from torchrl.envs import TransformedEnv
+
+from actors.policies.vla import ChunkPolicy
+from envs.judges import LearnedJudge
+from envs.physics.bench import BenchConfig
+from envs.physics.env import PhysicsEnv
+from envs.schema import ActionMode, Rewards
+from envs.simulators.base import Simulator, WorldShape
+from envs.simulators.state_base import StateDecoder
+from envs.simulators.state_head import StateHead
+from envs.simulators.unet import UNetConfig, UNetSimulator
+from envs.transforms import world_transforms
+from envs.world import Starts, WorldEnv
+
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """A value in the config cannot work; the message names the key and the fix."""
+
+
+def options(kind: type[T], section: Mapping[str, Any], key: str) -> T:
+    """A dataclass from a config section; lists become tuples, unknown and missing keys are named.
+
+    Raises:
+        ConfigError: naming the config key.
+    """
+    known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
+    unknown = sorted(set(section) - known)
+    if unknown:
+        raise ConfigError(f"{key}.{unknown[0]} is not an option; {key} takes {sorted(known)}")
+    values = {name: tuple(value) if isinstance(value, list) else value for name, value in section.items()}
+    try:
+        return kind(**values)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{key}: {error}") from error
+
+
+def prepare_process(seed: int, threads: int = 0) -> None:
+    """Settings every process needs before heavy work: seeds, threads, and an allocator that keeps its memory.
+
+    Video batches are tens of megabytes; glibc would map and unmap them at every operation, and page faults then
+    cost more than arithmetic (twice the time per training step, measured).
+    """
+    torch.manual_seed(seed)
+    torch.set_num_threads(threads or os.cpu_count() or 1)
+    try:
+        libc = ctypes.CDLL("libc.so.6")
+    except OSError:
+        return  # another C library: slower, not wrong
+    trim, top_pad, mmap = -1, -2, -3
+    libc.mallopt(mmap, 2**31 - 1)
+    libc.mallopt(trim, 2**31 - 1)
+    libc.mallopt(top_pad, 2**26)
+
+
+def device_of(cfg: Mapping[str, Any]) -> torch.device:
+    """The device of simulators and learners.
+
+    Raises:
+        ConfigError: if launch.device asks for a GPU that is not there.
+    """
+    name = cfg["launch"]["device"]
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigError(f"launch.device={name}, but this machine has no CUDA device; use launch.device=cpu")
+    return torch.device(name)
+
+
+def bench_config(cfg: Mapping[str, Any]) -> BenchConfig:
+    """Options of the true world."""
+    task = cfg["task"]
+    return options(BenchConfig, {"task": task["name"], "control_hz": task["control_hz"], "size": task["size"], "views": task["views"]}, "task")
+
+
+def world_shape(cfg: Mapping[str, Any]) -> WorldShape:
+    """What every simulator of this config shows."""
+    task = cfg["task"]
+    return WorldShape(len(task["views"]), tuple(task["size"]), task["chunk"], cfg["simulator"]["memory"], task["control_hz"])
+
+
+def build_simulator(cfg: Mapping[str, Any], weights: Path | None = None) -> Simulator:
+    """The learned world of simulator.engine, with weights if given."""
+    engine, shape = cfg["simulator"]["engine"], world_shape(cfg)
+    section = cfg["simulator"]["model"]
+    if engine == "unet":
+        model: Simulator = UNetSimulator(shape, options(UNetConfig, section, "simulator.model"))
+        model = model.to(memory_format=torch.channels_last)
+    elif engine == "dit":
+        from envs.simulators.dit_world import DiTConfig, DiTSimulator
+
+        model = DiTSimulator(shape, options(DiTConfig, section, "simulator.model"))
+    else:
+        raise ConfigError(f"simulator.engine={engine!r} is unknown; choose unet or dit")
+    return load(model, weights).to(device_of(cfg))
+
+
+def build_state_decoder(cfg: Mapping[str, Any], simulator: Simulator, weights: Path | None = None) -> StateDecoder:
+    """What decodes joint states from that simulator's features."""
+    shape = simulator.shape
+    if cfg["simulator"]["engine"] == "unet":
+        decoder: StateDecoder = StateHead(simulator.feature_shape[0], shape.chunk, shape.memory)
+    else:
+        from envs.simulators.state_flow import StateExpert, StateExpertConfig
+
+        decoder = StateExpert(simulator.feature_shape, shape.chunk, shape.memory, options(StateExpertConfig, cfg["simulator"]["state"], "simulator.state"))
+    return load(decoder, weights).to(device_of(cfg))
+
+
+def build_judge(cfg: Mapping[str, Any], weights: Path | None = None) -> LearnedJudge:
+    """The learned judge."""
+    section = cfg["judge"]
+    judge = LearnedJudge(len(cfg["task"]["views"]), section["hold"], section["margin"], section["width"], section["points"])
+    return load(judge, weights).to(device_of(cfg))
+
+
+def build_policy(cfg: Mapping[str, Any], weights: Path | None = None) -> ChunkPolicy:
+    """The policy; it acts and learns on the CPU, for it is small."""
+    section = cfg["policy"]
+    policy = ChunkPolicy(len(cfg["task"]["views"]), cfg["task"]["chunk"], section["knots"], section["width"], section["points"], section["std"])
+    return load(policy, weights)
+
+
+def build_physics(cfg: Mapping[str, Any], batch: int, record: bool = False, seed: int = 0) -> PhysicsEnv:
+    """The true world."""
+    task = cfg["task"]
+    return PhysicsEnv(
+        bench_config(cfg), batch, task["chunk"], task["horizon"], ActionMode(task["mode"]), options(Rewards, cfg["judge"]["rewards"], "judge.rewards"), cfg["launch"]["workers"], record, seed
+    )
+
+
+def build_world(cfg: Mapping[str, Any], simulator: Simulator, decoder: StateDecoder, judge: LearnedJudge, starts: Starts, batch: int, seed: int = 0) -> TransformedEnv:
+    """The imagined world with its three transforms."""
+    task = cfg["task"]
+    simulator.eval(), decoder.eval(), judge.eval()
+    base = WorldEnv(simulator, starts, batch, task["horizon"], ActionMode(task["mode"]), cfg["simulator"]["shared_noise"], cfg["simulator"]["bf16"], seed)
+    rewards = options(Rewards, cfg["judge"]["rewards"], "judge.rewards")
+    return TransformedEnv(base, world_transforms(decoder, judge, rewards, tuple(task["views"])))
+
+
+def load(module: T, weights: Path | None) -> T:
+    """Load safetensors weights strictly.
+
+    Raises:
+        ConfigError: if the file is missing or of another architecture, naming the first differences.
+    """
+    if weights is None:
+        return module
+    assert isinstance(module, nn.Module)
+    if not weights.exists():
+        raise ConfigError(f"{weights} does not exist; run the stage that makes it")
+    found, wanted = load_file(weights), module.state_dict()
+    wrong = [f"{k}: file {tuple(found[k].shape)}, model {tuple(wanted[k].shape)}" for k in found.keys() & wanted.keys() if found[k].shape != wanted[k].shape]
+    missing, extra = sorted(wanted.keys() - found.keys()), sorted(found.keys() - wanted.keys())
+    if wrong or missing or extra:
+        raise ConfigError(f"{weights} is of another architecture: missing {missing[:4]}, unexpected {extra[:4]}, differing {wrong[:4]}. Use the config it was trained with (config.yaml beside it).")
+    module.load_state_dict({name: value.to(wanted[name].dtype) for name, value in found.items()})
+    return module  # type: ignore[return-value]

@@ -1,0 +1,100 @@
+"""PPO on chunks (Schulman et al. 2017): maximise E[min(r A, clip(r, 1-e, 1+e) A)] + c H, where A is GAE over chunks.
+
+One decision is one chunk, so advantages say which chunk of an episode was good. The critic is a small network on the
+features of the frozen start policy, which are computed once per batch; it costs next to nothing and cannot disturb
+the policy.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from actors.policies.vla import HIDDEN, ChunkPolicy
+from envs.schema import CHUNK, IMAGE, LOG_PROB, STATE, TOKENS
+from learners.rl import judged, transitions
+
+FEATURES = "critic_features"
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Options of PPO.
+
+    Args:
+        gamma, lam: discount per chunk and GAE's lambda.
+        clip: clipping of the likelihood ratio.
+        entropy: weight of the entropy bonus.
+        critic: weight of the value loss.
+        critic_width: hidden size of the value network.
+    """
+
+    gamma: float = 0.97
+    lam: float = 0.9
+    clip: float = 0.2
+    entropy: float = 0.0
+    critic: float = 1.0
+    critic_width: int = 256
+
+
+class PPO:
+    """See the module's docstring; an Algorithm of learners.rl."""
+
+    name = "ppo"
+
+    def __init__(self, policy: ChunkPolicy, config: PPOConfig):
+        self.policy, self.config = policy, config
+        self.encoder = copy.deepcopy(policy[0]).requires_grad_(False)
+        width = policy.head.mean.in_features
+        value = nn.Sequential(nn.Linear(width, config.critic_width), nn.SiLU(), nn.Linear(config.critic_width, config.critic_width), nn.SiLU(), nn.Linear(config.critic_width, 1))
+        self.critic = TensorDictModule(value, in_keys=[FEATURES], out_keys=["state_value"])
+        self.gae = GAE(gamma=config.gamma, lmbda=config.lam, value_network=self.critic, average_gae=False)
+        self.objective = ClipPPOLoss(
+            policy, self.critic, clip_epsilon=config.clip, entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy, critic_coeff=config.critic, normalize_advantage=True
+        )
+        self.objective.set_keys(action=CHUNK, sample_log_prob=LOG_PROB)
+        # The loss registers both as functional parameters; optimising the originals needs them in one place.
+        self._all = nn.ModuleList([policy, self.critic])
+
+    def modules(self) -> nn.Module:
+        """Policy and critic."""
+        return self._all
+
+    def seeds(self, starts: int, envs: int, generator: torch.Generator) -> list[int]:
+        """Random starts without repetition where there are enough; early endings go on with further ones."""
+        rounds = [torch.randperm(starts, generator=generator) for _ in range(1 + 3 * envs // max(1, starts))]
+        return torch.cat(rounds)[: 3 * envs].tolist()
+
+    def prepare(self, batch: TensorDict) -> tuple[TensorDict, dict[str, float]]:
+        """Advantages of all steps of the rollout, unfinished last episodes included: the critic stands in for their rest."""
+        for part in (batch, batch["next"]):
+            part[FEATURES] = self._features(part)
+        with torch.no_grad():
+            self.gae(batch)
+        value, target = batch["state_value"], batch["value_target"]
+        explained = 1 - (target - value).var() / target.var().clamp(min=1e-8)
+        data = transitions(batch, judged(batch), advantage=batch["advantage"], value_target=target, critic_features=batch[FEATURES], state_value=value)
+        return data, {"explained_variance": float(explained.clamp(min=-10.0)), "advantage_std": float(batch["advantage"].std())}
+
+    def _features(self, part: TensorDict) -> Tensor:
+        flat = TensorDict({key: part[key].flatten(0, 1) for key in (IMAGE, STATE, TOKENS)}, [part.numel()])
+        with torch.no_grad():
+            out = torch.cat([self.encoder(piece.clone(False))[HIDDEN] for piece in flat.split(512)])
+        return out.unflatten(0, part.shape)
+
+    def loss(self, minibatch: TensorDict) -> tuple[Tensor, dict[str, float]]:
+        """The clipped objective, the value loss and the entropy bonus."""
+        out = self.objective(minibatch)
+        total = out["loss_objective"] + out["loss_critic"]
+        figures = {"kl": float(out["kl_approx"]), "clip_fraction": float(out["clip_fraction"]), "critic_loss": float(out["loss_critic"].detach())}
+        if "loss_entropy" in out.keys():
+            total = total + out["loss_entropy"]
+            figures["entropy"] = float(out["entropy"])
+        return total, figures

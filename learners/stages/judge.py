@@ -1,0 +1,94 @@
+"""Stage: teach the judge on real frames, and on generated ones labelled by physics under the same actions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from envs.encoders import to_signed
+from envs.episodes.clips import ClipStore
+from envs.judges.base import frame_labels
+from envs.judges.learned import LearnedJudge
+from envs.language import tokenize
+from learners.fit import FitConfig, fit
+
+Imagine = Callable[[Tensor], tuple[Tensor, Tensor]]  # episodes [n] -> frames uint8 [n, T, V, 3, H, W], valid [n, T]; row 0 is real
+
+
+def episode_labels(store: ClipStore, hold: int) -> Tensor:
+    """Frame targets of every row of a store, float32 [rows]; see judges.base.frame_labels."""
+    out = torch.zeros(len(store.arrays["success"]))
+    for start, length in zip(store.start.tolist(), store.length.tolist(), strict=True):
+        out[start : start + length] = frame_labels(store.arrays["success"][None, start : start + length].float(), hold)[0]
+    return out
+
+
+def train_judge(
+    judge: LearnedJudge, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path, imagined: TensorDict | None = None
+) -> dict[str, float]:
+    """Train `judge` in place.
+
+    Args:
+        imagined: generated frames as a TensorDict [N] with frames uint8 [V, 3, H, W], tokens, label and progress; half of each batch.
+    """
+    labels = episode_labels(store, judge.hold)
+    rows = torch.cat([torch.arange(int(store.start[n]), int(store.start[n] + store.length[n])) for n in episodes.tolist()])
+    owner = torch.repeat_interleave(torch.arange(len(store)), store.length)
+    tokens = torch.stack([tokenize(row["instruction"]) for row in store.episodes])
+    share = float(labels[rows].mean().clamp(0.02, 0.98))
+    positive, negative = rows[labels[rows] > 0.5], rows[labels[rows] <= 0.5]
+
+    def batch(step: int, generator: torch.Generator) -> TensorDict:
+        real = options.batch if imagined is None else options.batch // 2
+        # A third of the batch is positive whatever the data's share is, so that no batch is without a success.
+        wanted = real // 3 if len(positive) else 0
+        at = [negative[torch.randint(len(negative), (real - wanted,), generator=generator)]]
+        if wanted:
+            at.append(positive[torch.randint(len(positive), (wanted,), generator=generator)])
+        chosen = torch.cat(at)
+        out = TensorDict(
+            {"frames": store.frames(chosen), "tokens": tokens[owner[chosen]], "label": labels[chosen], "progress": store.arrays["progress"][chosen].float()}, [len(chosen)]
+        )
+        if imagined is not None:
+            pick = torch.randint(len(imagined), (options.batch - real,), generator=generator)
+            out = torch.cat([out, imagined[pick]])
+        return out
+
+    def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
+        pictures = augment(to_signed(data["frames"]), generator)
+        return judge.loss(pictures, data["tokens"], data["label"], data["progress"], max(share, 0.3))
+
+    return fit("judge", judge, batch, loss, options, folder, watch="frame_accuracy")
+
+
+def augment(pictures: Tensor, generator: torch.Generator, strength: float = 0.08) -> Tensor:
+    """Colour gain and offset per picture and channel, alike in all views; pictures float [N, V, 3, H, W] in -1..1."""
+    draw = torch.rand((2, len(pictures), 1, 3, 1, 1), generator=generator).mul(2).sub(1).to(pictures.device)
+    return pictures * (1 + strength * draw[0]) + strength * draw[1]
+
+
+def calibrate(judge: LearnedJudge, success: Tensor, valid: Tensor, truth: Tensor) -> float:
+    """Set the judge's threshold to the one with the best balanced episode accuracy on held-out episodes.
+
+    Args:
+        success: frame probabilities [N, T]; valid: bool [N, T]; truth: bool [N].
+
+    Returns:
+        That accuracy.
+    """
+    best, chosen = -1.0, 0.5
+    for threshold in torch.linspace(0.1, 0.95, 35).tolist():
+        judge.threshold.fill_(threshold)
+        verdict = judge.episode(success, valid)
+        right = verdict == truth
+        parts = [right[truth == flag].float().mean() for flag in (True, False) if (truth == flag).any()]
+        accuracy = float(torch.stack(parts).mean())
+        if accuracy > best + 1e-6 or (abs(accuracy - best) <= 1e-6 and abs(threshold - 0.5) < abs(chosen - 0.5)):
+            best, chosen = accuracy, threshold
+    judge.threshold.fill_(chosen)
+    return best

@@ -1,0 +1,40 @@
+"""Stage: teach the state decoder to read joint states off the frozen simulator's features."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from envs.episodes.clips import ClipSpec, ClipStore
+from envs.simulators.base import Simulator
+from envs.simulators.state_base import StateDecoder
+from learners.fit import FitConfig, fit
+
+
+def train_state(decoder: StateDecoder, simulator: Simulator, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path) -> dict[str, float]:
+    """Train `decoder` in place; the simulator only looks on."""
+    shape = simulator.shape
+    simulator.eval().requires_grad_(False)
+
+    def batch(step: int, generator: torch.Generator) -> TensorDict:
+        return store.sample(episodes, options.batch, ClipSpec(shape.memory, shape.chunk), generator)
+
+    def loss(clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
+        memory = TensorDict({k: clip["memory", k][:, 0] for k in ("frames", "pose_map", "c2w")}, clip.shape)
+        seed = torch.randint(2**40, clip.shape, generator=generator).to(clip["begin"].device)
+        inputs = TensorDict(
+            {"memory": memory, "future": clip["future"], "now": clip["now"], "intrinsic": clip["intrinsic"], "seed": seed, "chunk_index": torch.zeros_like(seed)}, clip.shape
+        )
+        with torch.no_grad():
+            features = simulator.features(inputs)
+        future, history = clip["future"], clip["history"]
+        value = decoder.loss(features.float(), future["commands"], history["commands"], history["states"], future["states"], future["valid"].float(), generator)
+        return value, {}
+
+    stats = fit("state", decoder, batch, loss, options, folder)
+    simulator.requires_grad_(True)
+    return stats

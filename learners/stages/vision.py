@@ -1,0 +1,49 @@
+"""Stage: teach a simulator to continue videos, from true frames at first and from its own later."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from envs.episodes.clips import ClipSpec, ClipStore
+from envs.simulators.base import Simulator
+from learners.fit import FitConfig, fit
+
+
+@dataclass(frozen=True)
+class VisionConfig:
+    """Options of the vision stage.
+
+    Args:
+        alone: share of the steps that train on single chunks; the rest unrolls.
+        unroll: chunks predicted from own predictions after that; the batch shrinks so that a step costs the same.
+        strides: frame strides to draw from, uniformly.
+        fresh: share of each batch drawn from the newest data set, so that what the policy now does is seen often; 0 draws by size.
+    """
+
+    alone: float = 0.6
+    unroll: int = 4
+    strides: tuple[int, ...] = (1,)
+    fresh: float = 0.0
+
+
+def train_vision(simulator: Simulator, store: ClipStore, episodes: Tensor, config: VisionConfig, options: FitConfig, folder: Path, newest: Tensor | None = None) -> dict[str, float]:
+    """Train `simulator` in place on the given episodes of a store; `newest` are those that `fresh` speaks of."""
+    shape = simulator.shape
+
+    def batch(step: int, generator: torch.Generator) -> TensorDict:
+        chunks = 1 if step < config.alone * options.steps else config.unroll
+        stride = config.strides[int(torch.randint(len(config.strides), (1,), generator=generator))]
+        spec = ClipSpec(shape.memory, shape.chunk, chunks, stride)
+        count = max(1, options.batch // chunks)
+        recent = round(count * config.fresh) if newest is not None and len(newest) else 0
+        parts = [store.sample(episodes, count - recent, spec, generator)]
+        if recent and newest is not None:
+            parts.append(store.sample(newest, recent, spec, generator))
+        return torch.cat(parts) if len(parts) > 1 else parts[0]
+
+    return fit("vision", simulator, batch, simulator.loss, options, folder)

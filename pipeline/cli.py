@@ -1,0 +1,149 @@
+"""The command line. Every command takes Hydra overrides: worldloop run experiment=quickstart seed=1."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from actors.factory import ConfigError, build_physics, build_policy, prepare_process
+from envs.episodes.episode import EpisodeError
+from envs.physics.pool import PoolError
+from envs.physics.render import MissingGL
+from learners.fit import TrainingDiverged
+from pipeline import work
+from pipeline.config import load_config
+from pipeline.loop import build_loop
+from pipeline.statistics import rate_entry
+
+
+def _root(cfg: dict[str, Any]) -> Path:
+    return Path(cfg["runs"]) / cfg["name"]
+
+
+def run(words: list[str]) -> None:
+    """run the whole loop of an experiment; finished stages are reused, interrupted ones resume"""
+    from pipeline.track import publish
+
+    cfg = load_config(words)
+    prepare_process(cfg["seed"])
+    root = _root(cfg)
+    graph = build_loop(cfg, root)
+    print(f"{len(graph.stages)} stages in {root}; each says how long it will take after its first steps")
+    manifests = graph.run()
+    result = json.loads((root / "result.json").read_text())
+    tracked = publish(cfg, {name: graph.folder(name) for name in graph.stages}, result, root)
+    total = sum(m["seconds"] for m in manifests.values())
+    print(f"\n{result['verdict']}\n{root}/report.html, {root}/result.json; {total / 60:.1f} min of work" + (f"; wandb in {tracked}" if tracked else ""))
+
+
+def stage(words: list[str]) -> None:
+    """run one stage and what it needs: worldloop stage vision-1 experiment=quickstart"""
+    if not words or "=" in words[0]:
+        raise ConfigError("say which stage: worldloop stage imitation experiment=quickstart; `worldloop stages` lists them")
+    cfg = load_config(words[1:])
+    prepare_process(cfg["seed"])
+    graph = build_loop(cfg, _root(cfg))
+    if words[0] not in graph.stages:
+        raise ConfigError(f"no stage {words[0]}; choose from {list(graph.stages)}")
+    graph.run(words[0])
+
+
+def stages(words: list[str]) -> None:
+    """list the stages of an experiment, their folders, and which are finished"""
+    cfg = load_config(words)
+    graph = build_loop(cfg, _root(cfg))
+    for name in graph.stages:
+        folder = graph.folder(name)
+        print(f"{'done' if (folder / 'manifest.json').exists() else '    '}  {name:<18} {folder}")
+
+
+def evaluate(words: list[str]) -> None:
+    """success of a policy: worldloop evaluate policy=<folder|stage> world=physics|imagined experiment=..."""
+    from actors.evaluate import evaluate as episodes
+
+    own = {word.split("=", 1)[0]: word.split("=", 1)[1] for word in words if word.startswith(("policy=", "world="))}
+    cfg = load_config([word for word in words if word.split("=")[0] not in own])
+    graph = build_loop(cfg, _root(cfg))
+    name = own.get("policy", "imitation")
+    folder = graph.folder(name) if name in graph.stages else Path(name)
+    policy = build_policy(cfg, folder / "weights.safetensors")
+    prepare_process(cfg["seed"])
+    world = own.get("world", "physics")
+    if world == "physics":
+        env: Any = build_physics(cfg, cfg["evaluate"]["envs"])
+        seeds = work.seeds_of(cfg, work.EVALUATE, cfg["evaluate"]["episodes"])
+    elif world == "imagined":
+        last = cfg["rounds"]["count"]
+        data = ("collect", *(f"deploy-{n}" for n in range(1, last + 1)))
+        found = {stage: graph.folder(stage) for stage in graph.stages}
+        store = work.open_store(found, data)
+        seeds = list(range(min(cfg["evaluate"]["imagined"], len(store))))
+        env = work.load_world(cfg, found, store, f"vision-{last}", f"state-{last}", f"judge-{last}", min(64, len(seeds)))
+    else:
+        raise ConfigError(f"world={world!r} must be physics or imagined")
+    try:
+        outcome = episodes(env, policy, seeds, label=world)
+    finally:
+        env.close()
+    entry = rate_entry(outcome.success[outcome.judged])
+    print(f"{folder} in {world}: {entry['successes']}/{entry['episodes']} = {100 * outcome.rate:.1f}% [{100 * entry['low']:.1f}, {100 * entry['high']:.1f}], {int((~outcome.judged).sum())} dropped by the judge")
+
+
+def config(words: list[str]) -> None:
+    """print the resolved config"""
+    print(OmegaConf.to_yaml(OmegaConf.create(load_config(words))), end="")
+
+
+def bench(words: list[str]) -> None:
+    """measure performance: worldloop bench conditioning|physics|world"""
+    from pipeline.bench import run_bench
+
+    run_bench(words)
+
+
+def doctor(words: list[str]) -> None:
+    """say what this machine has and what is missing"""
+    from pipeline.doctor import examine
+
+    sys.exit(examine())
+
+
+def controls(words: list[str]) -> None:
+    """the same physics budget spent without a simulator: filtered BC on the data, and RL in physics"""
+    from pipeline.controls import run_controls
+
+    cfg = load_config(words)
+    prepare_process(cfg["seed"])
+    run_controls(cfg, _root(cfg))
+
+
+COMMANDS: dict[str, Callable[[list[str]], None]] = {f.__name__: f for f in (run, stage, stages, evaluate, controls, bench, config, doctor)}
+
+
+def _help() -> str:
+    lines = [f"  {name:<10} {function.__doc__}" for name, function in COMMANDS.items()]
+    return "worldloop <command> [key=value ...]\n\n" + "\n".join(lines) + "\n\nKeys are those of configs/; `worldloop config` prints them."
+
+
+def main() -> None:
+    """Entry point of `worldloop` and `python -m pipeline`."""
+    words = sys.argv[1:]
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(_help())
+        return
+    if words[0] not in COMMANDS:
+        print(f"no command {words[0]!r}\n\n{_help()}", file=sys.stderr)
+        sys.exit(2)
+    try:
+        COMMANDS[words[0]](words[1:])
+    except (ConfigError, EpisodeError, MissingGL, PoolError, TrainingDiverged, OSError) as error:
+        print(f"worldloop {words[0]}: {error}", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print("\ninterrupted; the same command goes on from the last checkpoint", file=sys.stderr)
+        sys.exit(130)

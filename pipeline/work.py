@@ -1,0 +1,356 @@
+"""What each stage of the loop does, given the config, its own folder and its parents' folders."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from tqdm import tqdm
+
+from actors.evaluate import evaluate
+from actors.factory import (
+    ConfigError,
+    bench_config,
+    build_judge,
+    build_physics,
+    build_policy,
+    build_simulator,
+    build_state_decoder,
+    build_world,
+    options,
+    prepare_process,
+)
+from envs.episodes import Episode, LeRobotDataset, LeRobotWriter
+from envs.episodes.clips import ClipStore
+from envs.language import tokenize
+from envs.physics.pool import BenchPool, Track
+from envs.simulators.replay import replay
+from envs.world import Starts
+from learners.factory import build_algorithm
+from learners.fit import FitConfig
+from learners.rl import RLConfig, train_rl
+from learners.stages.imitation import train_imitation
+from learners.stages.judge import calibrate, episode_labels, train_judge
+from learners.stages.state import train_state
+from learners.stages.vision import VisionConfig, train_vision
+from pipeline import measurement
+from pipeline.artefact import save_weights, write_text
+from pipeline.statistics import rate_entry
+
+Cfg = Mapping[str, Any]
+Found = Mapping[str, Path]
+
+# Episode seeds of different purposes never meet, whatever the experiment's own seed is.
+_SPACE = 10_000_000
+TRAIN, HELD_OUT, DEPLOY, EVALUATE = 0, 2_000_000, 4_000_000, 9_000_000
+
+
+def seeds_of(cfg: Cfg, purpose: int, count: int, offset: int = 0) -> list[int]:
+    """Episode seeds for a purpose. Evaluation seeds are the same for every experiment seed, so that runs can be compared."""
+    base = purpose if purpose == EVALUATE else purpose + _SPACE * (1 + cfg["seed"])
+    return list(range(base + offset, base + offset + count))
+
+
+def fit_options(cfg: Cfg, section: Mapping[str, Any], key: str) -> FitConfig:
+    """FitConfig of a section, seeded by the experiment."""
+    return options(FitConfig, {**section, "seed": cfg["seed"]}, key)
+
+
+# -- data ------------------------------------------------------------------------------------------------------------
+def collect(cfg: Cfg, folder: Path, found: Found, part: str) -> dict[str, Any]:
+    """Scripted episodes into a LeRobot data set; goes on after the last finished shard."""
+    section, task, bench = cfg["collect"], cfg["task"], bench_config(cfg)
+    total = section["episodes"] if part == "train" else section["held_out"]
+    seeds = seeds_of(cfg, TRAIN if part == "train" else HELD_OUT, total)
+    names = [name for name, share in section["mix"].items() for _ in range(round(100 * share))]
+    if len(names) != 100:
+        raise ConfigError(f"collect.mix={section['mix']} must add up to 1")
+    # Consecutive episodes mix all behaviours, so that any prefix of the data has the right proportions.
+    order = torch.randperm(100, generator=torch.Generator().manual_seed(0)).tolist()
+    jobs = []
+    for number, seed in enumerate(seeds):
+        behaviour = names[order[number % 100]]
+        low, high = section["noise"]
+        dial = {"expert": 0.0, "random": 1.0}.get(behaviour, low + (high - low) * ((number * 0.618) % 1.0))
+        jobs.append((seed, dial, behaviour))
+    writer = LeRobotWriter(folder / "dataset", bench.views, bench.size, task["control_hz"])
+    size = section["shard"]
+    pool = BenchPool(bench, 2 * (torch.get_num_threads()), task["horizon"], cfg["launch"]["workers"])
+    done = len(LeRobotDataset(writer.root)) if writer.shards else 0
+    try:
+        with tqdm(total=total, initial=done, desc=f"collect {part}", unit="ep", dynamic_ncols=True) as bar:
+            for begin in range(done, total, size):
+                batch = jobs[begin : begin + size]
+                tracks = pool.script([(seed, dial) for seed, dial, _ in batch])
+                writer.write([Episode.from_track(t, b, bench.views, task["control_hz"]) for t, (_, _, b) in zip(tracks, batch, strict=True)])
+                bar.update(len(batch))
+    finally:
+        pool.close()
+    store = ClipStore([writer.root])
+    return {"episodes": len(store), "frames": int(store.length.sum()), "successes": sum(row["success"] for row in store.episodes)}
+
+
+def deploy(cfg: Cfg, folder: Path, found: Found, number: int, episodes: int) -> dict[str, Any]:
+    """Episodes of the current stochastic policy in physics, recorded whole."""
+    (policy_folder,) = found.values()
+    policy = build_policy(cfg, policy_folder / "weights.safetensors")
+    seeds = seeds_of(cfg, DEPLOY, episodes, offset=100_000 * number)
+    data = folder / "dataset"
+    shutil.rmtree(data, ignore_errors=True)  # a deployment is short; half of one is begun anew
+    tracks = run_recorded(cfg, policy, seeds)
+    bench = bench_config(cfg)
+    writer = LeRobotWriter(data, bench.views, bench.size, cfg["task"]["control_hz"])
+    for begin in range(0, len(tracks), 100):
+        writer.write([Episode.from_track(track, f"policy-{number}", bench.views, cfg["task"]["control_hz"]) for track in tracks[begin : begin + 100]])
+    success = torch.tensor([bool(track.rows["success"][-1]) for track in tracks])
+    return {"episodes": len(tracks), "true_stochastic": rate_entry(success), "success": float(success.float().mean())}
+
+
+def run_recorded(cfg: Cfg, policy: Any, seeds: list[int], stochastic: bool = True) -> list[Track]:
+    """Recorded episodes of a policy in physics, in the order of the seeds."""
+    env = build_physics(cfg, batch=min(64, len(seeds)), record=True)
+    try:
+        tracks: dict[int, Track] = {}
+        for begin in range(0, len(seeds), env.batch_size[0]):
+            part = seeds[begin : begin + env.batch_size[0]]
+            evaluate(env, policy, part, stochastic=stochastic, label="deploy", sampling_seed=cfg["seed"] * 1000 + begin)
+            tracks |= {track.seed: track for track in env.pop_tracks()}
+    finally:
+        env.close()
+    return [tracks[seed] for seed in seeds]
+
+
+def open_store(found: Found, data: Iterable[str]) -> ClipStore:
+    """The data sets of several stages as one store."""
+    return ClipStore([found[name] / "dataset" for name in data])
+
+
+def split(store: ClipStore) -> tuple[Tensor, Tensor]:
+    """Training and held-out episodes: every eighth of a policy's episodes is kept from all training, for measuring."""
+    numbers = torch.arange(len(store))
+    kept = torch.tensor([row["behaviour"].startswith("policy") and row["seed"] % 8 == 0 for row in store.episodes])
+    return numbers[~kept], numbers[kept]
+
+
+# -- learning -----------------------------------------------------------------------------------------------------------
+def imitation(cfg: Cfg, folder: Path, found: Found) -> dict[str, Any]:
+    """Behaviour cloning of the first few expert episodes."""
+    store = open_store(found, found)
+    experts = store.select(["expert"], succeeded=True)[: cfg["imitation"]["demos"]]
+    if len(experts) < cfg["imitation"]["demos"]:
+        raise ConfigError(f"imitation.demos={cfg['imitation']['demos']}, but the data hold {len(experts)} successful expert episodes; raise collect.episodes or collect.mix.expert")
+    prepare_process(cfg["seed"])
+    policy = build_policy(cfg)
+    stats = train_imitation(policy, store, experts, cfg["task"]["chunk"], fit_options(cfg, cfg["imitation"]["fit"], "imitation.fit"), folder)
+    save_weights(policy, folder)
+    return {**stats, "demos": len(experts)}
+
+
+def tokenizer(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...]) -> dict[str, Any]:
+    """The DiT's video autoencoder."""
+    from learners.stages.tokenizer import train_tokenizer
+
+    store = open_store(found, data)
+    train, _ = split(store)
+    prepare_process(cfg["seed"])
+    simulator = build_simulator(cfg)
+    stats = train_tokenizer(simulator, store, train, fit_options(cfg, cfg["tokenizer"], "tokenizer"), folder)  # type: ignore[arg-type]
+    save_weights(simulator, folder)
+    return stats
+
+
+def vision(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], warm: tuple[str, ...], steps: str) -> dict[str, Any]:
+    """The simulator, from nothing in the first round and from its predecessor after that."""
+    section = dict(cfg["vision"][steps])
+    fit_section = section.pop("fit")
+    store = open_store(found, data)
+    train, _ = split(store)
+    newest = train[train >= len(store) - len(ClipStore([found[data[-1]] / "dataset"]))]
+    prepare_process(cfg["seed"])
+    simulator = build_simulator(cfg, found[warm[0]] / "weights.safetensors" if warm else None)
+    stats = train_vision(simulator, store, train, options(VisionConfig, section, f"vision.{steps}"), fit_options(cfg, fit_section, f"vision.{steps}.fit"), folder, newest)
+    save_weights(simulator, folder)
+    return {**stats, "parameters": sum(p.numel() for p in simulator.parameters())}
+
+
+def state(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, warm: str, steps: str) -> dict[str, Any]:
+    """The state decoder on the frozen simulator."""
+    store = open_store(found, data)
+    train, _ = split(store)
+    prepare_process(cfg["seed"])
+    simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
+    decoder = build_state_decoder(cfg, simulator, found[warm] / "weights.safetensors" if warm else None)
+    if not warm and hasattr(decoder, "normalise"):
+        rows = torch.cat([torch.arange(int(store.start[n]), int(store.start[n] + store.length[n])) for n in train.tolist()])
+        decoder.normalise(store.arrays["states"][rows])
+    stats = train_state(decoder, simulator, store, train, fit_options(cfg, cfg["state"][steps], f"state.{steps}"), folder)
+    save_weights(decoder, folder)
+    return stats
+
+
+def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, state: str, warm: str, steps: str) -> dict[str, Any]:
+    """The judge on real and on generated frames, its threshold calibrated on episodes neither it nor the simulator learned from."""
+    section = dict(cfg["judge_fit"][steps])
+    fit_section = section.pop("fit")
+    store = open_store(found, data)
+    train, held = split(store)
+    prepare_process(cfg["seed"])
+    simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
+    judge = build_judge(cfg, found[warm] / "weights.safetensors" if warm else None)
+    pick = train[torch.randperm(len(train), generator=torch.Generator().manual_seed(cfg["seed"]))[: section["imagined"]]]
+    imagined = None
+    if len(pick):
+        made = replay(simulator, store, pick, bf16=cfg["simulator"]["bf16"])
+        labels = episode_labels(store, judge.hold)
+        tokens = torch.stack([tokenize(store.episodes[n]["instruction"]) for n in pick.tolist()])
+        valid = made.valid.reshape(-1)
+        flat = made.rows.reshape(-1)[valid]
+        imagined = TensorDict(
+            {
+                "frames": made.frames.flatten(0, 1)[valid],
+                "tokens": tokens.repeat_interleave(made.valid.shape[1], 0)[valid],
+                "label": labels[flat],
+                "progress": store.arrays["progress"][flat].float(),
+            },
+            [int(valid.sum())],
+        )
+    stats = train_judge(judge, store, train, fit_options(cfg, fit_section, f"judge_fit.{steps}.fit"), folder, imagined)
+    if len(held):
+        made = replay(simulator, store, held, bf16=cfg["simulator"]["bf16"])
+        success = measurement.judge_frames(judge, made.frames, store, held)
+        truth = torch.tensor([store.episodes[n]["success"] for n in held.tolist()])
+        stats["calibrated_accuracy"] = calibrate(judge, success, made.valid, truth)
+    save_weights(judge, folder)
+    return {**stats, "threshold": float(judge.threshold)}
+
+
+def rl(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, state: str, judge: str, policy: str, iterations: int, number: int) -> dict[str, Any]:
+    """Reinforcement learning inside the simulator."""
+    prepare_process(cfg["seed"])
+    store = open_store(found, data)
+    actor = build_policy(cfg, found[policy] / "weights.safetensors")
+    settings = options(RLConfig, {**cfg["rl"], "iterations": iterations, "seed": cfg["seed"] * 100 + number}, "rl")
+    world = load_world(cfg, found, store, vision, state, judge, settings.envs)
+    stats = train_rl(world, actor, build_algorithm(cfg, actor), settings, folder, starts=len(store))
+    save_weights(actor, folder)
+    return {**{k: v for k, v in stats.items() if k != "last"}, **{f"last_{k}": v for k, v in stats["last"].items()}}
+
+
+def load_world(cfg: Cfg, found: Found, store: ClipStore, vision: str, state: str, judge: str, batch: int, episodes: Tensor | None = None) -> Any:
+    """The imagined world with the weights of three stages, starting where the store's episodes start."""
+    simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
+    decoder = build_state_decoder(cfg, simulator, found[state] / "weights.safetensors")
+    referee = build_judge(cfg, found[judge] / "weights.safetensors")
+    return build_world(cfg, simulator, decoder, referee, Starts.of(store, episodes), batch)
+
+
+# -- proof --------------------------------------------------------------------------------------------------------------
+def gap(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, state: str, judge: str, policy: str, number: int) -> dict[str, Any]:
+    """How far imagination and truth lie apart for the policy just deployed: same starts, same stochastic policy."""
+    store = open_store(found, data)
+    mine = store.select([f"policy-{number}"])
+    prepare_process(cfg["seed"])
+    actor = build_policy(cfg, found[policy] / "weights.safetensors")
+    world = load_world(cfg, found, store, vision, state, judge, min(64, len(mine)), mine)
+    outcome = evaluate(world, actor, list(range(len(mine))), stochastic=True, label="gap", sampling_seed=cfg["seed"])
+    truth = torch.tensor([store.episodes[n]["success"] for n in mine.tolist()])
+    said = outcome.success[outcome.judged]
+    result = {"round": number, "true": rate_entry(truth), "imagined": rate_entry(said), "gap": float(said.float().mean() - truth.float().mean())}
+    _, held = split(store)
+    if len(held):
+        simulator = world.base_env.simulator
+        made = replay(simulator, store, held, bf16=cfg["simulator"]["bf16"])
+        referee = build_judge(cfg, found[judge] / "weights.safetensors")
+        result["replayed"] = measurement.judge_table(referee, made.frames, made.valid, store, held)
+    return result
+
+
+def evaluate_physics(cfg: Cfg, folder: Path, found: Found, policy: str) -> dict[str, Any]:
+    """Deterministic success in physics on the held-out seeds."""
+    actor = build_policy(cfg, found[policy] / "weights.safetensors")
+    env = build_physics(cfg, cfg["evaluate"]["envs"])
+    began = time.perf_counter()
+    try:
+        outcome = evaluate(env, actor, seeds_of(cfg, EVALUATE, cfg["evaluate"]["episodes"]), label="physics")
+    finally:
+        env.close()
+    torch.save({"success": outcome.success, "progress": outcome.progress}, folder / "outcomes.pt")
+    return {"rate": outcome.rate, **rate_entry(outcome.success), "progress": float(outcome.progress.mean()), "evaluation_seconds": time.perf_counter() - began}
+
+
+def evaluate_imagined(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, state: str, judge: str, before: str, after: str) -> dict[str, Any]:
+    """Deterministic success in imagination, from the starts of the data, for both policies in the last world."""
+    store = open_store(found, data)
+    count = min(cfg["evaluate"]["imagined"], len(store))
+    world = load_world(cfg, found, store, vision, state, judge, min(64, count))
+    out: dict[str, Any] = {}
+    for label, name in (("before", before), ("after", after)):
+        outcome = evaluate(world, build_policy(cfg, found[name] / "weights.safetensors"), list(range(count)), label=f"imagined {label}")
+        out[label] = {**rate_entry(outcome.success[outcome.judged]), "dropped": int((~outcome.judged).sum())}
+    return out
+
+
+def measure(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, state: str, judge: str, held_out: str) -> dict[str, Any]:
+    """Rollout error, state error, speed and the judge's tables on held-out episodes of every kind."""
+    prepare_process(cfg["seed"])
+    simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
+    decoder = build_state_decoder(cfg, simulator, found[state] / "weights.safetensors")
+    referee = build_judge(cfg, found[judge] / "weights.safetensors")
+    scripted = ClipStore([found[held_out] / "dataset"])
+    store = open_store(found, data)
+    groups = {name: (scripted, scripted.select([name])) for name in ("expert", "noisy", "random")}
+    groups["on-policy"] = (store, split(store)[1])
+    result: dict[str, Any] = {"rollout": {}, "judge": {}}
+    for name, (source, episodes) in groups.items():
+        if not len(episodes):
+            continue
+        made = replay(simulator, source, episodes, decoder, bf16=cfg["simulator"]["bf16"])
+        result["rollout"][name] = measurement.rollout_error(source, episodes, made)
+        real = source.frames(made.rows)
+        result["judge"][name] = {
+            "physics video": measurement.judge_table(referee, real, made.valid, source, episodes),
+            "simulator rollouts": measurement.judge_table(referee, made.frames, made.valid, source, episodes),
+        }
+    result["frames_per_second"] = {f"batch {n}": measurement.speed(simulator, scripted, n, cfg["measure"]["speed_chunks"]) for n in (1, 32)}
+    return result
+
+
+def videos(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, state: str, judge: str, held_out: str, before: str, after: str) -> dict[str, Any]:
+    """Paired videos: the policy in physics, and the same actions in the simulator."""
+    from pipeline.media import paired_video
+
+    prepare_process(cfg["seed"])
+    simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
+    seeds = seeds_of(cfg, EVALUATE, cfg["measure"]["videos"])
+    names = []
+    for label, name in (("before", before), ("after", after)):
+        tracks = run_recorded(cfg, build_policy(cfg, found[name] / "weights.safetensors"), seeds, stochastic=False)
+        bench = bench_config(cfg)
+        data_folder = folder / f"dataset-{label}"
+        shutil.rmtree(data_folder, ignore_errors=True)
+        LeRobotWriter(data_folder, bench.views, bench.size, cfg["task"]["control_hz"]).write([Episode.from_track(t, f"policy-{label}", bench.views, cfg["task"]["control_hz"]) for t in tracks])
+        store = ClipStore([data_folder])
+        made = replay(simulator, store, torch.arange(len(store)), bf16=cfg["simulator"]["bf16"])
+        for number, row in enumerate(store.episodes):
+            path = folder / "media" / f"{label}-{row['seed']}.mp4"
+            paired_video(path, store, number, made, f"{label}: {'success' if row['success'] else 'failure'}")
+            names.append(path.name)
+    return {"videos": names}
+
+
+def report(cfg: Cfg, folder: Path, found: Found, rounds: int, root: Path) -> dict[str, Any]:
+    """result.json and report.html of the whole run."""
+    from pipeline.report import build_report, build_result
+
+    result = build_result(cfg, found, rounds)
+    write_text(root / "result.json", json.dumps(result, indent=1, default=float))
+    build_report(cfg, found, result, rounds, root / "report.html")
+    shutil.copy(root / "report.html", folder / "report.html")
+    return {"verdict": result["verdict"]}
