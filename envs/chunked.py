@@ -7,12 +7,12 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
-from tensordict import NonTensorData, NonTensorStack, TensorDict, TensorDictBase
-from torchrl.data import Binary, Bounded, Categorical, Composite, NonTensor, Unbounded
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from envs.language import VOCABULARY, WORDS, tokenize
-from envs.schema import ACTION_DIM, EPISODE, INSTRUCTION, STATE_DIM, TOKENS, ActionMode
+from envs.schema import ACTION_DIM, EPISODE, STATE_DIM, TOKENS, ActionMode
 
 
 class ChunkedEnv(EnvBase):
@@ -56,6 +56,8 @@ class ChunkedEnv(EnvBase):
         self._steps = torch.zeros(batch, dtype=torch.int64)
         self._over = torch.ones(batch, 1, dtype=torch.bool)
         self._values: dict[int, dict[str, Any]] = {}
+        # Words stay outside the rollout, which carries their tokens: stacks of strings break TorchRL's stacking by device.
+        self.instructions: list[str] = [""] * batch
         shape = (batch,)
         height, width = size
         self.observation_spec = Composite(
@@ -74,7 +76,6 @@ class ChunkedEnv(EnvBase):
             success=Binary(1, (*shape, 1), dtype=torch.bool),
             progress=Bounded(0.0, 1.0, (*shape, 1)),
             episode_seed=Unbounded((*shape, 1), dtype=torch.int64),
-            language_instruction=NonTensor(shape, example_data=""),
             shape=shape,
             device=device,
         )
@@ -114,5 +115,5 @@ class ChunkedEnv(EnvBase):
     def _with_identity(self, out: TensorDict, instructions: Sequence[str]) -> TensorDict:
         out[EPISODE] = self._seeds.to(self.device).unsqueeze(-1)
         out[TOKENS] = torch.stack([tokenize(text) for text in instructions]).to(self.device)
-        out.set(INSTRUCTION, NonTensorStack(*[NonTensorData(text, device=self.device) for text in instructions]))
+        self.instructions = list(instructions)
         return out

@@ -10,7 +10,7 @@ from enum import Enum
 
 import torch
 from torch import Tensor
-from torchrl.data.vla import ACTION_CHUNK_KEY, IMAGE_KEY, INSTRUCTION_KEY, STATE_KEY
+from torchrl.data.vla import ACTION_CHUNK_KEY, IMAGE_KEY, STATE_KEY
 
 ACTION_DIM = 14  # [x, y, z, roll, pitch, yaw, gripper] of the left, then the right arm; metres, radians, 0 open..1 closed
 STATE_DIM = 16  # [left joints 7, left gripper, right joints 7, right gripper]; radians, 0 open..1 closed
@@ -20,8 +20,7 @@ LOG_PROB = ("vla_action", "log_probs")  # float32 [B]
 IMAGE = IMAGE_KEY  # ("observation", "image") uint8 [B, V, 3, H, W]: the last frame of each view
 STATE = STATE_KEY  # ("observation", "state") float32 [B, 16]
 COMMAND = ("observation", "command")  # float32 [B, 14]: the absolute command now in force
-INSTRUCTION = INSTRUCTION_KEY  # "language_instruction": one string per episode
-TOKENS = ("observation", "tokens")  # int64 [B, WORDS]: the same words as numbers (language.tokenize)
+TOKENS = ("observation", "tokens")  # int64 [B, WORDS]: the instruction as numbers (language.tokenize)
 INTRINSIC = ("camera", "intrinsic")  # float32 [B, V, 3, 3] pixels
 C2W = ("camera", "c2w")  # float32 [B, V, 4, 4] camera to world, OpenCV convention, at the last frame
 EPISODE = "episode_seed"  # int64 [B, 1]: episodes with equal seeds start from the same frame

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 
 import mujoco
@@ -26,7 +27,9 @@ class Offscreen:
     def __init__(self, model: mujoco.MjModel, size: tuple[int, int]):
         height, width = size
         try:
-            self._gl = mujoco.GLContext(width, height)
+            # Asked for by name: mujoco.GLContext was chosen when somebody first imported mujoco, perhaps for a window.
+            backend = os.environ.get("MUJOCO_GL", "egl")
+            self._gl = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
             self._gl.make_current()
             self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
         except Exception as error:
