@@ -10,13 +10,13 @@ from envs.language import VOCABULARY
 
 
 class SpatialEncoder(nn.Module):
-    """Pictures to key-point coordinates and pooled features (Finn et al. 2016, spatial soft-argmax).
+    """Pictures to key-point coordinates and a coarse grid of features (Finn et al. 2016, spatial soft-argmax).
 
     Args:
         points: number of soft key-points.
         width: channels at half resolution; twice as many at a quarter.
 
-    Forward takes float [B, 3, H, W] in -1..1 and returns float32 [B, 2 * points + 2 * width].
+    Forward takes float [B, 3, H, W] in -1..1 and returns float32 [B, 2 * points + 16 * width]: coordinates, and a coarse grid of features.
     """
 
     def __init__(self, points: int = 32, width: int = 32):
@@ -29,8 +29,10 @@ class SpatialEncoder(nn.Module):
         self.heat = nn.Conv2d(2 * width, points, 1)
         self.lift = nn.Conv2d(2 * width, width, 1)
         self.heat_fine = nn.Conv2d(width, points, 3, padding=1)
-        self.temperature = nn.Parameter(torch.zeros(points))
-        self.out_features = 2 * points + 2 * width
+        # Sharp from the start: over a near-uniform softmax, key-points sit in the middle and hardly learn.
+        self.temperature = nn.Parameter(torch.full((points,), 2.3))
+        self.grid = nn.Sequential(nn.Conv2d(2 * width, width, 4, stride=4), nn.SiLU(), nn.AdaptiveAvgPool2d(4), nn.Flatten())
+        self.out_features = 2 * points + 16 * width
 
     def forward(self, pictures: Tensor) -> Tensor:
         x = F.silu(self.norm1(self.stem(pictures.contiguous(memory_format=torch.channels_last))))
@@ -45,7 +47,7 @@ class SpatialEncoder(nn.Module):
         u = torch.linspace(-1, 1, width, device=heat.device)
         grid = share.unflatten(-1, (height, width))
         points = torch.cat(((grid.sum(-2) * u).sum(-1), (grid.sum(-1) * v).sum(-1)), -1)
-        return torch.cat((points, y.float().mean((-2, -1))), -1)
+        return torch.cat((points, self.grid(y).float()), -1)
 
 
 class PatchEncoder(nn.Module):

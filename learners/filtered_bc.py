@@ -6,6 +6,7 @@ The simplest learner from success, and the one GE-Sim 2.0 reports; no ratios, no
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -32,6 +33,10 @@ class FilteredBC:
     def modules(self) -> nn.Module:
         """The policy."""
         return self.policy
+
+    def groups(self, lr: float) -> list[dict[str, Any]]:
+        """One group."""
+        return [{"params": list(self.policy.parameters()), "lr": lr}]
 
     def seeds(self, starts: int, envs: int, generator: torch.Generator) -> list[int]:
         """Random starts."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -57,6 +58,10 @@ class GRPO:
     def modules(self) -> nn.Module:
         """The policy."""
         return self.policy
+
+    def groups(self, lr: float) -> list[dict[str, Any]]:
+        """One group."""
+        return [{"params": list(self.policy.parameters()), "lr": lr}]
 
     def seeds(self, starts: int, envs: int, generator: torch.Generator) -> list[int]:
         """Groups of equal starts; the members' seeds differ by multiples of the number of starts (see WorldEnv).

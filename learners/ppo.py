@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -33,7 +34,7 @@ class PPOConfig:
         clip: clipping of the likelihood ratio.
         entropy: weight of the entropy bonus.
         critic: weight of the value loss.
-        critic_width: hidden size of the value network.
+        critic_width, critic_lr: hidden size and learning rate of the value network.
     """
 
     gamma: float = 0.97
@@ -42,6 +43,7 @@ class PPOConfig:
     entropy: float = 0.0
     critic: float = 1.0
     critic_width: int = 256
+    critic_lr: float = 1e-3
 
 
 class PPO:
@@ -66,6 +68,10 @@ class PPO:
     def modules(self) -> nn.Module:
         """Policy and critic."""
         return self._all
+
+    def groups(self, lr: float) -> list[dict[str, Any]]:
+        """The critic begins from nothing and learns faster than the policy may."""
+        return [{"params": list(self.policy.parameters()), "lr": lr}, {"params": list(self.critic.parameters()), "lr": self.config.critic_lr}]
 
     def seeds(self, starts: int, envs: int, generator: torch.Generator) -> list[int]:
         """Random starts without repetition where there are enough; early endings go on with further ones."""

@@ -75,6 +75,10 @@ class Algorithm(Protocol):
         """All that is trained, the policy included."""
         ...
 
+    def groups(self, lr: float) -> list[dict[str, Any]]:
+        """Parameter groups for the optimiser; `lr` is the policy's."""
+        ...
+
 
 @dataclass
 class Alarms:
@@ -160,7 +164,7 @@ def train_rl(
     checkpoint, log = folder / "checkpoint.pt", folder / "metrics.jsonl"
     base = getattr(env, "base_env", env)
     trained = algorithm.modules()
-    optimiser = torch.optim.Adam(trained.parameters(), lr=config.lr, eps=1e-5)
+    optimiser = torch.optim.Adam(algorithm.groups(config.lr), lr=config.lr, eps=1e-5)
     alarms, first, episodes = Alarms(), 0, 0
     spent = {"rollout": 0.0, "update": 0.0}
     if checkpoint.exists():

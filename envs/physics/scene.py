@@ -88,7 +88,7 @@ def build_mjcf(timestep: float = 0.005) -> str:
   </visual>
   <default>
     <default class="link"><geom contype="0" conaffinity="0"/></default>
-    <default class="finger"><geom friction="0.7 0.01 0.001" contype="2" conaffinity="1"/></default>
+    <default class="finger"><geom friction="1.5 0.02 0.001" contype="2" conaffinity="1"/></default>
   </default>
   <asset>
     <texture name="floor" type="2d" builtin="checker" rgb1="0.30 0.32 0.36" rgb2="0.26 0.28 0.31" width="128" height="128"/>
@@ -103,7 +103,7 @@ def build_mjcf(timestep: float = 0.005) -> str:
     <geom type="box" size="0.04 0.04 0.355" pos="0.60 -0.52 -0.395" rgba="0.4 0.4 0.42 1" class="link"/>
     <camera name="head" pos="0.50 0 0.88" xyaxes="0 -1 0 0.956 0 -0.292" fovy="43"/>
     <camera name="beauty" pos="1.05 -0.75 0.70" xyaxes="0.62 0.785 0 -0.33 0.26 0.907" fovy="45"/>
-    <site name="target" type="cylinder" size="0.04 0.0008" pos="0.3 0 0.0008" rgba="0.2 0.7 0.3 1"/>
+    <site name="target" type="cylinder" size="0.05 0.0008" pos="0.3 0 0.0008" rgba="0.2 0.7 0.3 1"/>
     {_arm("left", "0.25 0.38 0.78 1")}
     {_arm("right", "0.85 0.47 0.20 1")}
     <body name="block" pos="0.2 0.1 0.03">

@@ -39,7 +39,7 @@ class Push:
         scale: distance in metres at which progress is zero.
     """
 
-    radius: float = 0.04
+    radius: float = 0.05
     hold: int = 4
     scale: float = 0.30
     name: str = field(default="push", init=False)
@@ -49,7 +49,7 @@ class Push:
         arm = int(rng.integers(2))
         side = 1.0 if arm == 0 else -1.0
         block = np.array([rng.uniform(0.13, 0.23), side * rng.uniform(0.05, 0.24)])
-        heading = rng.uniform(-0.75, 0.75)
+        heading = rng.uniform(-0.5, 0.5)
         distance = rng.uniform(0.10, 0.19)
         target = block + distance * np.array([np.cos(heading), np.sin(heading)])
         target[1] = np.clip(target[1], -0.30, 0.30)
