@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -18,6 +17,7 @@ from actors.policies.vla import ChunkPolicy
 from envs.judges import LearnedJudge
 from envs.physics.bench import BenchConfig
 from envs.physics.env import PhysicsEnv
+from envs.physics.pool import available_cores
 from envs.schema import ActionMode, Rewards
 from envs.simulators.base import Simulator, WorldShape
 from envs.simulators.state_base import StateDecoder
@@ -57,7 +57,7 @@ def prepare_process(seed: int, threads: int = 0) -> None:
     cost more than arithmetic (twice the time per training step, measured).
     """
     torch.manual_seed(seed)
-    torch.set_num_threads(threads or os.cpu_count() or 1)
+    torch.set_num_threads(threads or available_cores())
     try:
         libc = ctypes.CDLL("libc.so.6")
     except OSError:

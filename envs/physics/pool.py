@@ -19,6 +19,11 @@ from numpy.typing import NDArray
 from envs.physics.bench import Bench, BenchConfig
 
 
+def available_cores() -> int:
+    """Cores this process may run on, which in containers and batch systems is less than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 @dataclass
 class Track:
     """What one episode leaves behind, a row per video frame; row 0 is the start.
@@ -176,7 +181,7 @@ class BenchPool:
     """
 
     def __init__(self, config: BenchConfig, slots: int, horizon: int, workers: int = 0):
-        count = min(workers or os.cpu_count() or 1, slots)
+        count = min(workers or available_cores(), slots)
         self.owner = [slot % count for slot in range(slots)]
         self.local = [slot // count for slot in range(slots)]
         sizes = [self.owner.count(k) for k in range(count)]

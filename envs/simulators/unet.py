@@ -8,7 +8,7 @@ Things that move are then copied instead of remembered by the network, which lea
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F

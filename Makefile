@@ -1,0 +1,45 @@
+# `make quickstart` and `make test` each do all the set-up on a fresh machine.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+# Extra words for pip, such as an index with CPU builds of torch: make quickstart PIP_ARGS="--extra-index-url URL"
+PIP_ARGS ?=
+SEED ?= 0
+
+.PHONY: setup gl test lint quickstart smoke controls clean
+
+setup: gl $(VENV)/.ready
+
+$(VENV)/.ready: pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 10) else "Worldloop needs Python 3.10 or newer: make PYTHON=python3.11")'
+	$(PYTHON) -m venv $(VENV) || { echo "python venv is missing: sudo apt-get install -y python3-venv"; exit 1; }
+	$(BIN)/python -m pip install --upgrade pip --quiet
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[dev]"
+	touch $@
+
+# OpenGL in software, for rendering without a screen. Installed where we may, else the line to type is printed.
+gl:
+	@if ldconfig -p 2>/dev/null | grep -q 'libEGL\.so\.1'; then :; \
+	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	  apt-get update -qq && apt-get install -y -qq libegl1 libgl1-mesa-dri >/dev/null; \
+	elif sudo -n true 2>/dev/null; then sudo apt-get update -qq && sudo apt-get install -y -qq libegl1 libgl1-mesa-dri >/dev/null; \
+	else echo "OpenGL is missing; please type: sudo apt-get install -y libegl1 libgl1-mesa-dri"; exit 1; fi
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+test: lint
+	$(BIN)/python -m pytest
+
+quickstart: setup
+	$(BIN)/worldloop run experiment=quickstart seed=$(SEED)
+
+smoke: setup
+	$(BIN)/worldloop run experiment=smoke
+
+controls: setup
+	$(BIN)/worldloop controls experiment=quickstart seed=$(SEED)
+
+clean:
+	rm -rf runs
