@@ -100,7 +100,7 @@ def build_simulator(cfg: Mapping[str, Any], weights: Path | None = None) -> Simu
     section = cfg["simulator"]["model"]
     if engine == "unet":
         model: Simulator = UNetSimulator(shape, options(UNetConfig, section, "simulator.model"))
-        model = model.to(memory_format=torch.channels_last)
+        model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     elif engine == "dit":
         from envs.simulators.dit_world import DiTConfig, DiTSimulator
 

@@ -114,9 +114,10 @@ class WorldEnv(ChunkedEnv):
         mask = self._reset_mask(tensordict)
         seeds = self._next_seeds(mask)[mask]
         start = seeds % len(self.starts)
-        pick = [getattr(self.starts, name)[start].to(self.device) for name in ("image", "intrinsic", "c2w", "command", "state", "pose_map")]
+        names = {"frames": "image", "intrinsic": "intrinsic", "c2w": "c2w", "command": "command", "state": "state", "pose_map": "pose_map"}
+        begin = {key: getattr(self.starts, name)[start].to(self.device) for key, name in names.items()}
         noise = start if self.shared_noise else seeds
-        fresh = self.simulator.reset(*pick, noise.to(self.device))
+        fresh = self.simulator.reset(**begin, seed=noise.to(self.device))
         if self.session is None or mask.all():
             self.session = fresh
         else:

@@ -187,7 +187,7 @@ def state(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
     prepare_process(cfg["seed"])
     simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
     decoder = build_state_decoder(cfg, simulator, found[warm] / "weights.safetensors" if warm else None)
-    if not warm and hasattr(decoder, "normalise"):
+    if not warm:
         rows = torch.cat([torch.arange(int(store.start[n]), int(store.start[n] + store.length[n])) for n in train.tolist()])
         decoder.normalise(store.arrays["states"][rows])
     stats = train_state(decoder, simulator, store, train, fit_options(cfg, cfg["state"][steps], f"state.{steps}"), folder)

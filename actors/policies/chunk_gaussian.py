@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
@@ -27,7 +29,7 @@ class ChunkGaussian(Distribution):
         basis: [K, n]; gain and offset: [A] in action units.
     """
 
-    arg_constraints = {"loc": constraints.real, "scale": constraints.positive}
+    arg_constraints: ClassVar[dict[str, Any]] = {"loc": constraints.real, "scale": constraints.positive}
     has_rsample = True
 
     def __init__(self, loc: Tensor, scale: Tensor, basis: Tensor, gain: Tensor, offset: Tensor, validate_args: bool | None = None):
@@ -55,11 +57,11 @@ class ChunkGaussian(Distribution):
 
     deterministic_sample = mean
 
-    def rsample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:
+    def rsample(self, sample_shape: Any = ()) -> Tensor:
         shape = (*sample_shape, *self.loc.shape)
         return self._decode(self.loc + self.scale * torch.randn(shape, device=self.loc.device))
 
-    def sample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:
+    def sample(self, sample_shape: Any = ()) -> Tensor:
         with torch.no_grad():
             return self.rsample(sample_shape)
 

@@ -25,6 +25,9 @@ class VLATrunk(nn.Module):
         points: soft key-points of the first view.
     """
 
+    state_mean: Tensor
+    state_std: Tensor
+
     def __init__(self, views: int = 3, width: int = 256, points: int = 32):
         super().__init__()
         self.main = SpatialEncoder(points, 32)
@@ -56,6 +59,10 @@ class ChunkGaussianHead(nn.Module):
         knots: free points per dimension and chunk.
         std: initial spread, in units of the demonstrations' own spread.
     """
+
+    basis: Tensor
+    gain: Tensor
+    offset: Tensor
 
     def __init__(self, width: int, chunk: int, knots: int, std: float):
         super().__init__()

@@ -6,6 +6,7 @@ number of workers changes the speed and nothing else.
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import traceback
@@ -248,10 +249,8 @@ class BenchPool:
     def close(self) -> None:
         """End the workers."""
         for pipe, process in zip(self._pipes, self._processes, strict=True):
-            try:
+            with contextlib.suppress(OSError):  # gone already, which is what we ask for
                 pipe.send(None)
-            except (BrokenPipeError, OSError):
-                pass  # it is gone already, which is what we ask for
             process.join(timeout=5)
             if process.is_alive():
                 process.kill()

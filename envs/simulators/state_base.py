@@ -17,6 +17,10 @@ class StateDecoder(nn.Module):
         super().__init__()
         self.memory = memory
 
+    def normalise(self, states: Tensor) -> None:
+        """Set units from joint states [N, 16]."""
+        raise NotImplementedError
+
     def decode(self, features: Tensor, commands: Tensor, past_commands: Tensor, past_states: Tensor, seed: Tensor, chunk_index: Tensor) -> Tensor:
         """Joint states of one chunk.
 

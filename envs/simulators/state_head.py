@@ -18,6 +18,9 @@ class StateHead(StateDecoder):
         chunk: frames per chunk, K; memory: frames of history, M.
     """
 
+    state_mean: Tensor
+    state_std: Tensor
+
     def __init__(self, features: int, chunk: int, memory: int = 4, width: int = 256):
         super().__init__(memory)
         self.chunk = chunk
@@ -25,9 +28,10 @@ class StateHead(StateDecoder):
         self.register_buffer("state_mean", torch.zeros(STATE_DIM))
         self.register_buffer("state_std", torch.ones(STATE_DIM))
         self.norm = nn.LayerNorm(features)
-        self.layers = nn.Sequential(nn.Linear(size, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, chunk * STATE_DIM))
-        nn.init.zeros_(self.layers[-1].weight)
-        nn.init.zeros_(self.layers[-1].bias)
+        last = nn.Linear(width, chunk * STATE_DIM)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.layers = nn.Sequential(nn.Linear(size, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), last)
 
     def decode(self, features: Tensor, commands: Tensor, past_commands: Tensor, past_states: Tensor, seed: Tensor, chunk_index: Tensor) -> Tensor:
         """See StateDecoder.decode; seed and chunk_index do not matter, there is no noise."""

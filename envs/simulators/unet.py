@@ -64,9 +64,19 @@ class _Block(nn.Module):
         return x + h
 
 
+def _head(width: int, chunk: int) -> nn.Sequential:
+    """Output layer of one view; it starts from "nothing moves", for random output takes hundreds of steps to unlearn."""
+    last = nn.Conv2d(width, _CHANNELS * chunk * _FOLD**2, 1)
+    bias = torch.zeros(chunk, _CHANNELS, _FOLD**2)
+    bias[:, 0] = 3.0
+    nn.init.zeros_(last.weight)
+    last.bias = nn.Parameter(bias.flatten())
+    return nn.Sequential(nn.GroupNorm(8, width), nn.SiLU(), last)
+
+
 def _compose(drawn: Tensor, last: Tensor, first: Tensor) -> Tensor:
     """Frames [B, K, 3, H, W] from the output maps [B, K, 10, H, W] of one view and its last and first frame [B, 3, H, W]."""
-    batch, chunk, _, height, width = drawn.shape
+    _, chunk, _, height, width = drawn.shape
     share = drawn[:, :, :5].softmax(2)
     v, u = torch.meshgrid(
         torch.linspace(-1 + 1 / height, 1 - 1 / height, height, device=drawn.device),
@@ -113,16 +123,7 @@ class UNetSimulator(Simulator):
         self.fine_in = nn.ModuleList(_Block(config.width, cond) for _ in range(fine))
         self.deep = nn.ModuleList(_Block(wide, cond) for _ in range(deep))
         self.fine_out = nn.ModuleList(_Block(config.width, cond) for _ in range(fine))
-        self.heads = nn.ModuleList(
-            nn.Sequential(nn.GroupNorm(8, w), nn.SiLU(), nn.Conv2d(w, _CHANNELS * shape.chunk * _FOLD**2, 1))
-            for w in (config.width if s == 1 else wide for s in config.shrink)
-        )
-        for head in self.heads:
-            # Start from "nothing moves"; random output takes hundreds of steps to unlearn.
-            nn.init.zeros_(head[-1].weight)
-            bias = torch.zeros(shape.chunk, _CHANNELS, _FOLD**2)
-            bias[:, 0] = 3.0
-            head[-1].bias.data.copy_(bias.flatten())
+        self.heads = nn.ModuleList(_head(config.width if s == 1 else wide, shape.chunk) for s in config.shrink)
 
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; features are the pooled bottleneck beside the action embedding."""
@@ -136,10 +137,14 @@ class UNetSimulator(Simulator):
         ]
         return torch.stack(full, 2)
 
-    def views(self, inputs: TensorDict) -> tuple[list[Tensor], Tensor]:
-        """Frames of each view [B, K, 3, H / shrink, W / shrink], not yet enlarged, and the features."""
+    def features(self, inputs: TensorDict) -> Tensor:
+        """See Simulator.features; nothing is drawn."""
+        _, z, cond, _ = self._encode(inputs)
+        return torch.cat([z.float().mean((-2, -1)), cond.float()], 1)
+
+    def _encode(self, inputs: TensorDict) -> tuple[Tensor, Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
+        """Fine and coarse maps, the action embedding, and each view's first and last frame as it is looked at."""
         memory, future = inputs["memory"], inputs["future"]
-        chunk = self.shape.chunk
         stack = torch.cat([memory["frames"], memory["pose_map"], future["pose_map"]], 1)  # uint8 [B, 2M+K, V, 3, H, W]
         relative = to_relative(future["commands"], inputs["now", "command"]) * 10.0  # decimetres
         cond = self.actions(torch.cat([relative.flatten(1), inputs["now", "command"]], 1))
@@ -160,6 +165,12 @@ class UNetSimulator(Simulator):
         z = self.down(x) + torch.stack(deep).sum(0)
         for block in self.deep:
             z = block(z, cond)
+        return x, z, cond, ends
+
+    def views(self, inputs: TensorDict) -> tuple[list[Tensor], Tensor]:
+        """Frames of each view [B, K, 3, H / shrink, W / shrink], not yet enlarged, and the features."""
+        x, z, cond, ends = self._encode(inputs)
+        chunk = self.shape.chunk
         x = self.fuse(torch.cat([x, F.pixel_shuffle(self.up(z), 2)], 1))
         for block in self.fine_out:
             x = block(x, cond)
@@ -216,4 +227,4 @@ class UNetSimulator(Simulator):
                 drawn = pictures if drawn is None else torch.cat([drawn, pictures], 1)
             command = clip["future", "commands"][:, part.stop - 1]
         total = torch.stack(losses).mean()
-        return total, {"vision/first": losses[0].detach(), "vision/last": losses[-1].detach()}
+        return total, {"first_chunk": losses[0].detach(), "last_chunk": losses[-1].detach()}

@@ -77,7 +77,7 @@ def test_policy_sees_the_decoded_state(simulator: UNetSimulator, store: ClipStor
 
 
 def test_commands_accumulate_and_horizon_truncates(simulator: UNetSimulator, store: ClipStore) -> None:
-    env = world(simulator, store, 1, horizon=8)
+    env = world(simulator, store, 1, Fixed(0.1), horizon=8)
     env.base_env.schedule([3])
     td = env.reset()
     begin = td[COMMAND].clone()
@@ -148,7 +148,7 @@ def test_training_on_own_predictions_uses_them(simulator: UNetSimulator, store: 
     true["memory", "frames"][:, 1] = 0  # the second chunk must not look at true frames it could not have seen
     true["memory", "frames"][:, 1, 0] = clip["memory", "frames"][:, 1, 0]
     again, _ = simulator.loss(true, torch.Generator())
-    assert torch.equal(loss, again) and float(figures["last"]) > 0
+    assert torch.equal(loss, again) and float(figures["last_chunk"]) > 0
 
 
 def test_wrong_number_of_views_is_named() -> None:
