@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -39,6 +39,9 @@ class RLConfig:
         lr: learning rate of the policy.
         clip: largest gradient norm.
         kl_stop: mean KL to the behaviour policy at which an iteration's epochs end early.
+        anchor: weight of cloning what is known to have worked in physics (demonstrations and the policy's own true
+            successes) beside the algorithm's loss; it keeps RL from wandering where only the simulator says it works.
+        anchor_batch: frames of that per update.
         checkpoint_every: iterations between checkpoints.
         seed: of start frames, exploration and minibatches.
     """
@@ -50,6 +53,8 @@ class RLConfig:
     lr: float = 2e-4
     clip: float = 1.0
     kl_stop: float = 0.15
+    anchor: float = 0.0
+    anchor_batch: int = 96
     checkpoint_every: int = 5
     seed: int = 0
 
@@ -77,6 +82,18 @@ class Algorithm(Protocol):
 
     def groups(self, lr: float) -> list[dict[str, Any]]:
         """Parameter groups for the optimiser; `lr` is the policy's."""
+        ...
+
+
+class Anchor(Protocol):
+    """Something with batches and a loss that is added to the algorithm's."""
+
+    def sample(self, count: int, generator: torch.Generator) -> TensorDict:
+        """A batch."""
+        ...
+
+    def loss(self, data: TensorDict, generator: torch.Generator) -> Tensor:
+        """Its scalar loss."""
         ...
 
 
@@ -147,7 +164,7 @@ def train_rl(
     starts: int | None = None,
     name: str = "rl",
     seed_pool: Sequence[int] | None = None,
-    on_iteration: Callable[[int, dict[str, float]], None] | None = None,
+    anchor: Anchor | None = None,
 ) -> dict[str, Any]:
     """Improve `policy` in place.
 
@@ -155,7 +172,7 @@ def train_rl(
         env: batch of `config.envs` episodes; its base takes `schedule`.
         starts: number of start frames in imagination; None in physics, where `seed_pool` says which seeds may be used.
         folder: receives checkpoint.pt and metrics.jsonl; a checkpoint found there is resumed.
-        on_iteration: called with (iteration, figures) after each.
+        anchor: what RLConfig.anchor speaks of.
 
     Returns:
         Seconds spent, episodes used, alarms, and the metrics of the last iteration.
@@ -192,7 +209,7 @@ def train_rl(
             began = time.perf_counter()
             batch = next(stream)
             collected = time.perf_counter()
-            figures = update(batch, algorithm, optimiser, config, generator)
+            figures = update(batch, algorithm, optimiser, config, generator, anchor)
             updated = time.perf_counter()
             spent["rollout"] += collected - began
             spent["update"] += updated - collected
@@ -206,8 +223,6 @@ def train_rl(
             bar.set_postfix_str(f"success {figures['success']:.2f}", refresh=False)
             if iteration == first:
                 tqdm.write(f"{name}: about {(updated - began) * (config.iterations - first - 1) / 60:.1f} min for {config.iterations - first - 1} more iterations")
-            if on_iteration is not None:
-                on_iteration(iteration, figures)
             if (iteration + 1) % config.checkpoint_every == 0:
                 save_atomic(
                     {
@@ -228,7 +243,9 @@ def train_rl(
     return {**{f"{k}_seconds": v for k, v in spent.items()}, "episodes": episodes, "alarms": alarms.raised, "last": figures}
 
 
-def update(batch: TensorDict, algorithm: Algorithm, optimiser: torch.optim.Optimizer, config: RLConfig, generator: torch.Generator) -> dict[str, float]:
+def update(
+    batch: TensorDict, algorithm: Algorithm, optimiser: torch.optim.Optimizer, config: RLConfig, generator: torch.Generator, anchor: Anchor | None = None
+) -> dict[str, float]:
     """One iteration's optimisation on a rollout [B, T]; returns its figures."""
     done, success = batch["next", "done"].squeeze(-1), batch["next", SUCCESS].squeeze(-1)
     mine, fine = first_episode(done), judged(batch)
@@ -254,6 +271,10 @@ def update(batch: TensorDict, algorithm: Algorithm, optimiser: torch.optim.Optim
             if parts.get("kl", 0.0) > config.kl_stop:
                 stopped = True
                 break
+            if anchor is not None and config.anchor:
+                pull = anchor.loss(anchor.sample(config.anchor_batch, generator), generator)
+                loss = loss + config.anchor * pull
+                parts["anchor"] = float(pull.detach())
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
             norm = nn.utils.clip_grad_norm_(trained, config.clip)

@@ -40,6 +40,15 @@ def paired_video(path: Path, store: ClipStore, number: int, made: Replay, title:
     write_video(path, [*frames, *[frames[-1]] * 5], store.fps, crf=20, browser=True)
 
 
+def write_gif(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> None:
+    """Write frames uint8 [H, W, 3] as an endless GIF, which is what a README can show."""
+    from PIL import Image
+
+    pictures = [Image.fromarray(frame).quantize(128) for frame in frames]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=round(1000 / fps), loop=0, optimize=True)
+
+
 def inline(data: bytes, kind: str) -> str:
     """A data URL, so that a report is one file."""
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"

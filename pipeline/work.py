@@ -36,7 +36,7 @@ from envs.world import Starts
 from learners.factory import build_algorithm
 from learners.fit import FitConfig
 from learners.rl import RLConfig, train_rl
-from learners.stages.imitation import train_imitation
+from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.judge import calibrate, episode_labels, train_judge
 from learners.stages.state import train_state
 from learners.stages.vision import VisionConfig, train_vision
@@ -148,7 +148,7 @@ def imitation(cfg: Cfg, folder: Path, found: Found) -> dict[str, Any]:
         raise ConfigError(f"imitation.demos={cfg['imitation']['demos']}, but the data hold {len(experts)} successful expert episodes; raise collect.episodes or collect.mix.expert")
     prepare_process(cfg["seed"])
     policy = build_policy(cfg)
-    stats = train_imitation(policy, store, experts, cfg["task"]["chunk"], fit_options(cfg, cfg["imitation"]["fit"], "imitation.fit"), folder)
+    stats = train_imitation(policy, store, experts, fit_options(cfg, cfg["imitation"]["fit"], "imitation.fit"), folder)
     save_weights(policy, folder)
     return {**stats, "demos": len(experts)}
 
@@ -238,7 +238,10 @@ def rl(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str,
     actor = build_policy(cfg, found[policy] / "weights.safetensors")
     settings = options(RLConfig, {**cfg["rl"], "iterations": iterations, "seed": cfg["seed"] * 100 + number}, "rl")
     world = load_world(cfg, found, store, vision, state, judge, settings.envs)
-    stats = train_rl(world, actor, build_algorithm(cfg, actor), settings, folder, starts=len(store))
+    train, _ = split(store)
+    known = torch.cat([store.select(["expert"], succeeded=True)[: cfg["imitation"]["demos"]], store.select(["policy-*"], succeeded=True)])
+    anchor = Cloning(actor, store, known[torch.isin(known, train)])
+    stats = train_rl(world, actor, build_algorithm(cfg, actor), settings, folder, starts=len(store), anchor=anchor)
     save_weights(actor, folder)
     return {**{k: v for k, v in stats.items() if k != "last"}, **{f"last_{k}": v for k, v in stats["last"].items()}}
 
@@ -324,7 +327,7 @@ def measure(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision:
 
 def videos(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, state: str, judge: str, held_out: str, before: str, after: str) -> dict[str, Any]:
     """Paired videos: the policy in physics, and the same actions in the simulator."""
-    from pipeline.media import paired_video
+    from pipeline.media import paired_frames, paired_video, write_gif
 
     prepare_process(cfg["seed"])
     simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
@@ -342,6 +345,9 @@ def videos(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: 
             path = folder / "media" / f"{label}-{row['seed']}.mp4"
             paired_video(path, store, number, made, f"{label}: {'success' if row['success'] else 'failure'}")
             names.append(path.name)
+            if label == "after" and number == 0:
+                frames = paired_frames(store, number, made, "the policy's own actions")
+                write_gif(folder / "media" / "rollout.gif", [*frames, *[frames[-1]] * 8], cfg["task"]["control_hz"])
     return {"videos": names}
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from actors.policies.vla import HIDDEN, ChunkPolicy
 from envs.encoders import to_signed
-from envs.episodes.clips import ClipSpec, ClipStore
+from envs.episodes.clips import ClipStore
 from envs.language import tokenize
 from envs.schema import IMAGE, STATE, TOKENS, to_relative
 from learners.fit import FitConfig, fit
@@ -26,38 +26,51 @@ def observations(store: ClipStore, rows: Tensor, tokens: Tensor) -> TensorDict:
     return TensorDict({IMAGE: store.frames(rows), STATE: store.arrays["states"][rows], TOKENS: tokens}, rows.shape)
 
 
-def train_imitation(policy: ChunkPolicy, store: ClipStore, episodes: Tensor, chunk: int, options: FitConfig, folder: Path) -> dict[str, float]:
-    """Clone the chunks of the given episodes; sets the policy's units from them first.
+class Cloning:
+    """Chunks to imitate: every frame of the given episodes, with the next K commands relative to the one in force.
 
-    The target at a frame is the next K commands relative to the one in force; past the end the last is held.
+    Past an episode's end its last command is held.
     """
-    tokens = torch.stack([tokenize(row["instruction"]) for row in store.episodes])
-    spec = ClipSpec(1, chunk)
-    every = torch.cat([torch.stack([torch.full((int(store.length[n]),), n), torch.arange(int(store.length[n]))]) for n in episodes.tolist()], 1)
-    commands = store.arrays["commands"]
-    last = store.start[every[0]] + store.length[every[0]] - 1
-    rows = store.start[every[0]] + every[1]
-    ahead = torch.minimum(rows[:, None] + torch.arange(1, spec.chunk + 1), last[:, None])
-    targets = to_relative(commands[ahead], commands[rows])
-    policy.normalise(targets, store.arrays["states"][rows], torch.tensor(ACTIVE_FLOOR * 2))
-    head = policy.head
-    active = head.gain > 0
-    knots = torch.linalg.pinv(head.basis) @ ((targets - head.offset) / torch.where(active, head.gain, 1.0))
 
-    def batch(step: int, generator: torch.Generator) -> TensorDict:
-        pick = torch.randint(len(rows), (options.batch,), generator=generator)
-        out = observations(store, rows[pick], tokens[every[0][pick]])
-        out["target"] = knots[pick]
+    def __init__(self, policy: ChunkPolicy, store: ClipStore, episodes: Tensor):
+        self.policy, self.store = policy, store
+        chunk = policy.head.basis.shape[0]
+        every = torch.cat([torch.stack([torch.full((int(store.length[n]),), n), torch.arange(int(store.length[n]))]) for n in episodes.tolist()], 1)
+        self.rows = store.start[every[0]] + every[1]
+        last = store.start[every[0]] + store.length[every[0]] - 1
+        ahead = torch.minimum(self.rows[:, None] + torch.arange(1, chunk + 1), last[:, None])
+        commands = store.arrays["commands"]
+        self.targets = to_relative(commands[ahead], commands[self.rows])  # [N, K, 14]
+        words = torch.stack([tokenize(row["instruction"]) for row in store.episodes])
+        self.tokens = words[every[0]]
+
+    def sample(self, count: int, generator: torch.Generator) -> TensorDict:
+        """Random observations with the knots their chunks have under the policy's units."""
+        head = self.policy.head
+        pick = torch.randint(len(self.rows), (count,), generator=generator)
+        out = observations(self.store, self.rows[pick], self.tokens[pick])
+        gain = torch.where(head.gain > 0, head.gain, torch.ones_like(head.gain))
+        out["target"] = torch.linalg.pinv(head.basis) @ ((self.targets[pick] - head.offset) / gain)
         return out
 
-    def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
-        loc = predict_knots(policy, data, generator)
-        error = (loc - data["target"]).abs() * active
-        return error.sum() / (active.sum() * loc.shape[0] * loc.shape[1]), {}
+    def loss(self, data: TensorDict, generator: torch.Generator) -> Tensor:
+        """Mean absolute error of the knots that vary, in units of the demonstrations' spread."""
+        active = (self.policy.head.gain > 0).float()
+        error = (predict_knots(self.policy, data, generator) - data["target"]).abs() * active
+        return error.sum() / (active.sum() * error.shape[0] * error.shape[1])
 
-    head.log_std.requires_grad_(False)  # exploration is a choice, not something demonstrations tell
-    stats = fit("imitation", policy, batch, loss, options, folder)
-    head.log_std.requires_grad_(True)
+
+def train_imitation(policy: ChunkPolicy, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path) -> dict[str, float]:
+    """Clone the given episodes; sets the policy's units from them first."""
+    cloning = Cloning(policy, store, episodes)
+    policy.normalise(cloning.targets, store.arrays["states"][cloning.rows], torch.tensor(ACTIVE_FLOOR * 2))
+    policy.head.log_std.requires_grad_(False)  # exploration is a choice, not something demonstrations tell
+
+    def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
+        return cloning.loss(data, generator), {}
+
+    stats = fit("imitation", policy, lambda step, generator: cloning.sample(options.batch, generator), loss, options, folder)
+    policy.head.log_std.requires_grad_(True)
     return stats
 
 

@@ -73,13 +73,16 @@ def augment(pictures: Tensor, generator: torch.Generator, strength: float = 0.08
 
 
 def calibrate(judge: LearnedJudge, success: Tensor, valid: Tensor, truth: Tensor) -> float:
-    """Set the judge's threshold to the one with the best balanced episode accuracy on held-out episodes.
+    """Set the judge's threshold on held-out episodes: best balanced accuracy, less any bias of the success rate.
+
+    A threshold that lets more through than succeed is what a policy learns to exploit, so a biased rate costs as
+    much as wrong verdicts do.
 
     Args:
         success: frame probabilities [N, T]; valid: bool [N, T]; truth: bool [N].
 
     Returns:
-        That accuracy.
+        That accuracy less the bias.
     """
     best, chosen = -1.0, 0.5
     for threshold in torch.linspace(0.1, 0.95, 35).tolist():
@@ -87,7 +90,8 @@ def calibrate(judge: LearnedJudge, success: Tensor, valid: Tensor, truth: Tensor
         verdict = judge.episode(success, valid)
         right = verdict == truth
         parts = [right[truth == flag].float().mean() for flag in (True, False) if (truth == flag).any()]
-        accuracy = float(torch.stack(parts).mean())
+        bias = abs(float(verdict.float().mean() - truth.float().mean()))
+        accuracy = float(torch.stack(parts).mean()) - bias
         if accuracy > best + 1e-6 or (abs(accuracy - best) <= 1e-6 and abs(threshold - 0.5) < abs(chosen - 0.5)):
             best, chosen = accuracy, threshold
     judge.threshold.fill_(chosen)
