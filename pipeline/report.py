@@ -87,7 +87,7 @@ main{max-width:1080px;margin:0 auto;padding:36px 20px 80px}h1{font-size:30px;mar
 .verdict.none{border-color:var(--bad)}.grid{display:grid;grid-template-columns:repeat(auto-fit,minmax(220px,1fr));gap:14px}
 .card{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:14px 16px}.card b{display:block;font-size:28px;letter-spacing:-.02em}
 .wide{display:grid;grid-template-columns:repeat(auto-fit,minmax(440px,1fr));gap:14px}table{border-collapse:collapse;width:100%;background:var(--card);border:1px solid var(--line);border-radius:10px;overflow:hidden}
-th,td{padding:7px 12px;text-align:right;border-bottom:1px solid var(--line);font-variant-numeric:tabular-nums}th:first-child,td:first-child{text-align:left}th{font-weight:600;color:var(--dim);font-size:13px}
+th,td{padding:7px 12px;text-align:right;border-bottom:1px solid var(--line);font-variant-numeric:tabular-nums}th:first-child,td:first-child{text-align:left}th{font-weight:600;color:var(--dim);font-size:13px}td{white-space:nowrap}
 tr:last-child td{border-bottom:0}img.plot{width:100%}video{width:100%;border-radius:8px;background:#000}.bar{height:10px;border-radius:5px;background:var(--line);position:relative;margin:10px 0 2px}
 .bar i{position:absolute;top:0;bottom:0;border-radius:5px;background:var(--blue);opacity:.35}.bar u{position:absolute;top:-3px;width:3px;height:16px;background:var(--blue);border-radius:2px}code{font-size:13px}
 """
