@@ -16,7 +16,7 @@ from envs.schema import JUDGE_STATUS, PROGRESS, SUCCESS, Status
 
 @dataclass
 class Outcome:
-    """Results per episode, in the order of the seeds: success bool [N], progress float [N], judged bool [N]; video of some."""
+    """Results per episode, in the order of the seeds: success bool [N], progress float [N], judged bool [N]."""
 
     seeds: list[int]
     success: Tensor

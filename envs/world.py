@@ -6,7 +6,6 @@ the transforms of envs/transforms add them: TransformedEnv(WorldEnv(...), world_
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -165,8 +164,3 @@ class WorldEnv(ChunkedEnv):
         """All frames of the episode in a slot so far, uint8 [T, V, 3, H, W], the first being real."""
         assert self.session is not None
         return self.session["history", "frames"][slot, : int(self.session["length"][slot])].cpu()
-
-
-def start_seeds(starts: int, count: int, offset: int = 0) -> Sequence[int]:
-    """`count` episode seeds that visit every start before any start again, from `offset` on."""
-    return range(offset, offset + count)

@@ -63,11 +63,9 @@ class Behaviour:
 
     Args:
         dial: 0 is the expert, 1 pays no heed to the task.
-        jitter: slow disturbance of the commanded fingertip, on top of the dial's, in the dial's unit. An expert that is
-            disturbed shows how to recover, which is what cloning lacks most (Laskey et al. 2017, DART).
     """
 
-    def __init__(self, task: Push, layout: Layout, dial: float, rng: np.random.Generator, jitter: float = 0.0):
+    def __init__(self, task: Push, layout: Layout, dial: float, rng: np.random.Generator):
         if not 0.0 <= dial <= 1.0:
             raise ValueError(f"behaviour dial {dial} must lie in [0, 1]: 0 is the expert, 1 is random")
         believed = layout
@@ -75,7 +73,7 @@ class Behaviour:
             shift = rng.normal(0.0, 0.05 * dial, 2)
             believed = Layout(**{**vars(layout), "target": layout.target + shift})
         self.expert = PushExpert(task, believed)
-        self.layout, self.jitter, self.rng = layout, dial + jitter, rng
+        self.dial, self.rng = dial, rng
         self.drift = np.zeros(2)
         self.bias = rng.normal(0.0, 0.05 * dial, 2)
         self.random = dial >= 1.0
@@ -90,5 +88,5 @@ class Behaviour:
             goal = tip + step * min(1.0, SPEED / max(float(np.hypot(*step)), 1e-9))
         else:
             goal = self.expert.fingertip(block + self.bias, tip)
-        self.drift = 0.8 * self.drift + self.rng.normal(0.0, 0.008 * self.jitter, 2)
+        self.drift = 0.8 * self.drift + self.rng.normal(0.0, 0.008 * self.dial, 2)
         return goal + self.drift

@@ -103,7 +103,7 @@ class Worker:
                 out[index]["track"], slot.track = slot.track, None
         return out
 
-    def script(self, jobs: list[tuple[int, float]], jitter: float = 0.0) -> list[Track]:
+    def script(self, jobs: list[tuple[int, float]]) -> list[Track]:
         """Whole episodes of scripted behaviours for (seed, dial) pairs; recorded to the horizon or to success."""
         from envs.physics.behaviours import Behaviour
 
@@ -111,7 +111,7 @@ class Worker:
         for seed, dial in jobs:
             bench = self.slots[0].bench
             bench.reset(seed)
-            behaviour = Behaviour(bench.task, bench.layout, dial, np.random.default_rng([seed, 1]), jitter)
+            behaviour = Behaviour(bench.task, bench.layout, dial, np.random.default_rng([seed, 1]))
             near = bench.layout.arm * 7
             track = Track(seed, bench.layout.instruction, bench.cameras()[0])
             track.add(bench)
@@ -236,13 +236,13 @@ class BenchPool:
         """Carry out chunks {slot: [K, 14]} and return the observations after them."""
         return self._scatter("step", chunks)
 
-    def script(self, jobs: list[tuple[int, float]], jitter: float = 0.0) -> list[Track]:
+    def script(self, jobs: list[tuple[int, float]]) -> list[Track]:
         """Scripted episodes for (seed, dial) pairs, in the order of `jobs`."""
         if self._inline is not None:
-            return self._inline.script(jobs, jitter)
+            return self._inline.script(jobs)
         count = len(self._pipes)
         for index, pipe in enumerate(self._pipes):
-            pipe.send(("script", (jobs[index::count], jitter)))
+            pipe.send(("script", (jobs[index::count],)))
         shares = [self._receive(index) for index in range(count)]
         return [shares[k % count][k // count] for k in range(len(jobs))]
 

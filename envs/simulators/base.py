@@ -161,12 +161,10 @@ class Simulator(nn.Module):
     @staticmethod
     def replace(state: TensorDict, mask: Tensor, fresh: TensorDict) -> TensorDict:
         """The state with the sessions of `mask` [B] replaced by those of `fresh` (one row per True, in order)."""
-        capacity = state["history"].shape[1]
         for name in ("length", "intrinsic", "seed", "chunk_index"):
             state[name][mask] = fresh[name].to(state[name].dtype)
         for name in state["history"].keys():
             state["history", name][mask.nonzero().flatten(), 0] = fresh["history", name][:, 0]
-        assert capacity >= 1
         return state
 
 
