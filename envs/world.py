@@ -16,6 +16,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 
 from envs.chunked import ChunkedEnv
 from envs.episodes.clips import ClipStore
+from envs.precision import mixed_precision
 from envs.schema import ACTION_DIM, C2W, CHUNK_C2W, COMMAND, COMMANDS, FEATURES, FRAMES, IMAGE, INTRINSIC, POSE_MAP, PROGRESS, STATE, SUCCESS, ActionMode
 from envs.simulators.base import Simulator
 
@@ -70,7 +71,7 @@ class WorldEnv(ChunkedEnv):
         horizon: control steps per episode.
         mode: meaning of a chunk's numbers, used by the pose-map transform.
         shared_noise: let the episodes of a group meet the same noise.
-        bf16: generate in bfloat16.
+        bf16: generate in bfloat16 where the device computes in it.
         seed: of the stream of episode seeds.
 
     Raises:
@@ -133,7 +134,7 @@ class WorldEnv(ChunkedEnv):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         assert self.session is not None
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16):
+        with mixed_precision(self.device, self.bf16):
             frames, features, self.session = self.simulator.step(self.session, tensordict[COMMANDS], tensordict[POSE_MAP], tensordict[CHUNK_C2W])
         self._steps += self.chunk
         out = self._observe()

@@ -19,6 +19,8 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from envs.precision import mixed_precision
+
 Loss = Callable[[int, torch.Generator], tuple[Tensor, dict[str, Any]]]
 Batch = Callable[[int, torch.Generator], Any]
 
@@ -38,7 +40,7 @@ class FitConfig:
         weight_decay: of AdamW, on matrices only.
         ema: decay of the weights' moving average, 0 for none; the average is what a stage hands on.
         clip: largest gradient norm.
-        bf16: run forward passes in bfloat16 where that is faster.
+        bf16: run forward passes in bfloat16 where the device computes in it.
         checkpoint_every: steps between checkpoints.
         seed: of batches and noise.
     """
@@ -138,7 +140,7 @@ def fit(
             loaded = time.perf_counter()
             for group in optimiser.param_groups:
                 group["lr"] = _rate(config, step)
-            with torch.autocast(device.type, torch.bfloat16, enabled=config.bf16):
+            with mixed_precision(device, config.bf16):
                 value, figures = loss(data, generator)
             optimiser.zero_grad(set_to_none=True)
             value.backward()

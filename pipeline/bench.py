@@ -16,6 +16,7 @@ from envs.conditioning.pose_map import _AXIS_RGB, _layout, _shades
 from envs.geometry import follow_hands, hands_of
 from envs.physics.bench import Bench
 from envs.physics.pool import BenchPool
+from envs.precision import mixed_precision
 from pipeline.config import load_config
 
 
@@ -115,7 +116,7 @@ def world(cfg: dict[str, Any]) -> None:
         simulator.predict = timed  # type: ignore[method-assign]
         began = time.perf_counter()
         for _ in range(8):
-            with torch.autocast(device.type, torch.bfloat16, enabled=cfg["simulator"]["bf16"]):
+            with mixed_precision(device, cfg["simulator"]["bf16"]):
                 _, _, state = simulator.step(state, commands.to(device), maps.to(device), c2w.to(device))
         total = time.perf_counter() - began
         simulator.predict = forward  # type: ignore[method-assign]

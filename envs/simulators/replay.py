@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from envs.episodes.clips import ClipStore
+from envs.precision import mixed_precision
 from envs.simulators.base import Simulator
 from envs.simulators.state_base import StateDecoder
 
@@ -42,7 +43,7 @@ def replay(simulator: Simulator, store: ClipStore, episodes: Tensor, decoder: St
             ahead = step * chunk + torch.arange(1, chunk + 1)[None]
             at = start[:, None] + torch.minimum(ahead.expand(len(ids), -1), last)
             commands = store.arrays["commands"][at].to(device)
-            with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
+            with mixed_precision(device, bf16):
                 made, features, state = simulator.step(state, commands, store.pose_maps(at).to(device), store.arrays["c2w"][at].to(device))
             if decoder is not None:
                 recent = simulator.recent(state, decoder.memory + chunk)[:, : decoder.memory]
