@@ -26,6 +26,8 @@ class Offscreen:
 
     def __init__(self, model: mujoco.MjModel, size: tuple[int, int]):
         height, width = size
+        # Mesa's software driver hands pictures this small to threads of its own at a loss; every core has a worker already.
+        os.environ.setdefault("LP_NUM_THREADS", "0")
         try:
             # Asked for by name: mujoco.GLContext was chosen when somebody first imported mujoco, perhaps for a window.
             backend = os.environ.get("MUJOCO_GL", "egl")

@@ -82,7 +82,7 @@ def build_mjcf(timestep: float = 0.005) -> str:
   <option timestep="{timestep}" integrator="implicitfast" cone="elliptic" impratio="3"/>
   <visual>
     <headlight ambient="0.45 0.45 0.45" diffuse="0.35 0.35 0.35" specular="0.05 0.05 0.05"/>
-    <quality shadowsize="1024" offsamples="0"/>
+    <quality shadowsize="1024" offsamples="0" numslices="12" numstacks="6" numquads="1"/>
     <global offwidth="1280" offheight="960"/>
     <map znear="0.005" zfar="20"/>
   </visual>
