@@ -15,7 +15,7 @@ from torchrl.envs import TransformedEnv
 
 from actors.policies.vla import ChunkPolicy
 from envs.judges import LearnedJudge
-from envs.physics.bench import BenchConfig
+from envs.physics.bench import BenchConfig, frames_held
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import available_cores
 from envs.schema import ActionMode, Rewards
@@ -85,7 +85,7 @@ def device_of(cfg: Mapping[str, Any]) -> torch.device:
 def bench_config(cfg: Mapping[str, Any]) -> BenchConfig:
     """Options of the true world."""
     task = cfg["task"]
-    return options(BenchConfig, {"task": task["name"], "control_hz": task["control_hz"], "size": task["size"], "views": task["views"]}, "task")
+    return options(BenchConfig, {"task": task["name"], "control_hz": task["control_hz"], "hold": task["hold"], "size": task["size"], "views": task["views"]}, "task")
 
 
 def world_shape(cfg: Mapping[str, Any]) -> WorldShape:
@@ -125,7 +125,7 @@ def build_state_decoder(cfg: Mapping[str, Any], simulator: Simulator, weights: P
 def build_judge(cfg: Mapping[str, Any], weights: Path | None = None) -> LearnedJudge:
     """The learned judge."""
     section = cfg["judge"]
-    judge = LearnedJudge(len(cfg["task"]["views"]), section["hold"], section["margin"], section["width"], section["points"])
+    judge = LearnedJudge(len(cfg["task"]["views"]), frames_held(cfg["task"]["hold"], cfg["task"]["control_hz"]), section["margin"], section["width"], section["points"])
     return load(judge, weights).to(device_of(cfg))
 
 

@@ -15,13 +15,14 @@ class SpatialEncoder(nn.Module):
     Args:
         points: number of soft key-points.
         width: channels at half resolution; twice as many at a quarter.
+        pictures: how many are looked at as one, pixel on pixel.
 
-    Forward takes float [B, 3, H, W] in -1..1 and returns float32 [B, 2 * points + 16 * width]: coordinates, and a coarse grid of features.
+    Forward takes float [B, 3 * pictures, H, W] in -1..1 and returns float32 [B, 2 * points + 16 * width]: coordinates, and a coarse grid of features.
     """
 
-    def __init__(self, points: int = 32, width: int = 32):
+    def __init__(self, points: int = 32, width: int = 32, pictures: int = 1):
         super().__init__()
-        self.stem = nn.Conv2d(3, width, 5, stride=2, padding=2)
+        self.stem = nn.Conv2d(3 * pictures, width, 5, stride=2, padding=2)
         self.mid = nn.Conv2d(width, 2 * width, 3, stride=2, padding=1)
         self.deep = nn.Conv2d(2 * width, 2 * width, 3, padding=1)
         self.norm1, self.norm2, self.norm3 = nn.GroupNorm(4, width), nn.GroupNorm(8, 2 * width), nn.GroupNorm(8, 2 * width)

@@ -28,7 +28,7 @@ class FilteredBC:
     name = "filtered_bc"
 
     def __init__(self, policy: ChunkPolicy, config: FilteredBCConfig):
-        self.policy, self.config = policy, config
+        self.policy, self.config = policy.trained, config
 
     def modules(self) -> nn.Module:
         """The policy."""
@@ -46,7 +46,7 @@ class FilteredBC:
         """The steps of this iteration's successful episodes."""
         mine = first_episode(batch["next", "done"].squeeze(-1)) & judged(batch)
         won = (batch["next", SUCCESS].squeeze(-1) & mine).any(1)
-        return transitions(batch, mine & won[:, None]), {"episodes_kept": float(won.sum())}
+        return transitions(batch, mine & won[:, None], self.policy.in_keys), {"episodes_kept": float(won.sum())}
 
     def loss(self, minibatch: TensorDict) -> tuple[Tensor, dict[str, float]]:
         """Negative log-likelihood with the exploration spread held fixed, so that only means move."""

@@ -49,9 +49,9 @@ class GRPO:
     name = "grpo"
 
     def __init__(self, policy: ChunkPolicy, config: GRPOConfig):
-        self.policy, self.config = policy, config
-        self.reference = copy.deepcopy(policy).requires_grad_(False) if config.kl else None
-        self.objective = ClipPPOLoss(policy, None, clip_epsilon=(config.clip_low, config.clip_high), entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy)
+        self.policy, self.config = policy.trained, config
+        self.reference = copy.deepcopy(self.policy).requires_grad_(False) if config.kl else None
+        self.objective = ClipPPOLoss(self.policy, None, clip_epsilon=(config.clip_low, config.clip_high), entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy)
         self.objective.set_keys(action=CHUNK, sample_log_prob=LOG_PROB)
         self.starts = 1
 
@@ -94,7 +94,7 @@ class GRPO:
         keep = mine & (~alike).repeat_interleave(size)[:, None] & (there.sum(1) > 1).repeat_interleave(size, 0)
         if not keep.any():
             keep = mine  # nothing to learn from, and advantages are zero: the update is a no-op that alarms report
-        data = transitions(batch, keep, advantage=advantage.flatten(0, 1).unsqueeze(-1))
+        data = transitions(batch, keep, self.policy.in_keys, advantage=advantage.flatten(0, 1).unsqueeze(-1))
         same = batch[EPISODE][:, 0, 0] % self.starts
         assert bool((same.unflatten(0, (-1, size)) == same.unflatten(0, (-1, size))[:, :1]).all()), "a group holds different starts"
         return data, {"groups_dropped": float(alike.float().mean()), "advantage_std": float(data["advantage"].std())}

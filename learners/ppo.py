@@ -1,13 +1,11 @@
 """PPO on chunks (Schulman et al. 2017): maximise E[min(r A, clip(r, 1-e, 1+e) A)] + c H, where A is GAE over chunks.
 
-One decision is one chunk, so advantages say which chunk of an episode was good. The critic is a small network on the
-features of the frozen start policy, which are computed once per batch; it costs next to nothing and cannot disturb
-the policy.
+One decision is one chunk, so advantages say which chunk of an episode was good. The critic is a small network on what
+the policy's perception made of a rollout while it acted; it costs next to nothing and cannot disturb the policy.
 """
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,11 +16,9 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from actors.policies.vla import HIDDEN, ChunkPolicy
-from envs.schema import CHUNK, IMAGE, LOG_PROB, STATE, TOKENS
+from actors.policies.vla import SEEN, ChunkPolicy
+from envs.schema import CHUNK, IMAGE, LOG_PROB, STATE, STATE_DIM, TOKENS
 from learners.rl import judged, transitions
-
-FEATURES = "critic_features"
 
 
 @dataclass(frozen=True)
@@ -46,24 +42,34 @@ class PPOConfig:
     critic_lr: float = 1e-3
 
 
+class Value(nn.Module):
+    """V(observation) from perception's features [..., S] and the joint state [..., 16] -> [..., 1]."""
+
+    def __init__(self, seen: int, width: int):
+        super().__init__()
+        self.layers = nn.Sequential(nn.LayerNorm(seen + STATE_DIM), nn.Linear(seen + STATE_DIM, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 1))
+
+    def forward(self, seen: Tensor, state: Tensor) -> Tensor:
+        return self.layers(torch.cat((seen.detach(), state), -1))
+
+
 class PPO:
     """See the module's docstring; an Algorithm of learners.rl."""
 
     name = "ppo"
 
     def __init__(self, policy: ChunkPolicy, config: PPOConfig):
-        self.policy, self.config = policy, config
-        self.encoder = copy.deepcopy(policy[0]).requires_grad_(False)
-        width = policy.head.mean.in_features
-        value = nn.Sequential(nn.Linear(width, config.critic_width), nn.SiLU(), nn.Linear(config.critic_width, config.critic_width), nn.SiLU(), nn.Linear(config.critic_width, 1))
-        self.critic = TensorDictModule(value, in_keys=[FEATURES], out_keys=["state_value"])
+        self.policy, self.config = policy.trained, config
+        self.perception = policy.perception
+        value = Value(self.perception.out_features, config.critic_width)
+        self.critic = TensorDictModule(value, in_keys=[SEEN, STATE], out_keys=["state_value"])
         self.gae = GAE(gamma=config.gamma, lmbda=config.lam, value_network=self.critic, average_gae=False)
         self.objective = ClipPPOLoss(
-            policy, self.critic, clip_epsilon=config.clip, entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy, critic_coeff=config.critic, normalize_advantage=True
+            self.policy, self.critic, clip_epsilon=config.clip, entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy, critic_coeff=config.critic, normalize_advantage=True
         )
         self.objective.set_keys(action=CHUNK, sample_log_prob=LOG_PROB)
         # The loss registers both as functional parameters; optimising the originals needs them in one place.
-        self._all = nn.ModuleList([policy, self.critic])
+        self._all = nn.ModuleList([self.policy, self.critic])
 
     def modules(self) -> nn.Module:
         """Policy and critic."""
@@ -80,20 +86,23 @@ class PPO:
 
     def prepare(self, batch: TensorDict) -> tuple[TensorDict, dict[str, float]]:
         """Advantages of all steps of the rollout, unfinished last episodes included: the critic stands in for their rest."""
-        for part in (batch, batch["next"]):
-            part[FEATURES] = self._features(part)
+        batch["next", SEEN] = self._seen_next(batch)
         with torch.no_grad():
             self.gae(batch)
         value, target = batch["state_value"], batch["value_target"]
         explained = 1 - (target - value).var() / target.var().clamp(min=1e-8)
-        data = transitions(batch, judged(batch), advantage=batch["advantage"], value_target=target, critic_features=batch[FEATURES], state_value=value)
+        extra = {"advantage": batch["advantage"], "value_target": target, "state_value": value}
+        data = transitions(batch, judged(batch), {*self.policy.in_keys, SEEN, STATE}, **extra)
         return data, {"explained_variance": float(explained.clamp(min=-10.0)), "advantage_std": float(batch["advantage"].std())}
 
-    def _features(self, part: TensorDict) -> Tensor:
-        flat = TensorDict({key: part[key].flatten(0, 1) for key in (IMAGE, STATE, TOKENS)}, [part.numel()])
-        with torch.no_grad():
-            out = torch.cat([self.encoder(piece.clone(False))[HIDDEN] for piece in flat.split(512)])
-        return out.unflatten(0, part.shape)
+    @torch.no_grad()
+    def _seen_next(self, batch: TensorDict) -> Tensor:
+        """What perception makes of each step's next observation: what it made of it a step later, or, where the rollout ends or a slot starts anew, computed here."""
+        seen = batch[SEEN].roll(-1, 1)
+        fresh = batch["next", "done"].squeeze(-1).clone()
+        fresh[:, -1] = True
+        seen[fresh] = self.perception(batch["next", IMAGE][fresh], batch["next", TOKENS][fresh])
+        return seen
 
     def loss(self, minibatch: TensorDict) -> tuple[Tensor, dict[str, float]]:
         """The clipped objective, the value loss and the entropy bonus."""

@@ -10,20 +10,20 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
-from tensordict import TensorDict
+from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from actors.policies.vla import ChunkPolicy
-from envs.schema import CHUNK, IMAGE, JUDGE_STATUS, LOG_PROB, STATE, SUCCESS, TOKENS, Status
+from envs.schema import CHUNK, JUDGE_STATUS, LOG_PROB, SUCCESS, Status
 from learners.fit import TrainingDiverged, _truncate, save_atomic
 
 
@@ -42,6 +42,7 @@ class RLConfig:
         anchor: weight of cloning what is known to have worked in physics (demonstrations and the policy's own true
             successes) beside the algorithm's loss; it keeps RL from wandering where only the simulator says it works.
         anchor_batch: frames of that per update.
+        freeze_perception: train only what follows the policy's encoder, so that no picture is encoded twice.
         checkpoint_every: iterations between checkpoints.
         seed: of start frames, exploration and minibatches.
     """
@@ -55,6 +56,7 @@ class RLConfig:
     kl_stop: float = 0.15
     anchor: float = 0.0
     anchor_batch: int = 96
+    freeze_perception: bool = False
     checkpoint_every: int = 5
     seed: int = 0
 
@@ -290,10 +292,10 @@ def update(
     return figures | {"updates": float(count), "transitions": float(len(data))}
 
 
-def transitions(batch: TensorDict, keep: Tensor, **extra: Tensor) -> TensorDict:
-    """The flat set of kept steps: observation, chunk and behaviour log-probability, plus tensors [B, T, ...] by name."""
+def transitions(batch: TensorDict, keep: Tensor, keys: Iterable[NestedKey], **extra: Tensor) -> TensorDict:
+    """The flat set of kept steps: what losses read by key, chunk and behaviour log-probability, plus tensors [B, T, ...] by name."""
     flat = keep.reshape(-1).nonzero().squeeze(-1)
-    source = {key: batch[key].flatten(0, 1)[flat] for key in (IMAGE, STATE, TOKENS, CHUNK, LOG_PROB)}
+    source = {key: batch[key].flatten(0, 1)[flat] for key in (*keys, CHUNK, LOG_PROB)}
     out = TensorDict(source, [len(flat)])
     for key, value in extra.items():
         out[key] = value.flatten(0, 1)[flat]

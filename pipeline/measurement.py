@@ -82,8 +82,9 @@ def judge_frames(judge: LearnedJudge, frames: Tensor, store: ClipStore, episodes
     """Success probabilities [N, T] of frames uint8 [N, T, V, 3, H, W] of these episodes."""
     device = next(judge.parameters()).device
     tokens = torch.stack([tokenize(store.episodes[n]["instruction"]) for n in episodes.tolist()])
-    parts = [judge.score(piece.to(device), words.to(device)).success.cpu() for piece, words in zip(frames.split(batch), tokens.split(batch), strict=True)]
-    return torch.cat(parts)
+    first = store.frames(store.start[episodes])
+    pieces = zip(frames.split(batch), first.split(batch), tokens.split(batch), strict=True)
+    return torch.cat([judge.score(*(value.to(device) for value in piece)).success.cpu() for piece in pieces])
 
 
 def judge_table(judge: LearnedJudge, frames: Tensor, valid: Tensor, store: ClipStore, episodes: Tensor) -> dict[str, Any]:

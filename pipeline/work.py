@@ -215,6 +215,7 @@ def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
         imagined = TensorDict(
             {
                 "frames": made.frames.flatten(0, 1)[valid],
+                "begin": store.start[pick].repeat_interleave(made.valid.shape[1], 0)[valid],
                 "tokens": tokens.repeat_interleave(made.valid.shape[1], 0)[valid],
                 "label": labels[flat],
                 "progress": store.arrays["progress"][flat].float(),
@@ -241,6 +242,9 @@ def rl(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str,
     train, _ = split(store)
     known = torch.cat([store.select(["expert"], succeeded=True)[: cfg["imitation"]["demos"]], store.select(["policy-*"], succeeded=True)])
     anchor = Cloning(actor, store, known[torch.isin(known, train)])
+    if settings.freeze_perception:
+        actor.freeze_perception()
+        anchor.look()
     stats = train_rl(world, actor, build_algorithm(cfg, actor), settings, folder, starts=len(store), anchor=anchor)
     save_weights(actor, folder)
     return {**{k: v for k, v in stats.items() if k != "last"}, **{f"last_{k}": v for k, v in stats["last"].items()}}

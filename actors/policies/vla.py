@@ -1,6 +1,7 @@
 """The small vision-language-action policy: all views, state and words in, a distribution over chunks out.
 
-The trunk is one module and the head another, so that a token head or a flow head can stand beside the Gaussian.
+Perception, fusion and head are modules of their own, so that a token head or a flow head can stand beside the
+Gaussian, and RL may leave perception as it is.
 """
 
 from __future__ import annotations
@@ -13,41 +14,57 @@ from actors.policies.chunk_gaussian import ChunkGaussian, knot_basis
 from envs.encoders import PatchEncoder, SpatialEncoder, WordEncoder, to_signed
 from envs.schema import ACTION_DIM, CHUNK, IMAGE, LOG_PROB, STATE, STATE_DIM, TOKENS
 
-HIDDEN = ("policy", "hidden")  # float32 [B, width]: the trunk's output, for heads and critics
+SEEN = ("policy", "seen")  # float32 [B, S]: what perception makes of pictures and words, for heads and critics
+HIDDEN = ("policy", "hidden")  # float32 [B, width]: that joined with the state
 
 
-class VLATrunk(nn.Module):
-    """Encodes an observation: the first view by key-points, the others in passing, state and words by small layers.
+class Perception(nn.Module):
+    """Encodes pictures and words: the first view by key-points, the others in passing, words by a table.
 
     Args:
         views: number of cameras.
-        width: size of the output.
         points: soft key-points of the first view.
+    """
+
+    def __init__(self, views: int = 3, points: int = 32):
+        super().__init__()
+        self.main = SpatialEncoder(points, 32)
+        self.sides = nn.ModuleList(PatchEncoder(32) for _ in range(views - 1))
+        self.words = WordEncoder(16)
+        self.out_features = self.main.out_features + 32 * (views - 1) + 16
+
+    def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
+        """uint8 or float (-1..1) [B, V, 3, H, W], int64 [B, WORDS] -> float32 [B, out_features]; leading dimensions may be more."""
+        lead = image.shape[:-4]
+        pictures = to_signed(image.reshape(-1, *image.shape[-4:]))
+        parts = [self.main(pictures[:, 0])]
+        parts += [side(pictures[:, k + 1]) for k, side in enumerate(self.sides)]
+        parts += [self.words(tokens.reshape(-1, tokens.shape[-1]))]
+        return torch.cat(parts, -1).reshape(*lead, -1)
+
+
+class Fusion(nn.Module):
+    """Joins what is seen with the joint state.
+
+    Args:
+        seen: features of perception.
+        width: size of the output.
     """
 
     state_mean: Tensor
     state_std: Tensor
 
-    def __init__(self, views: int = 3, width: int = 256, points: int = 32):
+    def __init__(self, seen: int, width: int = 256):
         super().__init__()
-        self.main = SpatialEncoder(points, 32)
-        self.sides = nn.ModuleList(PatchEncoder(32) for _ in range(views - 1))
-        self.words = WordEncoder(16)
         self.register_buffer("state_mean", torch.zeros(STATE_DIM))
         self.register_buffer("state_std", torch.ones(STATE_DIM))
         self.state = nn.Sequential(nn.Linear(STATE_DIM, 64), nn.SiLU(), nn.Linear(64, 64))
-        joined = self.main.out_features + 32 * (views - 1) + 16 + 64
-        self.mix = nn.Sequential(nn.Linear(joined, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())
+        self.mix = nn.Sequential(nn.Linear(seen + 64, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())
 
-    def forward(self, image: Tensor, state: Tensor, tokens: Tensor) -> Tensor:
-        """uint8 [B, V, 3, H, W], float [B, 16], int64 [B, WORDS] -> float32 [B, width]; leading dimensions may be more."""
-        lead = image.shape[:-4]
-        pictures = to_signed(image.reshape(-1, *image.shape[-4:]))
-        proprio = ((state.reshape(-1, STATE_DIM) - self.state_mean) / self.state_std).clamp(-5, 5)
-        parts = [self.main(pictures[:, 0])]
-        parts += [side(pictures[:, k + 1]) for k, side in enumerate(self.sides)]
-        parts += [self.words(tokens.reshape(-1, tokens.shape[-1])), self.state(proprio)]
-        return self.mix(torch.cat(parts, -1)).reshape(*lead, -1)
+    def forward(self, seen: Tensor, state: Tensor) -> Tensor:
+        """float [..., S], float [..., 16] -> float32 [..., width]."""
+        proprio = ((state - self.state_mean) / self.state_std).clamp(-5, 5)
+        return self.mix(torch.cat((seen, self.state(proprio)), -1))
 
 
 class ChunkGaussianHead(nn.Module):
@@ -83,7 +100,7 @@ class ChunkGaussianHead(nn.Module):
 
 
 class ChunkPolicy(ProbabilisticTensorDictSequential):
-    """Trunk, head and ChunkGaussian as one TorchRL policy with get_dist and log_prob.
+    """Perception, fusion, head and ChunkGaussian as one TorchRL policy with get_dist and log_prob.
 
     Reads image, state and instruction tokens; writes ("vla_action", "chunk") and its log-probability.
 
@@ -94,7 +111,9 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
     """
 
     def __init__(self, views: int = 3, chunk: int = 4, knots: int = 2, width: int = 256, points: int = 32, std: float = 0.3):
-        trunk = TensorDictModule(VLATrunk(views, width, points), in_keys=[IMAGE, STATE, TOKENS], out_keys=[HIDDEN])
+        eyes = Perception(views, points)
+        perception = TensorDictModule(eyes, in_keys=[IMAGE, TOKENS], out_keys=[SEEN])
+        fusion = TensorDictModule(Fusion(eyes.out_features, width), in_keys=[SEEN, STATE], out_keys=[HIDDEN])
         parameters = [("policy", name) for name in ("loc", "scale", "basis", "gain", "offset")]
         head = TensorDictModule(ChunkGaussianHead(width, chunk, knots, std), in_keys=[HIDDEN], out_keys=parameters)
         sampler = ProbabilisticTensorDictModule(
@@ -104,17 +123,33 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
             return_log_prob=True,
             log_prob_key=LOG_PROB,
         )
-        super().__init__(trunk, head, sampler)
+        super().__init__(perception, fusion, head, sampler)
+        self.frozen = False
 
     @property
-    def trunk(self) -> VLATrunk:
-        """The encoder."""
+    def perception(self) -> Perception:
+        """What encodes pictures and words."""
         return self[0].module
+
+    @property
+    def fusion(self) -> Fusion:
+        """What joins them with the state."""
+        return self[1].module
 
     @property
     def head(self) -> ChunkGaussianHead:
         """The Gaussian head."""
-        return self[1].module
+        return self[2].module
+
+    def freeze_perception(self) -> None:
+        """Leave perception as imitation made it: what was seen during a rollout then serves every update, and no picture is encoded twice."""
+        self.perception.requires_grad_(False)
+        self.frozen = True
+
+    @property
+    def trained(self) -> ProbabilisticTensorDictSequential:
+        """The part that learners train, a policy in its own right: all of it, or what follows a frozen perception."""
+        return ProbabilisticTensorDictSequential(self[1], self[2], self[3]) if self.frozen else self
 
     def normalise(self, chunks: Tensor, states: Tensor, floor: Tensor) -> None:
         """Set units from demonstrations: dimensions that hardly vary become constants, the rest get unit knots.
@@ -131,5 +166,5 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
             active = spread > floor
             head.gain.copy_(torch.where(active, spread, 0.0))
             head.offset.copy_(torch.where(active, 0.0, centre))
-            self.trunk.state_mean.copy_(states.mean(0))
-            self.trunk.state_std.copy_(states.std(0).clamp(min=0.05))
+            self.fusion.state_mean.copy_(states.mean(0))
+            self.fusion.state_std.copy_(states.std(0).clamp(min=0.05))

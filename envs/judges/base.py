@@ -33,11 +33,12 @@ class Judge(nn.Module):
         self.register_buffer("threshold", torch.tensor(threshold))
         self.hold = hold
 
-    def score(self, frames: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
+    def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
         """Judge clips.
 
         Args:
             frames: uint8 [B, T, V, 3, H, W].
+            first: uint8 [B, V, 3, H, W], the episode's first frame, in which everything can still be seen.
             tokens: int64 [B, WORDS], the instruction (language.tokenize).
             objects: float32 [B, T, 2, 3] true positions of block and target in metres; only the rule judge looks.
         """

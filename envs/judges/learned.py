@@ -1,4 +1,7 @@
-"""The learned judge: every frame on its own gets a success probability and a progress, given the instruction."""
+"""The learned judge: every frame gets a success probability and a progress, given the episode's first frame and the instruction.
+
+The first frame says where things were before an arm stood in front of them or a block lay upon the target.
+"""
 
 from __future__ import annotations
 
@@ -25,23 +28,23 @@ class LearnedJudge(Judge):
     def __init__(self, views: int = 3, hold: int = 4, margin: float = 0.0, width: int = 24, points: int = 24):
         super().__init__(0.5, hold)
         self.margin = margin
-        self.main = SpatialEncoder(points, width)
+        self.main = SpatialEncoder(points, width, pictures=2)
         self.sides = nn.ModuleList(PatchEncoder(16, 8) for _ in range(views - 1))
         self.words = WordEncoder(16)
         self.head = nn.Sequential(nn.Linear(self.main.out_features + 16 * views, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU(), nn.Linear(128, 2))
 
-    def forward(self, frames: Tensor, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits of success and of progress, float32 [N], for frames uint8 or float (-1..1) [N, V, 3, H, W] and tokens [N, WORDS]."""
+    def forward(self, frames: Tensor, first: Tensor, tokens: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits of success and of progress, float32 [N], for frames and first frames uint8 or float (-1..1) [N, V, 3, H, W] and tokens [N, WORDS]."""
         pictures = to_signed(frames)
-        parts = [self.main(pictures[:, 0])] + [side(pictures[:, k + 1]) for k, side in enumerate(self.sides)]
+        parts = [self.main(torch.cat((pictures[:, 0], to_signed(first[:, 0])), 1))] + [side(pictures[:, k + 1]) for k, side in enumerate(self.sides)]
         out = self.head(torch.cat([*parts, self.words(tokens)], -1)).float()
         return out[:, 0], out[:, 1]
 
     @torch.no_grad()
-    def score(self, frames: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
+    def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
         """See Judge.score; `objects` is ignored."""
         batch, count = frames.shape[:2]
-        logit, progress = self(frames.flatten(0, 1), tokens.repeat_interleave(count, 0))
+        logit, progress = self(frames.flatten(0, 1), first.repeat_interleave(count, 0), tokens.repeat_interleave(count, 0))
         success = logit.sigmoid().unflatten(0, (batch, count))
         status = ok_status(success)
         if self.margin:
@@ -49,14 +52,14 @@ class LearnedJudge(Judge):
             status = torch.where(near, Status.ABSTAIN.value, status)
         return Verdict(success, progress.sigmoid().unflatten(0, (batch, count)), status)
 
-    def loss(self, frames: Tensor, tokens: Tensor, label: Tensor, progress: Tensor, share: float) -> tuple[Tensor, dict[str, Any]]:
+    def loss(self, frames: Tensor, first: Tensor, tokens: Tensor, label: Tensor, progress: Tensor, share: float) -> tuple[Tensor, dict[str, Any]]:
         """Class-balanced cross-entropy of success plus that of progress.
 
         Args:
             label: float [N] in {0, 1}; progress: float [N] in 0..1.
             share: fraction of positive frames in the data, by which the classes are balanced.
         """
-        logit, towards = self(frames, tokens)
+        logit, towards = self(frames, first, tokens)
         weight = torch.where(label > 0.5, 0.5 / max(share, 1e-3), 0.5 / max(1 - share, 1e-3))
         success = (F.binary_cross_entropy_with_logits(logit, label, reduction="none") * weight).mean()
         shaped = F.binary_cross_entropy_with_logits(towards, progress)

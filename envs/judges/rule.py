@@ -13,14 +13,15 @@ class RuleJudge(Judge):
     """Applies the task's own rule to true positions; can judge physics only.
 
     Args:
-        task: whose radius and scale apply.
+        task: whose radius, hold and scale apply.
+        control_hz: frames per second.
     """
 
-    def __init__(self, task: Push | None = None):
+    def __init__(self, task: Push | None = None, control_hz: float = 10.0):
         self.task = task or Push()
-        super().__init__(threshold=0.5, hold=self.task.hold)
+        super().__init__(threshold=0.5, hold=max(1, round(self.task.hold * control_hz)))
 
-    def score(self, frames: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
+    def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
         """See Judge.score.
 
         Raises:

@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from envs.physics.tasks import Layout, Push
 
 Array = NDArray[np.float64]
-SPEED = 0.022  # m a gripper moves per control step at most
+SPEED = 0.22  # m/s a gripper moves at most
 _STANDOFF = 0.055  # m from block centre to fingertip centre when the push begins
 _LATERAL = 0.012  # m off the push line at which the gripper still counts as aligned
 
 
 class PushExpert:
-    """Go behind the block as seen from the target, then push through it, steering back onto the line at every step."""
+    """Go behind the block as seen from the target, then push through it, steering back onto the line at every step of `period` seconds."""
 
-    def __init__(self, task: Push, layout: Layout):
-        self.task, self.layout = task, layout
+    def __init__(self, task: Push, layout: Layout, period: float = 0.1):
+        self.task, self.layout, self.period = task, layout, period
         self.behind = False
 
     def fingertip(self, block: Array, tip: Array) -> Array:
@@ -42,7 +42,7 @@ class PushExpert:
         if self.behind:
             # Lead the block towards the line: push a little from the side it has drifted to.
             goal = target - line * reach - normal * across * 1.5
-            speed = min(SPEED, 0.010 + 0.5 * distance)
+            speed = min(SPEED, 0.1 + 5.0 * distance)
         elif along > -reach and abs(across) < self.layout.block_half + 0.03:
             side = 1.0 if across >= 0 else -1.0  # beside or ahead of it: go round
             goal = block + normal * side * (self.layout.block_half + 0.06) - line * 0.08
@@ -52,7 +52,7 @@ class PushExpert:
             speed = SPEED
         step = goal - tip
         length = float(np.hypot(*step))
-        return tip + step * min(1.0, speed / max(length, 1e-9))
+        return tip + step * min(1.0, speed * self.period / max(length, 1e-9))
 
 
 class Behaviour:
@@ -63,17 +63,19 @@ class Behaviour:
 
     Args:
         dial: 0 is the expert, 1 pays no heed to the task.
+        period: seconds per control step.
     """
 
-    def __init__(self, task: Push, layout: Layout, dial: float, rng: np.random.Generator):
+    def __init__(self, task: Push, layout: Layout, dial: float, rng: np.random.Generator, period: float = 0.1):
         if not 0.0 <= dial <= 1.0:
             raise ValueError(f"behaviour dial {dial} must lie in [0, 1]: 0 is the expert, 1 is random")
         believed = layout
         if dial > 0:
             shift = rng.normal(0.0, 0.05 * dial, 2)
             believed = Layout(**{**vars(layout), "target": layout.target + shift})
-        self.expert = PushExpert(task, believed)
-        self.dial, self.rng = dial, rng
+        self.expert = PushExpert(task, believed, period)
+        self.dial, self.rng, self.period = dial, rng, period
+        self.keep = 0.8 ** (period / 0.1)  # the drift forgets at the same pace whatever the control rate
         self.drift = np.zeros(2)
         self.bias = rng.normal(0.0, 0.05 * dial, 2)
         self.random = dial >= 1.0
@@ -82,11 +84,11 @@ class Behaviour:
     def fingertip(self, block: Array, tip: Array) -> Array:
         """The next fingertip position [2] of the near arm in metres."""
         if self.random:
-            if self.waypoint is None or np.hypot(*(self.waypoint - tip)) < 0.02 or self.rng.random() < 0.05:
+            if self.waypoint is None or np.hypot(*(self.waypoint - tip)) < 0.02 or self.rng.random() < 1 - 0.95 ** (self.period / 0.1):
                 self.waypoint = block + self.rng.normal(0.0, 0.09, 2)
             step = self.waypoint - tip
-            goal = tip + step * min(1.0, SPEED / max(float(np.hypot(*step)), 1e-9))
+            goal = tip + step * min(1.0, SPEED * self.period / max(float(np.hypot(*step)), 1e-9))
         else:
             goal = self.expert.fingertip(block + self.bias, tip)
-        self.drift = 0.8 * self.drift + self.rng.normal(0.0, 0.008 * self.dial, 2)
+        self.drift = self.keep * self.drift + self.rng.normal(0.0, 0.0133 * self.dial * np.sqrt(1 - self.keep**2), 2)
         return goal + self.drift

@@ -17,7 +17,13 @@ Array = NDArray[np.float64]
 TIP_HEIGHT = 0.020  # m above the table at which fingertips travel
 LOW = np.array([-0.04, -0.42, TIP_HEIGHT - 0.012])  # reachable fingertip box, metres
 HIGH = np.array([0.46, 0.42, 0.35])
+GLIDE = 0.025  # s between joint targets: commands are interpolated, so that arms glide instead of jerking at the control rate
 MAX_SPEED = 0.6  # m/s a command may move a fingertip; faster commands are slowed down, not refused
+
+
+def frames_held(hold: float, control_hz: float) -> int:
+    """Frames in a row that make a condition held for `hold` seconds."""
+    return max(1, round(hold * control_hz))
 
 
 @dataclass(frozen=True)
@@ -27,12 +33,14 @@ class BenchConfig:
     Args:
         task: a name in tasks.TASKS.
         control_hz: commands and video frames per second.
+        hold: seconds the task's condition must hold.
         size: (height, width) of every view in pixels.
         views: cameras to render, in order.
     """
 
     task: str = "push"
     control_hz: float = 10.0
+    hold: float = 0.4
     size: tuple[int, int] = (64, 64)
     views: tuple[str, ...] = VIEWS
 
@@ -49,11 +57,13 @@ class Bench:
 
     def __init__(self, config: BenchConfig):
         self.config = config
-        self.task = TASKS[config.task]()
+        self.task = TASKS[config.task](hold=config.hold)
+        self.hold = frames_held(config.hold, config.control_hz)
         self.model = mujoco.MjModel.from_xml_string(build_mjcf())
         self.data = mujoco.MjData(self.model)
         self.ik = ArmKinematics(self.model)
-        self.substeps = max(4, round(1.0 / (config.control_hz * self.model.opt.timestep)))
+        self.glides = max(1, round(1.0 / (config.control_hz * GLIDE)))
+        self.substeps = max(1, round(1.0 / (config.control_hz * self.glides * self.model.opt.timestep)))
         self._slides = np.array([[self.model.joint(f"{s}_slide_{t}").qposadr[0] for t in "ab"] for s in ARMS])
         self._block = self.model.joint("block").qposadr[0]
         self._cams = [self.model.camera(v).id for v in config.views]
@@ -96,10 +106,9 @@ class Bench:
             raise ValueError(f"a command must be 14 finite numbers [x,y,z,roll,pitch,yaw,g]x2, got {command}")
         self.command = self._limit(command)
         before, after = self.joints, self.ik.solve(self.command, self.joints)
-        # Joint targets move in four even steps, so that arms glide instead of jerking at the control rate.
-        for k in range(4):
-            self._set_targets(before + (after - before) * (k + 1) / 4)
-            mujoco.mj_step(self.model, self.data, nstep=self.substeps // 4)
+        for k in range(self.glides):
+            self._set_targets(before + (after - before) * (k + 1) / self.glides)
+            mujoco.mj_step(self.model, self.data, nstep=self.substeps)
         self.joints = after
         mujoco.mj_forward(self.model, self.data)
         self.held = self.held + 1 if self.distance < self.task.radius else 0
@@ -130,8 +139,8 @@ class Bench:
 
     @property
     def success(self) -> bool:
-        """True once the condition has held for the task's last `hold` control steps."""
-        return self.held >= self.task.hold
+        """True once the condition has held for the last `hold` control steps."""
+        return self.held >= self.hold
 
     @property
     def block(self) -> Array:

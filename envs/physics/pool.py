@@ -111,7 +111,7 @@ class Worker:
         for seed, dial in jobs:
             bench = self.slots[0].bench
             bench.reset(seed)
-            behaviour = Behaviour(bench.task, bench.layout, dial, np.random.default_rng([seed, 1]))
+            behaviour = Behaviour(bench.task, bench.layout, dial, np.random.default_rng([seed, 1]), 1 / self.config.control_hz)
             near = bench.layout.arm * 7
             track = Track(seed, bench.layout.instruction, bench.cameras()[0])
             track.add(bench)

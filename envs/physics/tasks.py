@@ -35,12 +35,12 @@ class Push:
 
     Args:
         radius: success distance between block and target centres in metres.
-        hold: control steps the distance must stay within the radius; being there for a moment is no success.
+        hold: seconds the distance must stay within the radius; being there for a moment is no success.
         scale: distance in metres at which progress is zero.
     """
 
     radius: float = 0.05
-    hold: int = 4
+    hold: float = 0.4
     scale: float = 0.30
     name: str = field(default="push", init=False)
 

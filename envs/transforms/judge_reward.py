@@ -26,9 +26,10 @@ class JudgeReward(Transform):
         self.judge, self.rewards = judge, rewards
         self._run = torch.zeros(0, dtype=torch.int64)
         self._progress = torch.zeros(0, 1)
+        self._first = torch.zeros(0, dtype=torch.uint8)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        verdict = self.judge.score(next_tensordict[FRAMES], tensordict[TOKENS])
+        verdict = self.judge.score(next_tensordict[FRAMES], self._first, tensordict[TOKENS])
         done, self._run = self.judge.streak(verdict.success, self._run)
         failed = (verdict.status != Status.OK.value).unsqueeze(-1)
         success = done.any(1, keepdim=True) & ~failed
@@ -44,15 +45,16 @@ class JudgeReward(Transform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         mask = tensordict.get("_reset", None)
-        first = self.judge.score(tensordict_reset[IMAGE].unsqueeze(1), tensordict_reset[TOKENS])
-        progress = first.progress
+        image = tensordict_reset[IMAGE]
+        progress = self.judge.score(image.unsqueeze(1), image, tensordict_reset[TOKENS]).progress
         if mask is None or self._run.shape[0] != progress.shape[0]:
             self._run = torch.zeros(progress.shape[0], dtype=torch.int64, device=progress.device)
-            self._progress = progress
+            self._progress, self._first = progress, image.clone()
         else:
             mask = mask.reshape(-1, 1)
             self._run = torch.where(mask.squeeze(-1), 0, self._run)
             self._progress = torch.where(mask, progress, self._progress)
+            self._first = torch.where(mask[..., None, None, None], image, self._first)
         tensordict_reset[PROGRESS] = self._progress
         tensordict_reset[JUDGE_STATUS] = torch.full_like(self._run, Status.OK.value).unsqueeze(-1)
         return tensordict_reset.exclude(FRAMES, FEATURES, "world")

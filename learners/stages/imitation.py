@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from actors.policies.vla import HIDDEN, ChunkPolicy
+from actors.policies.vla import SEEN, ChunkPolicy
 from envs.encoders import to_signed
 from envs.episodes.clips import ClipStore
 from envs.language import tokenize
@@ -19,11 +19,6 @@ from learners.stages.judge import augment
 
 # Spread below which a command dimension is a constant: a millimetre, a hundredth of a radian, a twentieth of a grip.
 ACTIVE_FLOOR = (1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2, 5e-2)
-
-
-def observations(store: ClipStore, rows: Tensor, tokens: Tensor) -> TensorDict:
-    """What a policy would have seen at given rows [B] of a store, with tokens [B, WORDS]."""
-    return TensorDict({IMAGE: store.frames(rows), STATE: store.arrays["states"][rows], TOKENS: tokens}, rows.shape)
 
 
 class Cloning:
@@ -43,20 +38,38 @@ class Cloning:
         self.targets = to_relative(commands[ahead], commands[self.rows])  # [N, K, 14]
         words = torch.stack([tokenize(row["instruction"]) for row in store.episodes])
         self.tokens = words[every[0]]
+        self.seen: Tensor | None = None
+
+    @torch.no_grad()
+    def look(self, batch: int = 512) -> None:
+        """Encode every frame once, for a policy whose perception stays as it is."""
+        pairs = zip(self.rows.split(batch), self.tokens.split(batch), strict=True)
+        self.seen = torch.cat([self.policy.perception(self.store.frames(rows), tokens) for rows, tokens in pairs])
 
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
         """Random observations with the knots their chunks have under the policy's units."""
         head = self.policy.head
         pick = torch.randint(len(self.rows), (count,), generator=generator)
-        out = observations(self.store, self.rows[pick], self.tokens[pick])
+        out = TensorDict({STATE: self.store.arrays["states"][self.rows[pick]]}, pick.shape)
+        if self.seen is None:
+            out[IMAGE], out[TOKENS] = self.store.frames(self.rows[pick]), self.tokens[pick]
+        else:
+            out[SEEN] = self.seen[pick]
         gain = torch.where(head.gain > 0, head.gain, torch.ones_like(head.gain))
         out["target"] = torch.linalg.pinv(head.basis) @ ((self.targets[pick] - head.offset) / gain)
         return out
 
     def loss(self, data: TensorDict, generator: torch.Generator) -> Tensor:
-        """Mean absolute error of the knots that vary, in units of the demonstrations' spread."""
-        active = (self.policy.head.gain > 0).float()
-        error = (predict_knots(self.policy, data, generator) - data["target"]).abs() * active
+        """Mean absolute error of the knots that vary, in units of the demonstrations' spread.
+
+        Pictures and states are disturbed a little, for robustness.
+        """
+        policy, state = self.policy, data[STATE]
+        seen = data[SEEN] if self.seen is not None else policy.perception(augment(to_signed(data[IMAGE]), generator), data[TOKENS])
+        noise = torch.randn(state.shape, generator=generator).to(state.device) * 0.05 * policy.fusion.state_std
+        knots = policy.head(policy.fusion(seen, state + noise))[0]
+        active = (policy.head.gain > 0).float()
+        error = (knots - data["target"]).abs() * active
         return error.sum() / (active.sum() * error.shape[0] * error.shape[1])
 
 
@@ -72,14 +85,3 @@ def train_imitation(policy: ChunkPolicy, store: ClipStore, episodes: Tensor, opt
     stats = fit("imitation", policy, lambda step, generator: cloning.sample(options.batch, generator), loss, options, folder)
     policy.head.log_std.requires_grad_(True)
     return stats
-
-
-def predict_knots(policy: ChunkPolicy, data: TensorDict, generator: torch.Generator | None = None) -> Tensor:
-    """Mean knots [B, n, 14] for observations; with a generator, pictures and states are disturbed a little for robustness."""
-    trunk = policy.trunk
-    if generator is None:
-        return policy.head(policy[0](data)[HIDDEN])[0]
-    image, state = data[IMAGE], data[STATE]
-    pictures = augment(to_signed(image), generator)
-    noise = torch.randn(state.shape, generator=generator).to(state.device) * 0.05 * trunk.state_std
-    return policy.head(trunk(pictures, state + noise, data[TOKENS]))[0]

@@ -34,10 +34,12 @@ def train_judge(
     """Train `judge` in place.
 
     Args:
-        imagined: generated frames as a TensorDict [N] with frames uint8 [V, 3, H, W], tokens, label and progress; half of each batch.
+        imagined: generated frames as a TensorDict [N] with frames uint8 [V, 3, H, W], begin (the row of their first frame), tokens, label and
+            progress; half of each batch.
     """
     labels = episode_labels(store, judge.hold)
     rows = torch.cat([torch.arange(int(store.start[n]), int(store.start[n] + store.length[n])) for n in episodes.tolist()])
+    begin = torch.repeat_interleave(store.start, store.length)
     owner = torch.repeat_interleave(torch.arange(len(store)), store.length)
     tokens = torch.stack([tokenize(row["instruction"]) for row in store.episodes])
     share = float(labels[rows].mean().clamp(0.02, 0.98))
@@ -52,16 +54,18 @@ def train_judge(
             at.append(positive[torch.randint(len(positive), (wanted,), generator=generator)])
         chosen = torch.cat(at)
         out = TensorDict(
-            {"frames": store.frames(chosen), "tokens": tokens[owner[chosen]], "label": labels[chosen], "progress": store.arrays["progress"][chosen].float()}, [len(chosen)]
+            {"frames": store.frames(chosen), "begin": begin[chosen], "tokens": tokens[owner[chosen]], "label": labels[chosen], "progress": store.arrays["progress"][chosen].float()}, [len(chosen)]
         )
         if imagined is not None:
             pick = torch.randint(len(imagined), (options.batch - real,), generator=generator)
             out = torch.cat([out, imagined[pick]])
+        out["first"] = store.frames(out["begin"])
         return out
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
-        pictures = augment(to_signed(data["frames"]), generator)
-        return judge.loss(pictures, data["tokens"], data["label"], data["progress"], max(share, 0.3))
+        views = data["frames"].shape[1]  # the same colours for both, as one camera would give them
+        pictures, first = augment(to_signed(torch.cat((data["frames"], data["first"]), 1)), generator).split(views, 1)
+        return judge.loss(pictures, first, data["tokens"], data["label"], data["progress"], max(share, 0.3))
 
     return fit("judge", judge, batch, loss, options, folder, watch="frame_accuracy")
 

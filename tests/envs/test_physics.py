@@ -38,7 +38,7 @@ def test_success_must_be_held() -> None:
     bench = Bench(BenchConfig())
     bench.reset(1)
     bench.data.qpos[bench._block : bench._block + 2] = bench.layout.target
-    for step in range(bench.task.hold):
+    for step in range(bench.hold):
         assert bench.success is False, step
         bench.step(bench.command)
     assert bench.success is True

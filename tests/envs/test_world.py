@@ -128,11 +128,11 @@ def test_rule_judge_agrees_with_physics(store: ClipStore) -> None:
     judge = RuleJudge()
     rows = store.start[0] + torch.arange(int(store.length[0]))
     objects = store.arrays["objects"][rows][None]
-    verdict = judge.score(store.frames(rows)[None], torch.zeros(1, 12, dtype=torch.int64), objects)
+    verdict = judge.score(store.frames(rows)[None], store.frames(rows[:1]), torch.zeros(1, 12, dtype=torch.int64), objects)
     assert torch.allclose(verdict.progress[0], store.arrays["progress"][rows], atol=1e-4)
     assert bool(judge.episode(verdict.success, torch.ones_like(verdict.success).bool())) == store.episodes[0]["success"]
     with pytest.raises(ValueError, match="judge=learned"):
-        judge.score(store.frames(rows)[None], torch.zeros(1, 12, dtype=torch.int64))
+        judge.score(store.frames(rows)[None], store.frames(rows[:1]), torch.zeros(1, 12, dtype=torch.int64))
 
 
 def test_replay_covers_every_frame(simulator: UNetSimulator, store: ClipStore) -> None:
