@@ -35,6 +35,12 @@ def eef_transforms(commands: Tensor) -> Tensor:
     return rpy_poses(commands.unflatten(-1, (2, 7))[..., :6])
 
 
+def fingertips(commands: Tensor, tool_offset: float = 0.15) -> Tensor:
+    """Points [..., 2, 3] between the fingertips of both arms, `tool_offset` metres along each flange's z axis, from commands [..., 14]."""
+    flange = eef_transforms(commands)
+    return flange[..., :3, 3] + tool_offset * flange[..., :3, 2]
+
+
 def invert(transform: Tensor) -> Tensor:
     """Inverse [..., 4, 4] of rigid transforms [..., 4, 4]."""
     out = torch.zeros_like(transform)

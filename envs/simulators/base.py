@@ -168,6 +168,12 @@ class Simulator(nn.Module):
         return state
 
 
+def hue_gap(frames: Tensor) -> Tensor:
+    """How unlike in hue each pixel is to the picture's median colour, [..., 1, H, W] in 0..1, for frames [..., 3, H, W] in 0..1."""
+    gap = frames - frames.flatten(-2).median(-1).values[..., None, None]
+    return ((gap - gap.mean(-3, keepdim=True)).abs().amax(-3, keepdim=True) * 4).clamp(max=1.0)
+
+
 def foreground_weight(frames: Tensor, gain: float) -> Tensor:
     """Loss weights [..., 1, H, W] that lift whatever differs from the picture's median colour, most of all in hue.
 
@@ -176,10 +182,7 @@ def foreground_weight(frames: Tensor, gain: float) -> Tensor:
 
     Args:
         frames: float [..., 3, H, W] in 0..1.
-        gain: weight of a pixel of a fully different hue, above the 1 of the median colour; a grey difference gets a quarter.
+        gain: weight of a pixel of a fully different hue, above the 1 of the median colour; a grey difference gets a twelfth.
     """
-    median = frames.flatten(-2).median(-1).values[..., None, None]
-    gap = frames - median
-    grey = gap.mean(-3, keepdim=True)
-    hue = (gap - grey).abs().amax(-3, keepdim=True)
-    return 1.0 + gain * ((hue * 4).clamp(max=1.0) + (grey.abs() * 2.5).clamp(max=1.0) / 4)
+    grey = (frames - frames.flatten(-2).median(-1).values[..., None, None]).mean(-3, keepdim=True)
+    return 1.0 + gain * (hue_gap(frames) + (grey.abs() * 2.5).clamp(max=1.0) / 12)

@@ -2,8 +2,9 @@
 
 Each view is folded into channels (side views at half the detail), memory and future pose maps ride along as
 channels, and commands modulate every block. A pixel of the output is a soft choice between five sources: the last
-frame as it is, the last frame moved by a predicted flow, the first frame, the median colour, and a drawn colour.
-Things that move are then copied instead of remembered by the network, which learns far faster than a residual does.
+frame as it is, the last frame moved by a predicted flow, the first frame, the median colour, and a drawn colour; over
+these lie a few parts of the last frame that were carried elsewhere as a whole (transport.py). Things that move are
+then copied instead of remembered by the network, which learns far faster than a residual does.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from torch import Tensor, nn
 
 from envs.conditioning import render_ray_map
 from envs.schema import ACTION_DIM, to_relative
-from envs.simulators.base import Simulator, WorldShape, foreground_weight
+from envs.simulators.base import Simulator, WorldShape, foreground_weight, hue_gap
+from envs.simulators.transport import Transport, tip_tracks
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,7 @@ class UNetConfig:
         blocks: residual blocks per fine half, and in the bottleneck.
         foreground: extra loss weight of what differs from the median colour.
         emphasis: loss weight of each view.
+        slots: parts per view that may be carried as a whole.
     """
 
     shrink: tuple[int, ...] = (1, 2, 2)
@@ -37,10 +40,11 @@ class UNetConfig:
     blocks: tuple[int, int] = (2, 4)
     foreground: float = 8.0
     emphasis: tuple[float, ...] = (1.0, 0.4, 0.4)
+    slots: int = 2
 
 
 _FOLD = 4  # pixels folded into channels, both ways
-_CHANNELS = 5 + 2 + 3  # logits of the sources, flow, drawn colour
+_CHANNELS = 5 + 2 + 3 + 1  # logits of the sources, flow, drawn colour, whether what is carried lies in front
 _REACH = 8.0  # pixels one unit of flow moves
 
 
@@ -64,21 +68,24 @@ class _Block(nn.Module):
         return x + h
 
 
-def _head(width: int, chunk: int) -> nn.Sequential:
-    """Output layer of one view; it starts from "nothing moves", for random output takes hundreds of steps to unlearn."""
-    last = nn.Conv2d(width, _CHANNELS * chunk * _FOLD**2, 1)
-    bias = torch.zeros(chunk, _CHANNELS, _FOLD**2)
-    bias[:, 0] = 3.0
-    nn.init.zeros_(last.weight)
+def _head(width: int, chunk: int, slots: int) -> nn.Sequential:
+    """Output layer of one view, maps of each frame and the masks of the parts; it starts from "nothing moves", for random output takes hundreds of steps to unlearn."""
+    last = nn.Conv2d(width, (_CHANNELS * chunk + slots) * _FOLD**2, 1)
+    bias = torch.zeros(_CHANNELS * chunk + slots, _FOLD**2)
+    bias[: _CHANNELS * chunk : _CHANNELS] = 3.0
+    bias[_CHANNELS * chunk :] = -4.0
+    with torch.no_grad():
+        # Masks differ from the start, or all would learn the same.
+        last.weight[: _CHANNELS * chunk * _FOLD**2].zero_()
     last.bias = nn.Parameter(bias.flatten())
     return nn.Sequential(nn.GroupNorm(8, width), nn.SiLU(), last)
 
 
-def _compose(drawn: Tensor, last: Tensor, first: Tensor) -> Tensor:
-    """Frames [B, K, 3, H, W] from the output maps [B, K, 10, H, W] of one view and its last and first frame [B, 3, H, W]."""
+def _compose(drawn: Tensor, last: Tensor, first: Tensor, carried: tuple[Tensor, Tensor]) -> Tensor:
+    """Frames [B, K, 3, H, W] from the output maps [B, K, 11, H, W] of one view, its last and first frame [B, 3, H, W], and what is carried (Transport)."""
     _, chunk, _, height, width = drawn.shape
     # Split, not sliced: the gradient of a slice is a full map of zeros.
-    logits, flow, colour = drawn.split((5, 2, 3), 2)
+    logits, flow, colour, front = drawn.split((5, 2, 3, 1), 2)
     still, moves, past, middle, fresh = logits.softmax(2).split(1, 2)
     v, u = torch.meshgrid(
         torch.linspace(-1 + 1 / height, 1 - 1 / height, height, device=drawn.device),
@@ -91,7 +98,11 @@ def _compose(drawn: Tensor, last: Tensor, first: Tensor) -> Tensor:
     moved = F.grid_sample(last, grid.flatten(1, 2), padding_mode="border", align_corners=False)
     moved = moved.unflatten(2, (chunk, height)).transpose(1, 2)
     median = first.flatten(2).median(-1).values[:, None, :, None, None]
-    return still * last[:, None] + moves * moved + past * first[:, None] + middle * median + fresh * (0.5 + 0.5 * colour)
+    out = still * last[:, None] + moves * moved + past * first[:, None] + middle * median + fresh * (0.5 + 0.5 * colour)
+    shown = (front + 2.0).sigmoid()
+    for part, cover in zip(carried[0].unbind(1), carried[1].unbind(1), strict=True):
+        out = out + shown * cover * (part - out)
+    return out
 
 
 def _fold(pictures: Tensor) -> Tensor:
@@ -137,7 +148,8 @@ class UNetSimulator(Simulator):
         self.fine_in = nn.ModuleList(_Block(config.width, cond) for _ in range(fine))
         self.deep = nn.ModuleList(_Block(wide, cond) for _ in range(deep))
         self.fine_out = nn.ModuleList(_Block(config.width, cond) for _ in range(fine))
-        self.heads = nn.ModuleList(_head(config.width if s == 1 else wide, shape.chunk) for s in config.shrink)
+        self.heads = nn.ModuleList(_head(config.width if s == 1 else wide, shape.chunk, config.slots) for s in config.shrink)
+        self.transports = nn.ModuleList(Transport(shape.chunk, config.slots) for _ in config.shrink)
 
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; features are the pooled bottleneck beside the action embedding."""
@@ -189,9 +201,13 @@ class UNetSimulator(Simulator):
         for block in self.fine_out:
             x = block(x, cond)
         views = []
-        for shrink, head, (first, last) in zip(self.config.shrink, self.heads, ends, strict=True):
-            drawn = _unfold(head(x if shrink == 1 else z).float().contiguous())
-            views.append(_compose(drawn.unflatten(1, (chunk, _CHANNELS)), last, first))
+        future, memory = inputs["future"], inputs["memory"]
+        tracks = tip_tracks(inputs["now", "command"], future["commands"], inputs["intrinsic"], memory["c2w"][:, -1], future["c2w"], self.shape.size)
+        for view, (shrink, head, carry, (first, last)) in enumerate(zip(self.config.shrink, self.heads, self.transports, ends, strict=True)):
+            drawn, masks = _unfold(head(x if shrink == 1 else z).float().contiguous()).split((_CHANNELS * chunk, self.config.slots), 1)
+            # What is coloured unlike the rest is likelier to be a thing; which of them moves is for the network to learn.
+            carried = carry((masks + 6.0 * hue_gap(last)).sigmoid(), last, tracks[:, view])
+            views.append(_compose(drawn.unflatten(1, (chunk, _CHANNELS)), last, first, carried))
         features = torch.cat([z.float().mean((-2, -1)), cond.float()], 1)
         return views, features
 

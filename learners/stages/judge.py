@@ -12,7 +12,7 @@ from torch import Tensor
 
 from envs.encoders import to_signed
 from envs.episodes.clips import ClipStore
-from envs.judges.base import frame_labels
+from envs.judges.base import Judge, frame_labels
 from envs.judges.learned import LearnedJudge
 from envs.language import tokenize
 from learners.fit import FitConfig, fit
@@ -76,27 +76,30 @@ def augment(pictures: Tensor, generator: torch.Generator, strength: float = 0.08
     return pictures * (1 + strength * draw[0]) + strength * draw[1]
 
 
-def calibrate(judge: LearnedJudge, success: Tensor, valid: Tensor, truth: Tensor) -> float:
+def calibrate(judge: Judge, success: Tensor, valid: Tensor, truth: Tensor, resamples: int = 200) -> float:
     """Set the judge's threshold on held-out episodes: best balanced accuracy, less any bias of the success rate.
 
     A threshold that lets more through than succeed is what a policy learns to exploit, so a biased rate costs as
-    much as wrong verdicts do.
+    much as wrong verdicts do. The best threshold of a few dozen episodes jumps with each of them; the mean of the
+    best ones of many resamples (bagging, Breiman 1996) does not.
 
     Args:
         success: frame probabilities [N, T]; valid: bool [N, T]; truth: bool [N].
 
     Returns:
-        That accuracy less the bias.
+        That accuracy less the bias, on all episodes.
     """
-    best, chosen = -1.0, 0.5
-    for threshold in torch.linspace(0.1, 0.95, 35).tolist():
-        judge.threshold.fill_(threshold)
-        verdict = judge.episode(success, valid)
-        right = verdict == truth
-        parts = [right[truth == flag].float().mean() for flag in (True, False) if (truth == flag).any()]
-        bias = abs(float(verdict.float().mean() - truth.float().mean()))
-        accuracy = float(torch.stack(parts).mean()) - bias
-        if accuracy > best + 1e-6 or (abs(accuracy - best) <= 1e-6 and abs(threshold - 0.5) < abs(chosen - 0.5)):
-            best, chosen = accuracy, threshold
-    judge.threshold.fill_(chosen)
-    return best
+    # An episode succeeds if its best run of `hold` frames lies above the threshold throughout.
+    best = torch.where(valid, success, 0.0).unfold(1, judge.hold, 1).amin(-1).amax(1)
+    thresholds = torch.linspace(0.05, 0.95, 91)
+    verdicts = best[:, None] >= thresholds
+    generator = torch.Generator().manual_seed(0)
+
+    def merit(pick: Tensor) -> Tensor:
+        said, true = verdicts[pick].float(), truth[pick].float()[:, None]
+        hits = [((said == true) * (true == flag)).sum(0) / (true == flag).sum().clamp(min=1) for flag in (0, 1) if (true == flag).any()]
+        return torch.stack(hits).mean(0) - (said.mean(0) - true.mean()).abs()
+
+    chosen = [thresholds[merit(torch.randint(len(truth), (len(truth),), generator=generator)).argmax()] for _ in range(resamples)]
+    judge.threshold.fill_(torch.stack(chosen).mean())
+    return float(merit(torch.arange(len(truth)))[(thresholds - judge.threshold.cpu()).abs().argmin()])

@@ -1,0 +1,96 @@
+"""Things that move as a whole: masks on the last frame, each carried to where it will be (Finn et al. 2016, STP).
+
+A block that is pushed keeps its shape. Drawing it anew in every chunk blurs it away over a rollout; lifting it out of
+the last frame and setting it down elsewhere does not. What carries it is a small network that sees no pixels, only
+where the mask is and where the fingertips are and will be in the picture: contact is then a matter of few numbers.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from envs.geometry import fingertips, project
+
+_SPAN = 3.0  # half-pictures beyond which a fingertip counts as out of sight
+
+
+def tip_tracks(now: Tensor, commands: Tensor, intrinsic: Tensor, c2w_now: Tensor, c2w: Tensor, size: tuple[int, int]) -> Tensor:
+    """Fingertips in the pictures of every view, in half-pictures from the middle.
+
+    Args:
+        now: [B, 14] command in force; commands: [B, K, 14] to come.
+        intrinsic: [B, V, 3, 3] pixels of `size` = (height, width).
+        c2w_now: [B, V, 4, 4]; c2w: [B, K, V, 4, 4] as they will be.
+
+    Returns:
+        [B, V, 1 + 2 K, 2, 2]: both tips now; both tips at each step; and where both present tips will appear at each
+        step, which says how the camera itself moves.
+    """
+    scale = torch.tensor([size[1], size[0]], device=now.device) / 2
+
+    def see(points: Tensor, camera: Tensor) -> Tensor:  # [B, T, 2, 3], [B, T, V, 4, 4] -> [B, V, T, 2, 2]
+        pixels, depth = project(points[:, :, None].expand(-1, -1, camera.shape[2], -1, -1), intrinsic[:, None].expand(-1, camera.shape[1], -1, -1, -1), camera)
+        where = torch.where(depth[..., None] > 1e-3, pixels / scale - 1, torch.full_like(pixels, _SPAN))
+        return where.clamp(-_SPAN, _SPAN).transpose(1, 2)
+
+    here, ahead = fingertips(now)[:, None], fingertips(commands)
+    return torch.cat((see(here, c2w_now[:, None]), see(ahead, c2w), see(here.expand_as(ahead), c2w)), 2)
+
+
+class Transport(nn.Module):
+    """Carries masked parts of one view's last frame through the frames of a chunk.
+
+    Args:
+        chunk: frames per chunk, K.
+        slots: masks, S.
+        width: hidden size of the network that carries them.
+    """
+
+    def __init__(self, chunk: int, slots: int, width: int = 128):
+        super().__init__()
+        self.chunk, self.slots = chunk, slots
+        tracks = 4 * (1 + 2 * chunk)
+        self.moves = nn.Sequential(nn.Linear(6 + 2 * tracks + slots, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 4 * chunk))
+        last = self.moves[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
+    @torch.autocast("cpu", enabled=False)
+    @torch.autocast("cuda", enabled=False)  # positions need more than the eight bits of bfloat16
+    def forward(self, masks: Tensor, picture: Tensor, tracks: Tensor) -> tuple[Tensor, Tensor]:
+        """Pictures and masks after the move.
+
+        Args:
+            masks: [B, S, H, W] in 0..1 on `picture` [B, 3, H, W], the last frame.
+            tracks: [B, 1 + 2 K, 2, 2] of this view (tip_tracks).
+
+        Returns:
+            colours [B, S, K, 3, H, W] and coverage [B, S, K, 1, H, W] in 0..1.
+        """
+        batch, slots, height, width = masks.shape
+        v, u = torch.meshgrid(torch.arange(height, device=masks.device), torch.arange(width, device=masks.device), indexing="ij")
+        place = torch.stack(((2 * u + 1) / width - 1, (2 * v + 1) / height - 1), -1)  # [H, W, 2]
+        mass = masks.sum((-2, -1))[..., None] + 1e-3
+        middle = torch.einsum("bshw,hwc->bsc", masks, place) / mass
+        second = torch.einsum("bshw,hwc->bsc", masks, torch.cat((place.square(), place.prod(-1, keepdim=True)), -1)) / mass
+        spread = second - torch.cat((middle.square(), middle.prod(-1, keepdim=True)), -1)
+        absolute = tracks.flatten(1)[:, None].expand(-1, slots, -1)
+        relative = (tracks[:, None] - middle[:, :, None, None]).flatten(2)
+        which = torch.eye(slots, device=masks.device).expand(batch, -1, -1)
+        seen = torch.cat((middle, 30 * spread, (mass / (height * width)).log() / 4, absolute, 4 * relative.clamp(-1, 1), which), -1)
+        # Each frame goes on from the one before; increments of a frame are small.
+        moves = (0.2 * self.moves(seen)).unflatten(-1, (self.chunk, 4)).cumsum(2)  # [B, S, K, 4]
+        shift, turn, growth = moves[..., :2], moves[..., 2], moves[..., 3].clamp(-1, 1).exp()
+        centre = middle[:, :, None, None, None]
+        offset = (place - centre - shift[:, :, :, None, None]) / growth[..., None, None, None]
+        aspect = torch.tensor([width / height, height / width], device=masks.device)
+        cos, sin = turn.cos()[..., None, None], turn.sin()[..., None, None]
+        turned = torch.stack((cos * offset[..., 0] + sin * offset[..., 1] * aspect[1], cos * offset[..., 1] - sin * offset[..., 0] * aspect[0]), -1)
+        grid = (centre + turned).flatten(0, 1).flatten(1, 2)  # [B S, K H, W, 2]
+        source = torch.cat((picture[:, None].expand(-1, slots, -1, -1, -1), masks[:, :, None]), 2).flatten(0, 1)
+        carried = F.grid_sample(source, grid, padding_mode="zeros", align_corners=False)
+        carried = carried.unflatten(2, (self.chunk, height)).unflatten(0, (batch, slots)).transpose(2, 3)  # [B, S, K, 4, H, W]
+        return carried[:, :, :, :3], carried[:, :, :, 3:]
