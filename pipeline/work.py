@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
-from actors.evaluate import evaluate
+from actors.evaluate import evaluate, imagine
 from actors.factory import (
     ConfigError,
     bench_config,
@@ -195,12 +195,12 @@ def state(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
     return stats
 
 
-def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, state: str, warm: str, steps: str) -> dict[str, Any]:
-    """The judge on real and on generated frames, its threshold calibrated on episodes neither it nor the simulator learned from."""
+def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, state: str, policy: str, warm: str, steps: str, number: int) -> dict[str, Any]:
+    """The judge on real and on generated frames, its threshold calibrated on the policy that was deployed last."""
     section = dict(cfg["judge_fit"][steps])
     fit_section = section.pop("fit")
     store = open_store(found, data)
-    train, held = split(store)
+    train, _ = split(store)
     prepare_process(cfg["seed"])
     simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
     judge = build_judge(cfg, found[warm] / "weights.safetensors" if warm else None)
@@ -223,11 +223,13 @@ def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
             [int(valid.sum())],
         )
     stats = train_judge(judge, store, train, fit_options(cfg, fit_section, f"judge_fit.{steps}.fit"), folder, imagined)
-    if len(held):
-        made = replay(simulator, store, held, bf16=cfg["simulator"]["bf16"])
-        success = measurement.judge_frames(judge, made.frames, store, held)
-        truth = torch.tensor([store.episodes[n]["success"] for n in held.tolist()])
-        stats["calibrated_accuracy"] = calibrate(judge, success, made.valid, truth)
+    save_weights(judge, folder)
+    mine = store.select([f"policy-{number}"])
+    world = load_world(cfg, {**found, "self": folder}, store, vision, state, "self", min(64, len(mine)), mine)
+    actor = build_policy(cfg, found[policy] / "weights.safetensors")
+    frames = imagine(world, actor, list(range(len(mine))), sampling_seed=cfg["seed"] + 1)
+    truth = torch.tensor([store.episodes[n]["success"] for n in mine.tolist()])
+    calibrate(judge, measurement.judge_frames(judge, frames, store, mine), float(truth.float().mean()))
     save_weights(judge, folder)
     return {**stats, "threshold": float(judge.threshold)}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,6 @@ from envs.judges.base import Judge, frame_labels
 from envs.judges.learned import LearnedJudge
 from envs.language import tokenize
 from learners.fit import FitConfig, fit
-
-Imagine = Callable[[Tensor], tuple[Tensor, Tensor]]  # episodes [n] -> frames uint8 [n, T, V, 3, H, W], valid [n, T]; row 0 is real
 
 
 def episode_labels(store: ClipStore, hold: int) -> Tensor:
@@ -76,30 +73,16 @@ def augment(pictures: Tensor, generator: torch.Generator, strength: float = 0.08
     return pictures * (1 + strength * draw[0]) + strength * draw[1]
 
 
-def calibrate(judge: Judge, success: Tensor, valid: Tensor, truth: Tensor, resamples: int = 200) -> float:
-    """Set the judge's threshold on held-out episodes: best balanced accuracy, less any bias of the success rate.
+def calibrate(judge: Judge, success: Tensor, rate: float) -> None:
+    """Set the judge's threshold so that imagined episodes succeed as often as true ones did.
 
-    A threshold that lets more through than succeed is what a policy learns to exploit, so a biased rate costs as
-    much as wrong verdicts do. The best threshold of a few dozen episodes jumps with each of them; the mean of the
-    best ones of many resamples (bagging, Breiman 1996) does not.
+    A judge that lets more through than succeed is what a policy learns to exploit. Matching the rate of a policy whose
+    episodes were counted in physics uses all of them; a threshold of best accuracy on the few dozen episodes that are
+    kept from training jumps with each of these.
 
     Args:
-        success: frame probabilities [N, T]; valid: bool [N, T]; truth: bool [N].
-
-    Returns:
-        That accuracy less the bias, on all episodes.
+        success: frame probabilities [N, T] of imagined episodes of that policy; rate: its success rate in physics.
     """
     # An episode succeeds if its best run of `hold` frames lies above the threshold throughout.
-    best = torch.where(valid, success, 0.0).unfold(1, judge.hold, 1).amin(-1).amax(1)
-    thresholds = torch.linspace(0.05, 0.95, 91)
-    verdicts = best[:, None] >= thresholds
-    generator = torch.Generator().manual_seed(0)
-
-    def merit(pick: Tensor) -> Tensor:
-        said, true = verdicts[pick].float(), truth[pick].float()[:, None]
-        hits = [((said == true) * (true == flag)).sum(0) / (true == flag).sum().clamp(min=1) for flag in (0, 1) if (true == flag).any()]
-        return torch.stack(hits).mean(0) - (said.mean(0) - true.mean()).abs()
-
-    chosen = [thresholds[merit(torch.randint(len(truth), (len(truth),), generator=generator)).argmax()] for _ in range(resamples)]
-    judge.threshold.fill_(torch.stack(chosen).mean())
-    return float(merit(torch.arange(len(truth)))[(thresholds - judge.threshold.cpu()).abs().argmin()])
+    best = success.unfold(1, judge.hold, 1).amin(-1).amax(1)
+    judge.threshold.fill_(float(best.quantile(1 - rate).clamp(0.02, 0.98)))
