@@ -43,7 +43,7 @@ def build_loop(cfg: Cfg, root: Path) -> Graph:
             warm = (add("tokenizer", tuple(data), {**learned, "tokenizer": cfg["tokenizer"]}, work.tokenizer, data=tuple(data)),)
         vision = add(f"vision-{number}", (*data, *warm), {**learned, "vision": cfg["vision"][steps]}, work.vision, data=tuple(data), warm=warm, steps=steps)
         state = add(f"state-{number}", (*data, vision, *((state,) if state else ())), {**learned, "state": cfg["state"][steps]}, work.state, data=tuple(data), vision=vision, warm=state, steps=steps)
-        settings = {**learned, "judge": cfg["judge"], "judge_fit": cfg["judge_fit"][steps], "policy": cfg["policy"]}
+        settings = {**learned, "judge": cfg["judge"], "judge_fit": cfg["judge_fit"][steps], "policy": cfg["policy"], "starts": cfg["measure"]["starts"]}
         judge = add(f"judge-{number}", (*data, vision, state, policy, *((judge,) if judge else ())), settings, work.judge, data=tuple(data), vision=vision, state=state, policy=policy, warm=judge, steps=steps, number=number)
         gap = add(f"gap-{number}", (*data, vision, state, judge, policy, held_out), {**settings, "measure": cfg["measure"]}, work.gap, data=tuple(data), vision=vision, state=state, judge=judge, policy=policy, number=number)
         iterations = cfg["rounds"]["iterations"][min(number, len(cfg["rounds"]["iterations"])) - 1]

@@ -46,7 +46,6 @@ class UNetConfig:
 _FOLD = 4  # pixels folded into channels, both ways
 _CHANNELS = 5 + 2 + 3 + 1  # logits of the sources, flow, drawn colour, whether what is carried lies in front
 _REACH = 8.0  # pixels one unit of flow moves
-_SESSIONS = 16  # predicted at a time on a CPU
 
 
 class _Block(nn.Module):
@@ -154,10 +153,8 @@ class UNetSimulator(Simulator):
 
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; features are the pooled bottleneck beside the action embedding."""
-        # On a CPU the maps of a few sessions stay in its cache, those of many do not.
-        parts = inputs.split(_SESSIONS) if inputs["future", "commands"].device.type == "cpu" else (inputs,)
-        drawn = [(self._enlarge(views), features) for views, features in map(self.views, parts)]
-        return torch.cat([frames for frames, _ in drawn]), torch.cat([features for _, features in drawn])
+        views, features = self.views(inputs)
+        return self._enlarge(views), features
 
     def _enlarge(self, views: list[Tensor]) -> Tensor:
         full = [
