@@ -37,6 +37,7 @@ def build_loop(cfg: Cfg, root: Path) -> Graph:
         size = cfg["rounds"]["deploy"][min(number, len(cfg["rounds"]["deploy"])) - 1]
         deploy = add(f"deploy-{number}", (policy,), {**world, "deploy": size, "policy": cfg["policy"]}, work.deploy, number=number, episodes=size)
         data = [*data, deploy]
+        cloned = add(f"clone-{number}", (*data, policy), {**world, "policy": cfg["policy"], "imitation": cfg["imitation"], "clone": cfg["clone"]}, work.clone, data=tuple(data), policy=policy)
         steps = "first" if number == 1 else "refresh"
         warm = (vision,) if vision else ()
         if cfg["simulator"]["engine"] == "dit" and not vision:
@@ -48,7 +49,7 @@ def build_loop(cfg: Cfg, root: Path) -> Graph:
         gap = add(f"gap-{number}", (*data, vision, state, judge, policy, held_out), {**settings, "measure": cfg["measure"]}, work.gap, data=tuple(data), vision=vision, state=state, judge=judge, policy=policy, number=number)
         iterations = cfg["rounds"]["iterations"][min(number, len(cfg["rounds"]["iterations"])) - 1]
         settings = {**settings, "algorithm": cfg["algorithm"], "rl": cfg["rl"], "iterations": iterations}
-        policy = add(f"rl-{number}", (*data, vision, state, judge, policy, gap), settings, work.rl, data=tuple(data), vision=vision, state=state, judge=judge, policy=policy, iterations=iterations, number=number)
+        policy = add(f"rl-{number}", (*data, vision, state, judge, cloned, gap), settings, work.rl, data=tuple(data), vision=vision, state=state, judge=judge, policy=cloned, iterations=iterations, number=number)
     measured = {**learned, "judge": cfg["judge"], "policy": cfg["policy"], "measure": cfg["measure"]}
     world_parents = (*data, vision, state, judge)
     known = {"data": tuple(data), "vision": vision, "state": state, "judge": judge}

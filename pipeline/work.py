@@ -153,6 +153,23 @@ def imitation(cfg: Cfg, folder: Path, found: Found) -> dict[str, Any]:
     return {**stats, "demos": len(experts)}
 
 
+def worked(cfg: Cfg, store: ClipStore) -> Tensor:
+    """Episodes known to have worked in physics: the demonstrations, and the successes of deployed policies."""
+    known = torch.cat([store.select(["expert"], succeeded=True)[: cfg["imitation"]["demos"]], store.select(["policy-*"], succeeded=True)])
+    return known[torch.isin(known, split(store)[0])]
+
+
+def clone(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], policy: str) -> dict[str, Any]:
+    """The deployed policy, perception and all, learns from what worked in physics; RL then leaves its perception as it is."""
+    store = open_store(found, data)
+    prepare_process(cfg["seed"])
+    actor = build_policy(cfg, found[policy] / "weights.safetensors")
+    episodes = worked(cfg, store)
+    stats = train_imitation(actor, store, episodes, fit_options(cfg, cfg["clone"], "clone"), folder, fresh=False)
+    save_weights(actor, folder)
+    return {**stats, "episodes": len(episodes)}
+
+
 def tokenizer(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...]) -> dict[str, Any]:
     """The DiT's video autoencoder."""
     from learners.stages.tokenizer import train_tokenizer
@@ -242,9 +259,7 @@ def rl(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str,
     actor = build_policy(cfg, found[policy] / "weights.safetensors")
     settings = options(RLConfig, {**cfg["rl"], "iterations": iterations, "seed": cfg["seed"] * 100 + number}, "rl")
     world = load_world(cfg, found, store, vision, state, judge, settings.envs)
-    train, _ = split(store)
-    known = torch.cat([store.select(["expert"], succeeded=True)[: cfg["imitation"]["demos"]], store.select(["policy-*"], succeeded=True)])
-    anchor = Cloning(actor, store, known[torch.isin(known, train)])
+    anchor = Cloning(actor, store, worked(cfg, store))
     if settings.freeze_perception:
         actor.freeze_perception()
         anchor.look()

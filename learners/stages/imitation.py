@@ -73,10 +73,11 @@ class Cloning:
         return error.sum() / (active.sum() * error.shape[0] * error.shape[1])
 
 
-def train_imitation(policy: ChunkPolicy, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path) -> dict[str, float]:
-    """Clone the given episodes; sets the policy's units from them first."""
+def train_imitation(policy: ChunkPolicy, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path, fresh: bool = True) -> dict[str, float]:
+    """Clone the given episodes; a `fresh` policy gets its units from them first, one that can act already keeps its own."""
     cloning = Cloning(policy, store, episodes)
-    policy.normalise(cloning.targets, store.arrays["states"][cloning.rows], torch.tensor(ACTIVE_FLOOR * 2))
+    if fresh:
+        policy.normalise(cloning.targets, store.arrays["states"][cloning.rows], torch.tensor(ACTIVE_FLOOR * 2))
     policy.head.log_std.requires_grad_(False)  # exploration is a choice, not something demonstrations tell
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:

@@ -27,8 +27,9 @@ def test_same_seed_same_episode_whatever_the_workers() -> None:
             assert np.array_equal(np.stack(one.rows[name]), np.stack(two.rows[name])), name
 
 
-def test_expert_succeeds_on_unseen_seeds() -> None:
-    pool = BenchPool(BenchConfig(), 2, 40)
+@pytest.mark.parametrize("control_hz", [10.0, 5.0])
+def test_expert_succeeds_on_unseen_seeds(control_hz: float) -> None:
+    pool = BenchPool(BenchConfig(control_hz=control_hz), 2, round(4 * control_hz))
     tracks = pool.script([(500_000 + seed, 0.0) for seed in range(100)])
     pool.close()
     assert sum(bool(track.rows["success"][-1]) for track in tracks) >= 95

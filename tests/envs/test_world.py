@@ -95,7 +95,7 @@ class Fixed(LearnedJudge):
         super().__init__()
         self.value, self.said = success, status
 
-    def score(self, frames: torch.Tensor, tokens: torch.Tensor, objects: torch.Tensor | None = None) -> Verdict:
+    def score(self, frames: torch.Tensor, first: torch.Tensor, tokens: torch.Tensor, objects: torch.Tensor | None = None) -> Verdict:
         batch, count = frames.shape[:2]
         filled = torch.full((batch, count), self.value)
         return Verdict(filled, filled, torch.full((batch,), self.said.value))
@@ -117,6 +117,19 @@ def test_success_streak_crosses_chunks(simulator: UNetSimulator) -> None:
     assert done.tolist() == [[False, False, False]] and run.tolist() == [2]
     done, _ = judge.streak(torch.tensor([[0.9, 0.9, 0.1]]), run)
     assert done.tolist() == [[False, True, False]]
+
+
+def test_judge_compares_with_the_episodes_own_first_frame(simulator: UNetSimulator, store: ClipStore) -> None:
+    seen = []
+
+    class Watching(Fixed):
+        def score(self, frames: torch.Tensor, first: torch.Tensor, tokens: torch.Tensor, objects: torch.Tensor | None = None) -> Verdict:
+            seen.append(first)
+            return super().score(frames, first, tokens, objects)
+
+    env = world(simulator, store, 2, Watching(0.1))
+    play(env, [3, 1], 2)
+    assert torch.equal(seen[-1], env.base_env.starts.image[[3, 1]])
 
 
 def test_frame_labels_begin_where_the_hold_begins() -> None:

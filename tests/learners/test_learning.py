@@ -14,6 +14,7 @@ from torch import nn
 from actors.policies.chunk_gaussian import ChunkGaussian, knot_basis
 from actors.policies.vla import ChunkPolicy
 from envs.episodes.clips import ClipStore
+from envs.judges import LearnedJudge
 from envs.physics.bench import BenchConfig
 from envs.physics.env import PhysicsEnv
 from envs.schema import CHUNK, EPISODE, IMAGE, JUDGE_STATUS, LOG_PROB, STATE, SUCCESS, TOKENS, Status
@@ -23,6 +24,7 @@ from learners.grpo import GRPO, GRPOConfig
 from learners.ppo import PPO, PPOConfig
 from learners.rl import Alarms, RLConfig, first_episode, judged, train_rl
 from learners.stages.imitation import train_imitation
+from learners.stages.judge import calibrate
 
 
 class Stop(Exception):
@@ -142,6 +144,29 @@ def test_update_makes_better_chunks_likelier(name: str) -> None:
     new = policy.get_dist(data.clone(False)).log_prob(data[CHUNK]) - data[LOG_PROB]
     good = data["advantage"].flatten() > data["advantage"].mean()
     assert float(new[good].mean()) > float(new[~good].mean())
+
+
+def test_frozen_perception_is_neither_trained_nor_run_again() -> None:
+    policy = small_policy()
+    policy.freeze_perception()
+    algorithm = PPO(policy, PPOConfig())
+    data, _ = algorithm.prepare(rollout([[1.0, 1.0]] * 4 + [[0.0, 0.0]] * 4, policy))
+    assert IMAGE not in data.keys(True, True)
+    before = {name: value.clone() for name, value in policy.state_dict().items()}
+    optimiser = torch.optim.Adam(algorithm.groups(1e-2))
+    loss, _ = algorithm.loss(data)
+    loss.backward()
+    optimiser.step()
+    changed = {name for name, value in policy.state_dict().items() if not torch.equal(value, before[name])}
+    assert changed and not any(name.startswith("module.0.") for name in changed)
+
+
+def test_threshold_lets_through_as_many_as_succeed() -> None:
+    judge = LearnedJudge(hold=2)
+    frames = torch.rand(200, 8, generator=torch.Generator().manual_seed(0))
+    calibrate(judge, frames, 0.25)
+    said = judge.episode(frames, torch.ones_like(frames).bool())
+    assert abs(float(said.float().mean()) - 0.25) <= 0.01
 
 
 def test_filtered_bc_keeps_successes_only() -> None:
