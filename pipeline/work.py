@@ -241,9 +241,8 @@ def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
         )
     stats = train_judge(judge, store, train, fit_options(cfg, fit_section, f"judge_fit.{steps}.fit"), folder, imagined)
     save_weights(judge, folder)
-    mine = store.select([f"policy-{number}"])
+    mine = store.select([f"policy-{number}"])[: cfg["measure"]["starts"]]
     rate = torch.tensor([store.episodes[n]["success"] for n in mine.tolist()]).float().mean()
-    mine = mine[: cfg["measure"]["starts"]]
     world = load_world(cfg, {**found, "self": folder}, store, vision, state, "self", min(64, len(mine)), mine)
     actor = build_policy(cfg, found[policy] / "weights.safetensors")
     frames = imagine(world, actor, list(range(len(mine))), sampling_seed=cfg["seed"] + 1)
@@ -280,13 +279,12 @@ def load_world(cfg: Cfg, found: Found, store: ClipStore, vision: str, state: str
 def gap(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, state: str, judge: str, policy: str, number: int) -> dict[str, Any]:
     """How far imagination and truth lie apart for the policy just deployed: same starts, same stochastic policy."""
     store = open_store(found, data)
-    mine = store.select([f"policy-{number}"])
+    mine = store.select([f"policy-{number}"])[: cfg["measure"]["starts"]]
     prepare_process(cfg["seed"])
     actor = build_policy(cfg, found[policy] / "weights.safetensors")
     truth = torch.tensor([store.episodes[n]["success"] for n in mine.tolist()])
-    starts = mine[: cfg["measure"]["starts"]]
-    world = load_world(cfg, found, store, vision, state, judge, min(64, len(starts)), starts)
-    outcome = evaluate(world, actor, list(range(len(starts))), stochastic=True, label="gap", sampling_seed=cfg["seed"])
+    world = load_world(cfg, found, store, vision, state, judge, min(64, len(mine)), mine)
+    outcome = evaluate(world, actor, list(range(len(mine))), stochastic=True, label="gap", sampling_seed=cfg["seed"])
     said = outcome.success[outcome.judged]
     result = {"round": number, "true": rate_entry(truth), "imagined": rate_entry(said), "gap": float(said.float().mean() - truth.float().mean())}
     _, held = split(store)
