@@ -113,8 +113,8 @@ class ClipStore:
 
         Returns:
             TensorDict [B] with memory (index [L, M], frames, pose_map uint8 [L, M, V, 3, H, W], c2w [L, M, V, 4, 4]),
-            future (frames, pose_map [L*K, V, 3, H, W], c2w, commands [L*K, 14], states [L*K, 16], valid [L*K]),
-            now (command [14], state [16]), history (states, commands [M, ...]), intrinsic [V, 3, 3], begin [].
+            future (frames, pose_map [L*K, V, 3, H, W], c2w, commands [L*K, 14], states [L*K, 16], objects [L*K, 2, 3], valid [L*K]),
+            now (command [14], state [16], objects [2, 3]), history (states, commands [M, ...]), intrinsic [V, 3, 3], begin [].
             Frames past the episode's end repeat its last and are not valid.
         """
         total = spec.chunks * spec.chunk
@@ -144,11 +144,12 @@ class ClipStore:
                         "c2w": pick("c2w", rows),
                         "commands": pick("commands", rows),
                         "states": pick("states", rows),
+                        "objects": pick("objects", rows),
                         "valid": valid,
                     },
                     size,
                 ),
-                "now": TensorDict({"command": pick("commands", now), "state": pick("states", now)}, size),
+                "now": TensorDict({"command": pick("commands", now), "state": pick("states", now), "objects": pick("objects", now)}, size),
                 "history": TensorDict({"commands": pick("commands", recent), "states": pick("states", recent)}, size),
                 "intrinsic": self.intrinsic[episode],
                 "begin": begin // spec.stride,

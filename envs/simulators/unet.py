@@ -18,8 +18,8 @@ from torch import Tensor, nn
 
 from envs.conditioning import render_ray_map
 from envs.schema import ACTION_DIM, to_relative
-from envs.simulators.base import Simulator, WorldShape, foreground_weight, hue_gap
-from envs.simulators.transport import Transport, tip_tracks
+from envs.simulators.base import Simulator, WorldShape, foreground_weight
+from envs.simulators.transport import Carried, Parts, Transport, in_view, tip_tracks, track_loss
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,7 @@ class UNetConfig:
         foreground: extra loss weight of what differs from the median colour.
         emphasis: loss weight of each view.
         slots: parts per view that may be carried as a whole.
+        tracks: loss weight of known object positions (transport.track_loss).
     """
 
     shrink: tuple[int, ...] = (1, 2, 2)
@@ -41,10 +42,11 @@ class UNetConfig:
     foreground: float = 8.0
     emphasis: tuple[float, ...] = (1.0, 0.4, 0.4)
     slots: int = 2
+    tracks: float = 2.0
 
 
 _FOLD = 4  # pixels folded into channels, both ways
-_CHANNELS = 5 + 2 + 3 + 1  # logits of the sources, flow, drawn colour, whether what is carried lies in front
+_CHANNELS = 5 + 2 + 3  # logits of the sources, flow, drawn colour
 _REACH = 8.0  # pixels one unit of flow moves
 
 
@@ -68,24 +70,29 @@ class _Block(nn.Module):
         return x + h
 
 
-def _head(width: int, chunk: int, slots: int) -> nn.Sequential:
-    """Output layer of one view, maps of each frame and the masks of the parts; it starts from "nothing moves", for random output takes hundreds of steps to unlearn."""
-    last = nn.Conv2d(width, (_CHANNELS * chunk + slots) * _FOLD**2, 1)
-    bias = torch.zeros(_CHANNELS * chunk + slots, _FOLD**2)
-    bias[: _CHANNELS * chunk : _CHANNELS] = 3.0
-    bias[_CHANNELS * chunk :] = -4.0
-    with torch.no_grad():
-        # Masks differ from the start, or all would learn the same.
-        last.weight[: _CHANNELS * chunk * _FOLD**2].zero_()
+def _head(width: int, chunk: int) -> nn.Sequential:
+    """Output layer of one view; it starts from "nothing moves", for random output takes hundreds of steps to unlearn."""
+    last = nn.Conv2d(width, _CHANNELS * chunk * _FOLD**2, 1)
+    bias = torch.zeros(chunk, _CHANNELS, _FOLD**2)
+    bias[:, 0] = 3.0
+    nn.init.zeros_(last.weight)
     last.bias = nn.Parameter(bias.flatten())
     return nn.Sequential(nn.GroupNorm(8, width), nn.SiLU(), last)
 
 
-def _compose(drawn: Tensor, last: Tensor, first: Tensor, carried: tuple[Tensor, Tensor]) -> Tensor:
-    """Frames [B, K, 3, H, W] from the output maps [B, K, 11, H, W] of one view, its last and first frame [B, 3, H, W], and what is carried (Transport)."""
+def _compose(drawn: Tensor, last: Tensor, first: Tensor, carried: Carried) -> Tensor:
+    """Frames of a chunk in one view.
+
+    Args:
+        drawn: [B, K, 10, H, W] output maps; last, first: [B, 3, H, W] frames.
+        carried: parts of the last frame and where they go, the first uppermost.
+
+    Returns:
+        [B, K, 3, H, W].
+    """
     _, chunk, _, height, width = drawn.shape
     # Split, not sliced: the gradient of a slice is a full map of zeros.
-    logits, flow, colour, front = drawn.split((5, 2, 3, 1), 2)
+    logits, flow, colour = drawn.split((5, 2, 3), 2)
     still, moves, past, middle, fresh = logits.softmax(2).split(1, 2)
     v, u = torch.meshgrid(
         torch.linspace(-1 + 1 / height, 1 - 1 / height, height, device=drawn.device),
@@ -95,13 +102,15 @@ def _compose(drawn: Tensor, last: Tensor, first: Tensor, carried: tuple[Tensor, 
     flow_u, flow_v = (flow * (2 * _REACH)).unbind(2)
     grid = torch.stack((u + flow_u / width, v + flow_v / height), -1)
     # All frames of a chunk are sampled from one picture: stack them as rows of one tall grid.
+    median = first.flatten(2).median(-1).values[..., None, None]
+    # What is carried is lifted out first: a thing is in one place, and doubt about where must not fade it.
+    hole = 1 - (1 - carried.masks).prod(1, keepdim=True)
+    last = last + hole * (median - last)
     moved = F.grid_sample(last, grid.flatten(1, 2), padding_mode="border", align_corners=False)
     moved = moved.unflatten(2, (chunk, height)).transpose(1, 2)
-    median = first.flatten(2).median(-1).values[:, None, :, None, None]
-    out = still * last[:, None] + moves * moved + past * first[:, None] + middle * median + fresh * (0.5 + 0.5 * colour)
-    shown = (front + 2.0).sigmoid()
-    for part, cover in zip(carried[0].unbind(1), carried[1].unbind(1), strict=True):
-        out = out + shown * cover * (part - out)
+    out = still * last[:, None] + moves * moved + past * first[:, None] + middle * median[:, None] + fresh * (0.5 + 0.5 * colour)
+    for part, cover in zip(carried.colours.flip(1).unbind(1), carried.cover.flip(1).unbind(1), strict=True):
+        out = out + cover * (part - out)
     return out
 
 
@@ -148,12 +157,13 @@ class UNetSimulator(Simulator):
         self.fine_in = nn.ModuleList(_Block(config.width, cond) for _ in range(fine))
         self.deep = nn.ModuleList(_Block(wide, cond) for _ in range(deep))
         self.fine_out = nn.ModuleList(_Block(config.width, cond) for _ in range(fine))
-        self.heads = nn.ModuleList(_head(config.width if s == 1 else wide, shape.chunk, config.slots) for s in config.shrink)
+        self.heads = nn.ModuleList(_head(config.width if s == 1 else wide, shape.chunk) for s in config.shrink)
+        self.parts = nn.ModuleList(Parts(config.slots) for _ in config.shrink)
         self.transports = nn.ModuleList(Transport(shape.chunk, config.slots) for _ in config.shrink)
 
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; features are the pooled bottleneck beside the action embedding."""
-        views, features = self.views(inputs)
+        views, features, _ = self.views(inputs)
         return self._enlarge(views), features
 
     def _enlarge(self, views: list[Tensor]) -> Tensor:
@@ -168,21 +178,22 @@ class UNetSimulator(Simulator):
         _, z, cond, _ = self._encode(inputs)
         return torch.cat([z.float().mean((-2, -1)), cond.float()], 1)
 
-    def _encode(self, inputs: TensorDict) -> tuple[Tensor, Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
-        """Fine and coarse maps, the action embedding, and each view's first and last frame as it is looked at."""
+    def _encode(self, inputs: TensorDict) -> tuple[Tensor, Tensor, Tensor, list[tuple[Tensor, Tensor, Tensor]]]:
+        """Fine and coarse maps, the action embedding, and each view's first and last frame and last pose map as it is looked at."""
         memory, future = inputs["memory"], inputs["future"]
         stack = torch.cat([memory["frames"], memory["pose_map"], future["pose_map"]], 1)  # uint8 [B, 2M+K, V, 3, H, W]
         relative = to_relative(future["commands"], inputs["now", "command"]) * 10.0  # decimetres
         cond = self.actions(torch.cat([relative.flatten(1), inputs["now", "command"]], 1))
         fine: list[Tensor] = []
         deep = [self.rays(self._rays(inputs))]
-        ends: list[tuple[Tensor, Tensor]] = []
+        ends: list[tuple[Tensor, Tensor, Tensor]] = []
         for view, (shrink, embed) in enumerate(zip(self.config.shrink, self.embed, strict=True)):
             pictures = stack[:, :, view].flatten(1, 2).float().div_(255.0)
             if shrink > 1:
                 pictures = F.avg_pool2d(pictures, shrink)
             latest = 3 * (self.shape.memory - 1)
-            ends.append((pictures[:, :3], pictures[:, latest : latest + 3]))
+            drawn_at = 3 * (2 * self.shape.memory - 1)
+            ends.append((pictures[:, :3], pictures[:, latest : latest + 3], pictures[:, drawn_at : drawn_at + 3]))
             folded = _fold(pictures * 2 - 1).contiguous(memory_format=torch.channels_last)
             (fine if shrink == 1 else deep).append(embed(folded))
         x = torch.stack(fine).sum(0)
@@ -193,23 +204,24 @@ class UNetSimulator(Simulator):
             z = block(z, cond)
         return x, z, cond, ends
 
-    def views(self, inputs: TensorDict) -> tuple[list[Tensor], Tensor]:
-        """Frames of each view [B, K, 3, H / shrink, W / shrink], not yet enlarged, and the features."""
+    def views(self, inputs: TensorDict) -> tuple[list[Tensor], Tensor, list[Carried]]:
+        """Frames of each view [B, K, 3, H / shrink, W / shrink], not yet enlarged, the features, and what each view carries."""
         x, z, cond, ends = self._encode(inputs)
         chunk = self.shape.chunk
         x = self.fuse(torch.cat([x, F.pixel_shuffle(self.up(z), 2)], 1))
         for block in self.fine_out:
             x = block(x, cond)
-        views = []
+        views: list[Tensor] = []
+        parts: list[Carried] = []
         future, memory = inputs["future"], inputs["memory"]
         tracks = tip_tracks(inputs["now", "command"], future["commands"], inputs["intrinsic"], memory["c2w"][:, -1], future["c2w"], self.shape.size)
-        for view, (shrink, head, carry, (first, last)) in enumerate(zip(self.config.shrink, self.heads, self.transports, ends, strict=True)):
-            drawn, masks = _unfold(head(x if shrink == 1 else z).float().contiguous()).split((_CHANNELS * chunk, self.config.slots), 1)
-            # What is coloured unlike the rest is likelier to be a thing; which of them moves is for the network to learn.
-            carried = carry((masks + 6.0 * hue_gap(last)).sigmoid(), last, tracks[:, view])
-            views.append(_compose(drawn.unflatten(1, (chunk, _CHANNELS)), last, first, carried))
+        for view, (shrink, head, carry, (first, last, pose)) in enumerate(zip(self.config.shrink, self.heads, self.transports, ends, strict=True)):
+            drawn = _unfold(head(x if shrink == 1 else z).float().contiguous())
+            masks = self.parts[view](last, first, pose).float()
+            parts.append(carry(masks, last, tracks[:, view]))
+            views.append(_compose(drawn.unflatten(1, (chunk, _CHANNELS)), last, first, parts[-1]))
         features = torch.cat([z.float().mean((-2, -1)), cond.float()], 1)
-        return views, features
+        return views, features, parts
 
     def _rays(self, inputs: TensorDict) -> Tensor:
         """Ray maps [B, V * 12, h, w] of the last remembered and the last future frame at the bottleneck's resolution."""
@@ -238,7 +250,7 @@ class UNetSimulator(Simulator):
             future = TensorDict({k: clip["future", k][:, part] for k in ("pose_map", "c2w", "commands")}, clip.shape)
             now = TensorDict({"command": command, "state": state}, clip.shape)
             inputs = TensorDict({"memory": memory, "future": future, "now": now, "intrinsic": clip["intrinsic"]}, clip.shape)
-            views, _ = self.views(inputs)
+            views, _, parts = self.views(inputs)
             valid = clip["future", "valid"][:, part, None, None, None]
             error, norm = torch.zeros(()), torch.zeros(())
             for view, (frames, shrink, emphasis) in enumerate(zip(views, self.config.shrink, self.config.emphasis, strict=True)):
@@ -251,10 +263,18 @@ class UNetSimulator(Simulator):
                 error = error + ((gap.abs() + 50 * gap.square()) * weight).sum()
                 norm = norm + 3 * weight.sum()
             losses.append(error / norm.clamp(min=1))
+            if number == 0:  # later chunks begin from own frames, where things need not be where they were
+                here = in_view(clip["now", "objects"][:, None], clip["intrinsic"], memory["c2w"][:, -1:], self.shape.size)
+                there = in_view(clip["future", "objects"][:, part], clip["intrinsic"], future["c2w"], self.shape.size)
+                told = [
+                    emphasis * track_loss(carried, tuple(x[:, view] for x in here), tuple(x[:, view] for x in there), clip["future", "valid"][:, part])
+                    for view, (carried, emphasis) in enumerate(zip(parts, self.config.emphasis, strict=True))
+                ]
+                tracked = torch.stack(told).sum()
             if number + 1 < chunks:
                 with torch.no_grad():
                     pictures = (self._enlarge(views).clamp(0, 1) * 255).round().to(torch.uint8)
                 drawn = pictures if drawn is None else torch.cat([drawn, pictures], 1)
             command = clip["future", "commands"][:, part.stop - 1]
-        total = torch.stack(losses).mean()
-        return total, {"first_chunk": losses[0].detach(), "last_chunk": losses[-1].detach()}
+        total = torch.stack(losses).mean() + self.config.tracks * tracked
+        return total, {"tracked": tracked.detach(), "first_chunk": losses[0].detach(), "last_chunk": losses[-1].detach()}

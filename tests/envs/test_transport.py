@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from envs.geometry import fingertips, project
-from envs.simulators.transport import Transport, tip_tracks
+from envs.simulators.transport import Carried, Transport, in_view, tip_tracks, track_loss
 
 
 def carry(shift: tuple[float, float]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -18,8 +18,8 @@ def carry(shift: tuple[float, float]) -> tuple[torch.Tensor, torch.Tensor, torch
         bias.copy_(torch.tensor([*shift, 0.0, 0.0] * 2) / 0.2)  # the network's output counts in fifths
     masks, picture = torch.zeros(1, 1, 32, 32), torch.rand(1, 3, 32, 32)
     masks[:, :, 10:14, 8:12] = 1.0
-    colours, cover = transport(masks, picture, torch.zeros(1, 5, 2, 2))
-    return masks, picture, colours, cover
+    carried = transport(masks, picture, torch.zeros(1, 5, 2, 2))
+    return masks, picture, carried.colours, carried.cover
 
 
 def test_nothing_moves_at_first() -> None:
@@ -49,3 +49,23 @@ def test_tip_tracks_are_projections_of_fingertips() -> None:
     pixels, _ = project(fingertips(ahead[0, 1]), intrinsic[0, 0], c2w[0, 0])
     assert torch.allclose(tracks[0, 0, 2], pixels / torch.tensor([32.0, 16.0]) - 1, atol=1e-5)
     assert torch.equal(tracks[0, 0, 0], tracks[0, 0, 4])  # a camera that stands still sees present tips where they are
+
+
+def test_track_loss_wants_parts_where_objects_are() -> None:
+    intrinsic = torch.tensor([[32.0, 0, 16], [0, 32.0, 16], [0, 0, 1]]).expand(1, 1, 3, 3)
+    c2w = torch.eye(4).expand(1, 1, 1, 4, 4)
+    objects = torch.tensor([[[[0.1, 0.0, 0.5]]]])  # at 0.1 / 0.5 * 32 / 16 = 0.4 half-pictures
+    now = tuple(x[:, 0] for x in in_view(objects, intrinsic, c2w, (32, 32)))
+    valid = torch.ones(1, 1, dtype=torch.bool)
+    masks = torch.zeros(1, 1, 32, 32)
+    masks[0, 0, 14:17, 20:23] = 1.0  # nine pixels; 5 cm cover ten
+
+    def loss(u: float, shift: float) -> float:
+        empty = torch.zeros(0)
+        return float(track_loss(Carried(masks, empty, empty, torch.tensor([[[u, 0.0]]]), torch.tensor([[[[shift, 0.0]]]])), now, now, valid))
+
+    assert loss(0.4, 0.0) < 1e-5
+    assert abs(loss(0.5, 0.0) - 0.1) < 1e-5 and abs(loss(0.4, 0.2) - 0.2) < 1e-5
+    unknown = tuple(x[:, 0] for x in in_view(objects * torch.nan, intrinsic, c2w, (32, 32)))
+    empty = torch.zeros(0)
+    assert float(track_loss(Carried(masks, empty, empty, torch.zeros(1, 1, 2), torch.zeros(1, 1, 1, 2)), unknown, unknown, valid)) == 0.0
