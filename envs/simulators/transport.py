@@ -19,25 +19,24 @@ from envs.simulators.base import hue_gap
 _SPAN = 3.0  # half-pictures beyond which a fingertip counts as out of sight
 
 
-def in_view(points: Tensor, intrinsic: Tensor, c2w: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+def in_view(points: Tensor, intrinsic: Tensor, c2w: Tensor, size: tuple[int, int]) -> InView:
     """Where points [B, T, N, 3] are in the pictures of every view.
 
     Args:
         intrinsic: [B, V, 3, 3] pixels of `size` = (height, width); c2w: [B, T, V, 4, 4].
 
     Returns:
-        positions [B, V, T, N, 2] in half-pictures from the middle, visible bool [B, V, T, N], and the share of
-        the picture's width squared that a square of 5 cm covers there [B, V, T, N].
+        Where they are, with leading dimensions [B, V].
     """
     steps, views = c2w.shape[1:3]
     pixels, depth = project(points[:, :, None].expand(-1, -1, views, -1, -1), intrinsic[:, None].expand(-1, steps, -1, -1, -1), c2w)
     where = pixels / (torch.tensor([size[1], size[0]], device=points.device) / 2) - 1
     visible = (depth > 1e-3) & (where.abs() < 1).all(-1)  # false for NaN, an object nobody knows the place of
     area = (0.05 * intrinsic[:, None, :, 0, 0, None] / depth.clamp(min=1e-3) / size[1]).square()
-    return tuple(value.transpose(1, 2) for value in (where, visible, area))  # type: ignore[return-value]
+    return InView(where.transpose(1, 2), visible.transpose(1, 2), area.transpose(1, 2))
 
 
-def track_loss(carried: Carried, now: tuple[Tensor, Tensor, Tensor], ahead: tuple[Tensor, Tensor, Tensor], valid: Tensor) -> Tensor:
+def track_loss(carried: Carried, now: InView, ahead: InView, valid: Tensor) -> Tensor:
     """How far the first parts are from known objects, and how far from their size.
 
     Object positions are known where episodes carry them: in physics, or on real video by a tracker. They teach which
@@ -80,6 +79,19 @@ def tip_tracks(now: Tensor, commands: Tensor, intrinsic: Tensor, c2w_now: Tensor
 
     here, ahead = fingertips(now)[:, None], fingertips(commands)
     return torch.cat((see(here, c2w_now[:, None]), see(ahead, c2w), see(here.expand_as(ahead), c2w)), 2)
+
+
+class InView(NamedTuple):
+    """Points in pictures: where [..., T, N, 2] in half-pictures from the middle, visible bool [..., T, N], and area
+    [..., T, N], which a square of 5 cm covers there, in widths squared."""
+
+    where: Tensor
+    visible: Tensor
+    area: Tensor
+
+    def of(self, view: int) -> InView:
+        """Those in one view [B, T, N] of all [B, V, T, N]."""
+        return InView(*(value[:, view] for value in self))
 
 
 class Carried(NamedTuple):

@@ -267,7 +267,7 @@ class UNetSimulator(Simulator):
                 here = in_view(clip["now", "objects"][:, None], clip["intrinsic"], memory["c2w"][:, -1:], self.shape.size)
                 there = in_view(clip["future", "objects"][:, part], clip["intrinsic"], future["c2w"], self.shape.size)
                 told = [
-                    emphasis * track_loss(carried, tuple(x[:, view] for x in here), tuple(x[:, view] for x in there), clip["future", "valid"][:, part])
+                    emphasis * track_loss(carried, here.of(view), there.of(view), clip["future", "valid"][:, part])
                     for view, (carried, emphasis) in enumerate(zip(parts, self.config.emphasis, strict=True))
                 ]
                 tracked = torch.stack(told).sum()

@@ -55,7 +55,7 @@ def test_track_loss_wants_parts_where_objects_are() -> None:
     intrinsic = torch.tensor([[32.0, 0, 16], [0, 32.0, 16], [0, 0, 1]]).expand(1, 1, 3, 3)
     c2w = torch.eye(4).expand(1, 1, 1, 4, 4)
     objects = torch.tensor([[[[0.1, 0.0, 0.5]]]])  # at 0.1 / 0.5 * 32 / 16 = 0.4 half-pictures
-    now = tuple(x[:, 0] for x in in_view(objects, intrinsic, c2w, (32, 32)))
+    now = in_view(objects, intrinsic, c2w, (32, 32)).of(0)
     valid = torch.ones(1, 1, dtype=torch.bool)
     masks = torch.zeros(1, 1, 32, 32)
     masks[0, 0, 14:17, 20:23] = 1.0  # nine pixels; 5 cm cover ten
@@ -66,6 +66,6 @@ def test_track_loss_wants_parts_where_objects_are() -> None:
 
     assert loss(0.4, 0.0) < 1e-5
     assert abs(loss(0.5, 0.0) - 0.1) < 1e-5 and abs(loss(0.4, 0.2) - 0.2) < 1e-5
-    unknown = tuple(x[:, 0] for x in in_view(objects * torch.nan, intrinsic, c2w, (32, 32)))
+    unknown = in_view(objects * torch.nan, intrinsic, c2w, (32, 32)).of(0)
     empty = torch.zeros(0)
     assert float(track_loss(Carried(masks, empty, empty, torch.zeros(1, 1, 2), torch.zeros(1, 1, 1, 2)), unknown, unknown, valid)) == 0.0
