@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import time
@@ -12,7 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from pipeline.artefact import finish, read_manifest
+from pipeline.artefact import finish, read_manifest, write_text
 
 
 @dataclass
@@ -83,9 +84,17 @@ class Graph:
                 folder.mkdir(parents=True, exist_ok=True)
                 resumed = any(folder.iterdir())
                 tqdm.write(f"=== {name}{' (resumed)' if resumed else ''} -> {folder}")
+                spent = folder / "seconds.json"  # what earlier, interrupted attempts took
+                earlier = json.loads(spent.read_text()) if spent.exists() else 0.0
                 began = time.perf_counter()
-                result = stage.run(folder, {parent: self.folder(parent) for parent in stage.parents})
-                seconds = time.perf_counter() - began
+                try:
+                    result = stage.run(folder, {parent: self.folder(parent) for parent in stage.parents})
+                except BaseException:
+                    with contextlib.suppress(OSError):  # a full disk must not hide what went wrong
+                        write_text(spent, json.dumps(earlier + time.perf_counter() - began))
+                    raise
+                seconds = earlier + time.perf_counter() - began
+                spent.unlink(missing_ok=True)
                 finish(folder, name, self.key(name), stage.config, {p: self.key(p) for p in stage.parents}, seconds, result)
                 manifest = read_manifest(folder)
                 assert manifest is not None

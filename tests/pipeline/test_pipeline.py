@@ -6,6 +6,7 @@ import errno
 import json
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,23 @@ def test_a_failed_stage_keeps_the_others(tmp_path: Path) -> None:
     with pytest.raises(OSError):
         graph.run()
     assert log == ["a"]
+
+
+def test_seconds_of_interrupted_attempts_count(tmp_path: Path) -> None:
+    tries: list[int] = []
+
+    def work(folder: Path, found: dict[str, Path]) -> dict[str, Any]:
+        tries.append(1)
+        time.sleep(0.2)
+        if len(tries) == 1:
+            raise KeyboardInterrupt
+        return {}
+
+    graph = Graph(tmp_path)
+    graph.add(Stage("a", (), {}, work))
+    with pytest.raises(KeyboardInterrupt):
+        graph.run()
+    assert graph.run()["a"]["seconds"] >= 0.4
 
 
 def test_keys_change_with_what_matters_only(tmp_path: Path) -> None:
