@@ -163,7 +163,9 @@ def test_the_verdict_can_say_no_and_why() -> None:
     assert good.startswith("gain")
     fooled = verdict({**base, "physics_after": entry(41), "imagined_after": entry(90), "paired": {"p": 0.9}})
     assert fooled.startswith("no gain") and "exploits" in fooled
-    flat = verdict({**base, "physics_after": entry(41), "imagined_after": entry(42), "paired": {"p": 0.9}})
+    small = verdict({**base, "physics_after": entry(45), "imagined_after": entry(47), "paired": {"p": 0.02}})
+    assert "chance" in small and "exploits" not in small
+    flat = verdict({**base, "physics_after": entry(39), "imagined_after": entry(40), "paired": {"p": 0.9}})
     assert "iterations" in flat
 
 
