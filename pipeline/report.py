@@ -65,7 +65,7 @@ def verdict(result: Mapping[str, Any]) -> str:
         return f"gain: {head}"
     dreamt = 100 * (_rate(result["imagined_after"]) - _rate(result["imagined_before"]))
     gap = result["rounds"][-1]["gap"] if result["rounds"] else float("nan")
-    if points > 0 and dreamt - points < 5:
+    if min(points, dreamt) > 0 and dreamt - points < 5:
         why = f"true success rose as imagined success did ({dreamt:+.0f} points), but too little to tell from chance; give RL more iterations (rounds.iterations) or evaluate on more episodes"
     elif dreamt > 5:
         why = f"imagined success rose by {dreamt:.0f} points and true success did not follow: the policy exploits the simulator (gap in the last round {100 * gap:+.0f} points); deploy more episodes per round"
