@@ -192,4 +192,4 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     page = (tmp_path / "smoke/report.html").read_text()
     assert "data:video/mp4" in page and "http" not in page.replace("http://www.w3.org", "").split("<h2>Config")[0]
     again = worldloop(*words)
-    assert again.stdout.count("is finished, reused") + again.stderr.count("is finished, reused") == 21
+    assert again.stdout.count("is finished, reused") + again.stderr.count("is finished, reused") == 23
