@@ -91,7 +91,7 @@ def bench_config(cfg: Mapping[str, Any]) -> BenchConfig:
 def world_shape(cfg: Mapping[str, Any]) -> WorldShape:
     """What every simulator of this config shows."""
     task = cfg["task"]
-    return WorldShape(len(task["views"]), tuple(task["size"]), task["chunk"], cfg["simulator"]["memory"], task["control_hz"])
+    return WorldShape(len(task["views"]), tuple(task["size"]), task["chunk"], cfg["simulator"]["memory"], task["control_hz"], cfg["simulator"]["objects"])
 
 
 def build_simulator(cfg: Mapping[str, Any], weights: Path | None = None) -> Simulator:

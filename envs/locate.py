@@ -46,13 +46,3 @@ def locate(frames: Tensor, first: Tensor, start: Tensor, intrinsic: Tensor, c2w:
     pixels = torch.stack(((weight.sum(-2) * u).sum(-1), (weight.sum(-1) * v).sum(-1)), -1) / mass.clamp(min=1e-6).unsqueeze(-1)
     lost = mass < _FEWEST
     return torch.where(lost.unsqueeze(-1), torch.nan, pixels), lost
-
-
-def on_plane(pixels: Tensor, height: Tensor | float, intrinsic: Tensor, c2w: Tensor) -> Tensor:
-    """World points [..., T, 3] where the rays of pixels [..., T, 2] meet the plane z = height (metres)."""
-    ones = torch.ones_like(pixels[..., :1])
-    local = torch.cat((pixels, ones), -1) @ torch.linalg.inv(intrinsic).transpose(-1, -2)
-    direction = local @ c2w[..., :3, :3].transpose(-1, -2)
-    origin = c2w[..., None, :3, 3]
-    scale = (height - origin[..., 2:]) / direction[..., 2:]
-    return origin + scale * direction

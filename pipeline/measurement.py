@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from envs.episodes.clips import ClipStore
-from envs.geometry import project
+from envs.geometry import on_plane, project
 from envs.judges import LearnedJudge
 from envs.language import tokenize
-from envs.locate import locate, on_plane
+from envs.locate import locate
 from envs.simulators.base import Simulator
 from envs.simulators.replay import Replay, replay
 from pipeline.statistics import confusion

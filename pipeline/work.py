@@ -39,7 +39,7 @@ from learners.rl import RLConfig, train_rl
 from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.judge import calibrate, episode_labels, train_judge
 from learners.stages.state import train_state
-from learners.stages.vision import VisionConfig, train_vision
+from learners.stages.vision import VisionConfig, train_places, train_vision
 from pipeline import measurement
 from pipeline.artefact import save_weights, write_text
 from pipeline.statistics import rate_entry
@@ -186,12 +186,13 @@ def tokenizer(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...]) -> di
 def vision(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], warm: tuple[str, ...], steps: str) -> dict[str, Any]:
     """The simulator, from nothing in the first round and from its predecessor after that."""
     section = dict(cfg["vision"][steps])
-    fit_section = section.pop("fit")
+    fit_section, places_section = section.pop("fit"), section.pop("places")
     store = open_store(found, data)
     train, _ = split(store)
     newest = train[train >= len(store) - len(ClipStore([found[data[-1]] / "dataset"]))]
     prepare_process(cfg["seed"])
     simulator = build_simulator(cfg, found[warm[0]] / "weights.safetensors" if warm else None)
+    train_places(simulator, store, train, fit_options(cfg, places_section, f"vision.{steps}.places"), folder / "places")
     stats = train_vision(simulator, store, train, options(VisionConfig, section, f"vision.{steps}"), fit_options(cfg, fit_section, f"vision.{steps}.fit"), folder, newest)
     save_weights(simulator, folder)
     return {**stats, "parameters": sum(p.numel() for p in simulator.parameters())}

@@ -157,6 +157,42 @@ class ClipStore:
             size,
         )
 
+    def shots(self, episodes: Tensor, count: int, generator: torch.Generator) -> TensorDict:
+        """`count` random pictures of the first view, every other one an episode's first.
+
+        Returns:
+            TensorDict [count] with frames uint8 [3, H, W], objects [2, 3], intrinsic [3, 3] and c2w [4, 4].
+        """
+        chosen = episodes[torch.randint(len(episodes), (count,), generator=generator)]
+        ahead = (torch.rand(count, generator=generator) * self.length[chosen]).long()
+        ahead[::2] = 0
+        rows = self.start[chosen] + ahead
+        arrays = {"objects": self.arrays["objects"][rows], "c2w": self.arrays["c2w"][rows, 0], "intrinsic": self.intrinsic[chosen, 0]}
+        return TensorDict({"frames": self.frames(rows)[:, 0], **arrays}, [count])
+
+    def motions(self, episodes: Tensor, count: int, chunk: int, generator: torch.Generator) -> TensorDict:
+        """`count` random chunks without pictures, each wholly within its episode.
+
+        Returns:
+            TensorDict [count] with now (command [14], objects [2, 3]) and future (commands [K, 14], objects [K, 2, 3]).
+        """
+        choices = (self.length[episodes] - chunk).clamp(min=0)
+        if not int(choices.sum()):
+            raise EpisodeError(f"no episode is longer than a chunk of {chunk} frames; lower task.chunk")
+        edges = choices.cumsum(0)
+        draw = torch.randint(int(edges[-1]), (count,), generator=generator)
+        chosen = torch.searchsorted(edges, draw, right=True)
+        now = self.start[episodes[chosen]] + draw - (edges[chosen] - choices[chosen])
+        ahead = now[:, None] + torch.arange(1, chunk + 1)
+        commands, objects = self.arrays["commands"], self.arrays["objects"]
+        return TensorDict(
+            {
+                "now": TensorDict({"command": commands[now], "objects": objects[now]}, [count]),
+                "future": TensorDict({"commands": commands[ahead], "objects": objects[ahead]}, [count, chunk]),
+            },
+            [count],
+        )
+
     def sample(self, episodes: Tensor, count: int, spec: ClipSpec, generator: torch.Generator) -> TensorDict:
         """`count` random clips of the given episodes, every frame that has a successor being equally likely to begin one."""
         choices = (self.length[episodes] - spec.stride).clamp(min=1)

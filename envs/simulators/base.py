@@ -14,6 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from envs.episodes.clips import memory_indices
+from envs.simulators.places import Places
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class WorldShape:
         chunk: frames per step, K.
         memory: sparse memory frames, M; the first frame is always one of them.
         fps: frames per second.
+        objects: things whose places are followed (places.py), S; 0 follows none.
     """
 
     views: int = 3
@@ -33,6 +35,7 @@ class WorldShape:
     chunk: int = 8
     memory: int = 4
     fps: float = 10.0
+    objects: int = 2
 
 
 class Simulator(nn.Module):
@@ -47,6 +50,7 @@ class Simulator(nn.Module):
     def __init__(self, shape: WorldShape):
         super().__init__()
         self.shape = shape
+        self.places = Places(shape.objects, shape.chunk)
 
     # -- what a subclass gives -----------------------------------------------------------------------------------
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
@@ -54,7 +58,8 @@ class Simulator(nn.Module):
 
         Args:
             inputs: TensorDict [B] with memory (frames, pose_map uint8 [M, V, 3, H, W], c2w [M, V, 4, 4]),
-                future (pose_map uint8 [K, V, 3, H, W], c2w [K, V, 4, 4], commands [K, 14]), now (command [14], state [16]),
+                future (pose_map uint8 [K, V, 3, H, W], c2w [K, V, 4, 4], commands [K, 14], places [K, S, 3]),
+                now (command [14], state [16], places [S, 3]; NaN where unknown),
                 intrinsic [V, 3, 3], seed int64 [], chunk_index int64 [].
 
         Returns:
@@ -69,6 +74,41 @@ class Simulator(nn.Module):
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """Training loss of a clip (see ClipStore.clips) and figures to log."""
         raise NotImplementedError
+
+    def asked(self, clip: TensorDict, number: int, drawn: Tensor | None = None, generator: torch.Generator | None = None) -> TensorDict:
+        """The inputs of `predict` for chunk `number` of a training clip [B].
+
+        Args:
+            drawn: uint8 [B, number * K, V, 3, H, W], the model's own frames of the chunks before; memory then shows
+                these instead of true ones.
+            generator: draws the noise seeds; without one they are zero.
+        """
+        chunk, size = self.shape.chunk, clip.shape
+        part = slice(number * chunk, (number + 1) * chunk)
+        memory = TensorDict({key: clip["memory", key][:, number] for key in ("frames", "pose_map", "c2w")}, size)
+        if drawn is not None:
+            rows = torch.arange(len(clip), device=clip.device)[:, None]
+            ahead = clip["memory", "index"][:, number] - clip["begin"][:, None] - 1
+            memory["frames"] = torch.where((ahead >= 0)[..., None, None, None, None], drawn[rows, ahead.clamp(min=0)], memory["frames"])
+        future = TensorDict({key: clip["future", key][:, part] for key in ("pose_map", "c2w", "commands")}, size)
+        future["places"] = self.places.of(clip["future", "objects"][:, part])
+        if number == 0:
+            now = {"command": clip["now", "command"], "state": clip["now", "state"], "places": self.places.of(clip["now", "objects"])}
+        else:
+            before = clip["future"][:, part.start - 1]
+            now = {"command": before["commands"], "state": before["states"], "places": self.places.of(before["objects"])}
+        seed = torch.zeros(size, dtype=torch.int64) if generator is None else torch.randint(2**40, size, generator=generator)
+        return TensorDict(
+            {
+                "memory": memory,
+                "future": future,
+                "now": TensorDict(now, size),
+                "intrinsic": clip["intrinsic"],
+                "seed": seed.to(clip.device),
+                "chunk_index": torch.zeros(size, dtype=torch.int64, device=clip.device),
+            },
+            size,
+        )
 
     # -- the contract --------------------------------------------------------------------------------------------
     def reset(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor, command: Tensor, state: Tensor, pose_map: Tensor, seed: Tensor) -> TensorDict:
@@ -85,6 +125,8 @@ class Simulator(nn.Module):
             The sessions' state, a TensorDict [B].
         """
         size = frames.shape[:1]
+        with torch.no_grad():
+            places = self.places.find(frames[:, 0], intrinsic[:, 0].float(), c2w[:, 0].float())
         return TensorDict(
             {
                 "history": TensorDict(
@@ -93,6 +135,7 @@ class Simulator(nn.Module):
                 ),
                 "length": torch.ones(size, dtype=torch.int64, device=frames.device),
                 "intrinsic": intrinsic.float(),
+                "places": torch.where(self.places.taught, places, torch.nan),
                 "seed": seed.reshape(size),
                 "chunk_index": torch.zeros(size, dtype=torch.int64, device=frames.device),
             },
@@ -116,11 +159,12 @@ class Simulator(nn.Module):
         memory = memory_indices(length, self.shape.memory)
         history = state["history"]
         now = history[rows, length - 1]
+        ahead = self.places.push(state["places"], now["commands"], commands)
         inputs = TensorDict(
             {
                 "memory": history[rows[:, None], memory].select("frames", "pose_map", "c2w"),
-                "future": TensorDict({"pose_map": pose_map, "c2w": c2w, "commands": commands}, [batch]),
-                "now": TensorDict({"command": now["commands"], "state": now["states"]}, [batch]),
+                "future": TensorDict({"pose_map": pose_map, "c2w": c2w, "commands": commands, "places": ahead}, [batch]),
+                "now": TensorDict({"command": now["commands"], "state": now["states"], "places": state["places"]}, [batch]),
                 "intrinsic": state["intrinsic"],
                 "seed": state["seed"],
                 "chunk_index": state["chunk_index"],
@@ -138,7 +182,15 @@ class Simulator(nn.Module):
         for name, value in new.items():
             history[name][rows[:, None], at] = value
         state = TensorDict(
-            {"history": history, "length": length + count, "intrinsic": state["intrinsic"], "seed": state["seed"], "chunk_index": state["chunk_index"] + 1}, [batch]
+            {
+                "history": history,
+                "length": length + count,
+                "intrinsic": state["intrinsic"],
+                "places": ahead[:, -1],
+                "seed": state["seed"],
+                "chunk_index": state["chunk_index"] + 1,
+            },
+            [batch],
         )
         return pictures, features.float(), state
 
@@ -161,7 +213,7 @@ class Simulator(nn.Module):
     @staticmethod
     def replace(state: TensorDict, mask: Tensor, fresh: TensorDict) -> TensorDict:
         """The state with the sessions of `mask` [B] replaced by those of `fresh` (one row per True, in order)."""
-        for name in ("length", "intrinsic", "seed", "chunk_index"):
+        for name in ("length", "intrinsic", "places", "seed", "chunk_index"):
             state[name][mask] = fresh[name].to(state[name].dtype)
         for name in state["history"].keys():
             state["history", name][mask.nonzero().flatten(), 0] = fresh["history", name][:, 0]

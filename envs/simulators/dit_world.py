@@ -18,6 +18,7 @@ from envs.conditioning import render_ray_map
 from envs.simulators.autoencoder import STRIDE, Autoencoder
 from envs.simulators.base import Simulator, WorldShape, foreground_weight
 from envs.simulators.dit import DiTShape, MultiViewDiT
+from envs.simulators.places import in_view, place_map
 
 MEMORY_NOISE = 1e-4 / (1 + 1e-4)  # the noise level at which memory stands, as released
 
@@ -69,7 +70,7 @@ class DiTSimulator(Simulator):
         self.codec = Autoencoder(config.channels, config.codec_width)
         self.net = MultiViewDiT(
             DiTShape(
-                in_channels=config.channels + 3 + 6 + 1,
+                in_channels=config.channels + 3 + 6 + 1 + shape.objects,
                 out_channels=config.channels,
                 num_attention_heads=config.heads,
                 attention_head_dim=config.head_dim,
@@ -101,14 +102,17 @@ class DiTSimulator(Simulator):
         return self.codec.decode(flat.flatten(0, 2)).float().unflatten(0, flat.shape[:3])
 
     def _conditioning(self, inputs: TensorDict, memory: Tensor) -> Tensor:
-        """Channels [B, V, 3 + 6 + 1, M + K, h, w]: pose map, ray map, memory mask."""
+        """Channels [B, V, 3 + 6 + 1 + S, M + K, h, w]: pose map, ray map, memory mask, and spots of the objects, known from the last remembered frame on."""
         maps = torch.cat([inputs["memory", "pose_map"], inputs["future", "pose_map"]], 1).float() / 127.5 - 1
         small = F.interpolate(maps.flatten(0, 2), size=memory.shape[-2:], mode="bilinear", antialias=True).unflatten(0, maps.shape[:3])
         c2w = torch.cat([inputs["memory", "c2w"], inputs["future", "c2w"]], 1).transpose(1, 2)
         rays = render_ray_map(inputs["intrinsic"], c2w, self.shape.size, stride=STRIDE)  # [B, V, T, 6, h, w]
         mask = torch.zeros_like(rays[:, :, :, :1])
         mask[:, :, : self.shape.memory] = 1.0
-        return torch.cat([small.permute(0, 2, 1, 3, 4, 5), rays, mask], 3).transpose(2, 3)
+        places = torch.cat([inputs["now", "places"][:, None], inputs["future", "places"]], 1)
+        spots = place_map(in_view(places, inputs["intrinsic"], c2w[:, :, self.shape.memory - 1 :].transpose(1, 2), self.shape.size), *memory.shape[-2:])
+        spots = F.pad(spots, (0, 0, 0, 0, 0, 0, self.shape.memory - 1, 0))
+        return torch.cat([small.permute(0, 2, 1, 3, 4, 5), rays, mask, spots], 3).transpose(2, 3)
 
     def _velocity(self, future: Tensor, memory: Tensor, sigma: Tensor, conditioning: Tensor) -> tuple[Tensor, Tensor]:
         """Velocity of the future latents [B, V, C, K, h, w] at noise level sigma [B], and the fused features."""
@@ -162,25 +166,17 @@ class DiTSimulator(Simulator):
         """Flow matching on the future latents of the last chunk; the chunks before it are the model's own."""
         chunk, chunks = self.shape.chunk, clip["memory", "index"].shape[1]
         drawn: Tensor | None = None
-        rows = torch.arange(clip.shape[0], device=clip.device)
         value = torch.zeros((), device=clip.device)
         for number in range(chunks):
             part = slice(number * chunk, (number + 1) * chunk)
-            memory_td = TensorDict({k: clip["memory", k][:, number] for k in ("frames", "pose_map", "c2w")}, clip.shape)
-            if drawn is not None:
-                ahead = clip["memory", "index"][:, number] - clip["begin"][:, None] - 1
-                own = (ahead >= 0)[..., None, None, None, None]
-                memory_td["frames"] = torch.where(own, drawn[rows[:, None], ahead.clamp(min=0)], memory_td["frames"])
-            seed = torch.randint(2**40, clip.shape, generator=generator).to(clip.device)
-            future_td = TensorDict({k: clip["future", k][:, part] for k in ("pose_map", "c2w", "commands")}, clip.shape)
-            inputs = TensorDict({"memory": memory_td, "future": future_td, "intrinsic": clip["intrinsic"], "seed": seed, "chunk_index": torch.zeros_like(seed)}, clip.shape)
+            inputs = self.asked(clip, number, drawn, generator)
             if number + 1 < chunks:
                 with torch.no_grad():
                     pictures = (self.predict(inputs)[0].clamp(0, 1) * 255).round().to(torch.uint8)
                 drawn = pictures if drawn is None else torch.cat([drawn, pictures], 1)
                 continue
             truth = clip["future", "frames"][:, part]
-            memory, target = self.encode(memory_td["frames"]), self.encode(truth)
+            memory, target = self.encode(inputs["memory", "frames"]), self.encode(truth)
             conditioning = self._conditioning(inputs, memory)
             memory = self._disturb(memory, generator)
             draw = torch.rand(clip.shape, generator=generator).to(clip.device)

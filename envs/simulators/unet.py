@@ -1,9 +1,9 @@
 """The strong cheap engine: a U-Net that predicts a whole chunk in one deterministic pass.
 
 Each view is folded into channels (side views at half the detail), memory and future pose maps ride along as
-channels, and commands modulate every block. A pixel of the output is a soft choice between five sources: the last
-frame as it is, the last frame moved by a predicted flow, the first frame, the median colour, and a drawn colour; over
-these lie a few parts of the last frame that were carried elsewhere as a whole (transport.py). Things that move are
+channels beside spots where objects are and will be, and commands modulate every block. A pixel of the output is a
+soft choice between sources: the last frame as it is, the last frame moved by a predicted flow, the first frame, the
+median colour, a drawn colour, and, for every object, the last frame moved as that object moves. Things that move are
 then copied instead of remembered by the network, which learns far faster than a residual does.
 """
 
@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from envs.conditioning import render_ray_map
 from envs.schema import ACTION_DIM, to_relative
 from envs.simulators.base import Simulator, WorldShape, foreground_weight
-from envs.simulators.transport import Carried, Parts, Transport, in_view, tip_tracks, track_loss
+from envs.simulators.places import InView, in_view, place_map
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,7 @@ class UNetConfig:
         blocks: residual blocks per fine half, and in the bottleneck.
         foreground: extra loss weight of what differs from the median colour.
         emphasis: loss weight of each view.
-        slots: parts per view that may be carried as a whole.
-        tracks: loss weight of known object positions (transport.track_loss).
+        jitter: metres by which objects are misplaced in training, as the places of a rollout are.
     """
 
     shrink: tuple[int, ...] = (1, 2, 2)
@@ -41,12 +40,11 @@ class UNetConfig:
     blocks: tuple[int, int] = (2, 4)
     foreground: float = 8.0
     emphasis: tuple[float, ...] = (1.0, 0.4, 0.4)
-    slots: int = 2
-    tracks: float = 2.0
+    jitter: float = 0.003
 
 
 _FOLD = 4  # pixels folded into channels, both ways
-_CHANNELS = 5 + 2 + 3  # logits of the sources, flow, drawn colour
+_SOURCES = 5  # still, flow, first frame, median colour, drawn colour; and then the objects
 _REACH = 8.0  # pixels one unit of flow moves
 
 
@@ -70,47 +68,53 @@ class _Block(nn.Module):
         return x + h
 
 
-def _head(width: int, chunk: int) -> nn.Sequential:
+def _head(width: int, chunk: int, channels: int) -> nn.Sequential:
     """Output layer of one view; it starts from "nothing moves", for random output takes hundreds of steps to unlearn."""
-    last = nn.Conv2d(width, _CHANNELS * chunk * _FOLD**2, 1)
-    bias = torch.zeros(chunk, _CHANNELS, _FOLD**2)
+    last = nn.Conv2d(width, channels * chunk * _FOLD**2, 1)
+    bias = torch.zeros(chunk, channels, _FOLD**2)
     bias[:, 0] = 3.0
     nn.init.zeros_(last.weight)
     last.bias = nn.Parameter(bias.flatten())
     return nn.Sequential(nn.GroupNorm(8, width), nn.SiLU(), last)
 
 
-def _compose(drawn: Tensor, last: Tensor, first: Tensor, carried: Carried) -> Tensor:
+def _compose(drawn: Tensor, last: Tensor, first: Tensor, seen: InView, spots: Tensor) -> Tensor:
     """Frames of a chunk in one view.
 
     Args:
-        drawn: [B, K, 10, H, W] output maps; last, first: [B, 3, H, W] frames.
-        carried: parts of the last frame and where they go, the first uppermost.
+        drawn: [B, K, 5 + S + 2 + 3, H, W] output maps; last, first: [B, 3, H, W] frames.
+        seen: the objects in this view now and at every frame, each [B, 1 + K, S]; spots: [B, K, S, H, W] maps of the latter.
 
     Returns:
         [B, K, 3, H, W].
     """
     _, chunk, _, height, width = drawn.shape
+    objects = spots.shape[2]
     # Split, not sliced: the gradient of a slice is a full map of zeros.
-    logits, flow, colour = drawn.split((5, 2, 3), 2)
-    still, moves, past, middle, fresh = logits.softmax(2).split(1, 2)
+    logits, carried, flow, colour = drawn.split((_SOURCES, objects, 2, 3), 2)
+    # From the start an object is likely to lie where it is said to.
+    chosen = torch.cat((logits, carried - 3 + 8 * spots), 2).softmax(2)
+    still, moves, past, middle, fresh, *lifted = chosen.split(1, 2)
     v, u = torch.meshgrid(
         torch.linspace(-1 + 1 / height, 1 - 1 / height, height, device=drawn.device),
         torch.linspace(-1 + 1 / width, 1 - 1 / width, width, device=drawn.device),
         indexing="ij",
     )
     flow_u, flow_v = (flow * (2 * _REACH)).unbind(2)
-    grid = torch.stack((u + flow_u / width, v + flow_v / height), -1)
+    grids = [torch.stack((u + flow_u / width, v + flow_v / height), -1)]
+    place, known = torch.stack((u, v), -1), seen.visible[:, :1] & seen.visible[:, 1:]
+    for number in range(objects):
+        now, then = seen.where[:, :1, number, None, None], seen.where[:, 1:, number, None, None]
+        growth = (seen.span[:, 1:, number] / seen.span[:, :1, number]).clamp(0.5, 2.0)[..., None, None, None]
+        grids.append(torch.where(known[:, :, number, None, None, None], now + (place - then) / growth, place))
     # All frames of a chunk are sampled from one picture: stack them as rows of one tall grid.
+    grid = torch.stack(grids, 1).flatten(1, 3)
     median = first.flatten(2).median(-1).values[..., None, None]
-    # What is carried is lifted out first: a thing is in one place, and doubt about where must not fade it.
-    hole = 1 - (1 - carried.masks).prod(1, keepdim=True)
-    last = last + hole * (median - last)
-    moved = F.grid_sample(last, grid.flatten(1, 2), padding_mode="border", align_corners=False)
-    moved = moved.unflatten(2, (chunk, height)).transpose(1, 2)
-    out = still * last[:, None] + moves * moved + past * first[:, None] + middle * median[:, None] + fresh * (0.5 + 0.5 * colour)
-    for part, cover in zip(carried.colours.flip(1).unbind(1), carried.cover.flip(1).unbind(1), strict=True):
-        out = out + cover * (part - out)
+    moved = F.grid_sample(last, grid, padding_mode="border", align_corners=False)
+    moved = moved.unflatten(2, (1 + objects, chunk, height)).permute(2, 0, 3, 1, 4, 5)  # [1 + S, B, K, 3, H, W]
+    out = still * last[:, None] + moves * moved[0] + past * first[:, None] + middle * median[:, None] + fresh * (0.5 + 0.5 * colour)
+    for weight, picture in zip(lifted, moved[1:], strict=True):
+        out = out + weight * picture
     return out
 
 
@@ -144,7 +148,9 @@ class UNetSimulator(Simulator):
         if not set(config.shrink) <= {1, 2}:
             raise ValueError(f"simulator.shrink={list(config.shrink)} may hold 1 (full detail) and 2 (half) only")
         wide = 2 * config.width
-        pictures = 3 * (2 * shape.memory + shape.chunk)  # memory frames and pose maps, future pose maps
+        # Memory frames and pose maps, future pose maps, and spots of the objects now and in future.
+        pictures = 3 * (2 * shape.memory + shape.chunk) + shape.objects * (1 + shape.chunk)
+        self.channels = _SOURCES + shape.objects + 2 + 3
         cond = 256
         self.feature_shape = (wide + cond,)
         self.actions = nn.Sequential(nn.Linear((shape.chunk + 1) * ACTION_DIM, cond), nn.SiLU(), nn.Linear(cond, cond))
@@ -157,13 +163,11 @@ class UNetSimulator(Simulator):
         self.fine_in = nn.ModuleList(_Block(config.width, cond) for _ in range(fine))
         self.deep = nn.ModuleList(_Block(wide, cond) for _ in range(deep))
         self.fine_out = nn.ModuleList(_Block(config.width, cond) for _ in range(fine))
-        self.heads = nn.ModuleList(_head(config.width if s == 1 else wide, shape.chunk) for s in config.shrink)
-        self.parts = nn.ModuleList(Parts(config.slots) for _ in config.shrink)
-        self.transports = nn.ModuleList(Transport(shape.chunk, config.slots) for _ in config.shrink)
+        self.heads = nn.ModuleList(_head(config.width if s == 1 else wide, shape.chunk, self.channels) for s in config.shrink)
 
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; features are the pooled bottleneck beside the action embedding."""
-        views, features, _ = self.views(inputs)
+        views, features = self.views(inputs)
         return self._enlarge(views), features
 
     def _enlarge(self, views: list[Tensor]) -> Tensor:
@@ -175,11 +179,11 @@ class UNetSimulator(Simulator):
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is drawn."""
-        _, z, cond, _ = self._encode(inputs)
+        _, z, cond, *_ = self._encode(inputs)
         return torch.cat([z.float().mean((-2, -1)), cond.float()], 1)
 
-    def _encode(self, inputs: TensorDict) -> tuple[Tensor, Tensor, Tensor, list[tuple[Tensor, Tensor, Tensor]]]:
-        """Fine and coarse maps, the action embedding, and each view's first and last frame and last pose map as it is looked at."""
+    def _encode(self, inputs: TensorDict) -> tuple[Tensor, Tensor, Tensor, list[tuple[Tensor, Tensor, Tensor]], InView]:
+        """Fine and coarse maps, the action embedding, each view's first and last frame and spots [B, 1 + K, S, h, w] as it is looked at, and the objects in view."""
         memory, future = inputs["memory"], inputs["future"]
         stack = torch.cat([memory["frames"], memory["pose_map"], future["pose_map"]], 1)  # uint8 [B, 2M+K, V, 3, H, W]
         relative = to_relative(future["commands"], inputs["now", "command"]) * 10.0  # decimetres
@@ -187,14 +191,17 @@ class UNetSimulator(Simulator):
         fine: list[Tensor] = []
         deep = [self.rays(self._rays(inputs))]
         ends: list[tuple[Tensor, Tensor, Tensor]] = []
+        places = torch.cat((inputs["now", "places"][:, None], inputs["future", "places"]), 1)
+        cameras = torch.cat((memory["c2w"][:, -1:], future["c2w"]), 1)
+        seen = in_view(places, inputs["intrinsic"], cameras, self.shape.size)
         for view, (shrink, embed) in enumerate(zip(self.config.shrink, self.embed, strict=True)):
             pictures = stack[:, :, view].flatten(1, 2).float().div_(255.0)
             if shrink > 1:
                 pictures = F.avg_pool2d(pictures, shrink)
             latest = 3 * (self.shape.memory - 1)
-            drawn_at = 3 * (2 * self.shape.memory - 1)
-            ends.append((pictures[:, :3], pictures[:, latest : latest + 3], pictures[:, drawn_at : drawn_at + 3]))
-            folded = _fold(pictures * 2 - 1).contiguous(memory_format=torch.channels_last)
+            spots = place_map(InView(*(value[:, view : view + 1] for value in seen)), *pictures.shape[-2:])[:, 0]
+            ends.append((pictures[:, :3], pictures[:, latest : latest + 3], spots))
+            folded = _fold(torch.cat((pictures * 2 - 1, spots.flatten(1, 2)), 1)).contiguous(memory_format=torch.channels_last)
             (fine if shrink == 1 else deep).append(embed(folded))
         x = torch.stack(fine).sum(0)
         for block in self.fine_in:
@@ -202,26 +209,19 @@ class UNetSimulator(Simulator):
         z = self.down(x) + torch.stack(deep).sum(0)
         for block in self.deep:
             z = block(z, cond)
-        return x, z, cond, ends
+        return x, z, cond, ends, seen
 
-    def views(self, inputs: TensorDict) -> tuple[list[Tensor], Tensor, list[Carried]]:
-        """Frames of each view [B, K, 3, H / shrink, W / shrink], not yet enlarged, the features, and what each view carries."""
-        x, z, cond, ends = self._encode(inputs)
-        chunk = self.shape.chunk
+    def views(self, inputs: TensorDict) -> tuple[list[Tensor], Tensor]:
+        """Frames of each view [B, K, 3, H / shrink, W / shrink], not yet enlarged, and the features."""
+        x, z, cond, ends, seen = self._encode(inputs)
         x = self.fuse(torch.cat([x, F.pixel_shuffle(self.up(z), 2)], 1))
         for block in self.fine_out:
             x = block(x, cond)
         views: list[Tensor] = []
-        parts: list[Carried] = []
-        future, memory = inputs["future"], inputs["memory"]
-        tracks = tip_tracks(inputs["now", "command"], future["commands"], inputs["intrinsic"], memory["c2w"][:, -1], future["c2w"], self.shape.size)
-        for view, (shrink, head, carry, (first, last, pose)) in enumerate(zip(self.config.shrink, self.heads, self.transports, ends, strict=True)):
-            drawn = _unfold(head(x if shrink == 1 else z).float().contiguous())
-            masks = self.parts[view](last, first, pose).float()
-            parts.append(carry(masks, last, tracks[:, view]))
-            views.append(_compose(drawn.unflatten(1, (chunk, _CHANNELS)), last, first, parts[-1]))
-        features = torch.cat([z.float().mean((-2, -1)), cond.float()], 1)
-        return views, features, parts
+        for view, (shrink, head, (first, last, spots)) in enumerate(zip(self.config.shrink, self.heads, ends, strict=True)):
+            drawn = _unfold(head(x if shrink == 1 else z).float().contiguous()).unflatten(1, (self.shape.chunk, self.channels))
+            views.append(_compose(drawn, last, first, InView(*(value[:, view] for value in seen)), spots[:, 1:]))
+        return views, torch.cat([z.float().mean((-2, -1)), cond.float()], 1)
 
     def _rays(self, inputs: TensorDict) -> Tensor:
         """Ray maps [B, V * 12, h, w] of the last remembered and the last future frame at the bottleneck's resolution."""
@@ -235,22 +235,15 @@ class UNetSimulator(Simulator):
         Gradients stay within a chunk; predictions are rounded to bytes in between, as they are in rollouts.
         """
         chunk, chunks = self.shape.chunk, clip["memory", "index"].shape[1]
-        rows = torch.arange(clip.shape[0], device=clip.device)
+        misplaced = self.config.jitter * torch.randn((*clip.shape, 1, 1, 3), generator=generator).to(clip.device)
         drawn: Tensor | None = None
         losses = []
-        command, state = clip["now", "command"], clip["now", "state"]
         for number in range(chunks):
             part = slice(number * chunk, (number + 1) * chunk)
-            memory = TensorDict({k: clip["memory", k][:, number] for k in ("frames", "pose_map", "c2w")}, clip.shape)
-            if drawn is not None:
-                ahead = clip["memory", "index"][:, number] - clip["begin"][:, None] - 1
-                own = ahead >= 0
-                imagined = drawn[rows[:, None], ahead.clamp(min=0)]
-                memory["frames"] = torch.where(own[..., None, None, None, None], imagined, memory["frames"])
-            future = TensorDict({k: clip["future", k][:, part] for k in ("pose_map", "c2w", "commands")}, clip.shape)
-            now = TensorDict({"command": command, "state": state}, clip.shape)
-            inputs = TensorDict({"memory": memory, "future": future, "now": now, "intrinsic": clip["intrinsic"]}, clip.shape)
-            views, _, parts = self.views(inputs)
+            inputs = self.asked(clip, number, drawn)
+            inputs["now", "places"] = inputs["now", "places"] + misplaced[:, 0]
+            inputs["future", "places"] = inputs["future", "places"] + misplaced
+            views, _ = self.views(inputs)
             valid = clip["future", "valid"][:, part, None, None, None]
             error, norm = torch.zeros(()), torch.zeros(())
             for view, (frames, shrink, emphasis) in enumerate(zip(views, self.config.shrink, self.config.emphasis, strict=True)):
@@ -263,18 +256,8 @@ class UNetSimulator(Simulator):
                 error = error + ((gap.abs() + 50 * gap.square()) * weight).sum()
                 norm = norm + 3 * weight.sum()
             losses.append(error / norm.clamp(min=1))
-            if number == 0:  # later chunks begin from own frames, where things need not be where they were
-                here = in_view(clip["now", "objects"][:, None], clip["intrinsic"], memory["c2w"][:, -1:], self.shape.size)
-                there = in_view(clip["future", "objects"][:, part], clip["intrinsic"], future["c2w"], self.shape.size)
-                told = [
-                    emphasis * track_loss(carried, here.of(view), there.of(view), clip["future", "valid"][:, part])
-                    for view, (carried, emphasis) in enumerate(zip(parts, self.config.emphasis, strict=True))
-                ]
-                tracked = torch.stack(told).sum()
             if number + 1 < chunks:
                 with torch.no_grad():
                     pictures = (self._enlarge(views).clamp(0, 1) * 255).round().to(torch.uint8)
                 drawn = pictures if drawn is None else torch.cat([drawn, pictures], 1)
-            command = clip["future", "commands"][:, part.stop - 1]
-        total = torch.stack(losses).mean() + self.config.tracks * tracked
-        return total, {"tracked": tracked.detach(), "first_chunk": losses[0].detach(), "last_chunk": losses[-1].detach()}
+        return torch.stack(losses).mean(), {"first_chunk": losses[0].detach(), "last_chunk": losses[-1].detach()}

@@ -24,11 +24,7 @@ def train_state(decoder: StateDecoder, simulator: Simulator, store: ClipStore, e
         return store.sample(episodes, options.batch, ClipSpec(shape.memory, shape.chunk), generator)
 
     def loss(clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
-        memory = TensorDict({k: clip["memory", k][:, 0] for k in ("frames", "pose_map", "c2w")}, clip.shape)
-        seed = torch.randint(2**40, clip.shape, generator=generator).to(clip["begin"].device)
-        inputs = TensorDict(
-            {"memory": memory, "future": clip["future"], "now": clip["now"], "intrinsic": clip["intrinsic"], "seed": seed, "chunk_index": torch.zeros_like(seed)}, clip.shape
-        )
+        inputs = simulator.asked(clip, 0, generator=generator)
         with torch.no_grad():
             features = simulator.features(inputs)
         future, history = clip["future"], clip["history"]

@@ -1,4 +1,4 @@
-"""Stage: teach a simulator to continue videos, from true frames at first and from its own later."""
+"""Stage: teach a simulator where objects go and to continue videos, from true frames at first and from its own later."""
 
 from __future__ import annotations
 
@@ -47,3 +47,26 @@ def train_vision(simulator: Simulator, store: ClipStore, episodes: Tensor, confi
         return torch.cat(parts) if len(parts) > 1 else parts[0]
 
     return fit("vision", simulator, batch, simulator.loss, options, folder)
+
+
+def train_places(simulator: Simulator, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path) -> dict[str, float]:
+    """Train `simulator.places` in place; does nothing where no episode knows its objects' places.
+
+    Motions are few numbers, so a step sees `options.batch` of them, and few pictures beside them, which are soon learned.
+    """
+    places = simulator.places
+    known = torch.isfinite(store.arrays["objects"][store.start[episodes]][:, : places.objects]).any()
+    if not known:
+        return {}
+
+    def batch(step: int, generator: torch.Generator) -> TensorDict:
+        shown = store.shots(episodes, max(1, options.batch // 32), generator)
+        motion = store.motions(episodes, options.batch, simulator.shape.chunk, generator)
+        return TensorDict({"shown": shown, "motion": motion}, [])
+
+    def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        return places.loss(data["shown"], data["motion"], generator)
+
+    stats = fit("places", places, batch, loss, options, folder)
+    places.taught.fill_(True)
+    return stats
