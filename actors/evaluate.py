@@ -30,28 +30,6 @@ class Outcome:
 
 
 @torch.no_grad()
-def imagine(env: EnvBase, policy: TensorDictModuleBase, seeds: list[int], sampling_seed: int = 0) -> Tensor:
-    """Whole episodes of a stochastic policy in a world of WorldEnv, whatever its judge says of them.
-
-    Returns:
-        Generated frames uint8 [N, T, V, 3, H, W] up to the horizon, without the first frame, in the order of `seeds`.
-    """
-    base = getattr(env, "base_env", env)
-    width = env.batch_size[0]
-    torch.manual_seed(sampling_seed)
-    frames = []
-    with set_exploration_type(ExplorationType.RANDOM):
-        for begin in tqdm(range(0, len(seeds), width), desc="imagine", unit="batch", dynamic_ncols=True, leave=False):
-            part = seeds[begin : begin + width]
-            base.schedule([*part, *[part[-1]] * (width - len(part))])
-            now = env.reset()
-            for _ in range(base.horizon // base.chunk):
-                now = step_mdp(env.step(policy(now)), exclude_reward=True, exclude_done=True)
-            frames.append(base.session["history", "frames"][: len(part), 1 : base.horizon + 1].cpu())
-    return torch.cat(frames)
-
-
-@torch.no_grad()
 def evaluate(env: EnvBase, policy: TensorDictModuleBase, seeds: list[int], stochastic: bool = False, label: str = "evaluate", sampling_seed: int = 0) -> Outcome:
     """Run one episode per seed.
 

@@ -194,9 +194,17 @@ def train_rl(
         alarms.entropy, alarms.silent, alarms.raised = saved["entropy"], saved["silent"], saved["raised"]
         _truncate(log, first)
     steps = base.horizon // base.chunk
+    queued: list[int] = []
     per_batch = config.envs * steps
     collector = Collector(
-        env, policy, frames_per_batch=per_batch, total_frames=per_batch * max(1, config.iterations - first), reset_at_each_iter=True, auto_register_policy_transforms=False
+        env,
+        policy,
+        frames_per_batch=per_batch,
+        total_frames=per_batch * max(1, config.iterations - first),
+        reset_at_each_iter=True,
+        # Right before the reset: the collector also resets when it is set up, and would use up the first seeds.
+        pre_collect_hook=lambda: base.schedule(queued),
+        auto_register_policy_transforms=False,
     )
     bar = tqdm(total=config.iterations, initial=first, desc=name, unit="it", dynamic_ncols=True)
     figures: dict[str, float] = {}
@@ -207,7 +215,7 @@ def train_rl(
             torch.manual_seed(config.seed * 7_919 + iteration)
             pool = starts or len(seed_pool or ())
             seeds = algorithm.seeds(pool, config.envs, generator)
-            base.schedule(seeds if seed_pool is None else [seed_pool[s % pool] for s in seeds])
+            queued[:] = seeds if seed_pool is None else [seed_pool[s % pool] for s in seeds]
             began = time.perf_counter()
             batch = next(stream)
             collected = time.perf_counter()

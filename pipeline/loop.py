@@ -37,16 +37,17 @@ def build_loop(cfg: Cfg, root: Path) -> Graph:
         size = cfg["rounds"]["deploy"][min(number, len(cfg["rounds"]["deploy"])) - 1]
         deploy = add(f"deploy-{number}", (policy,), {**world, "deploy": size, "policy": cfg["policy"]}, work.deploy, number=number, episodes=size)
         data = [*data, deploy]
-        cloned = add(f"clone-{number}", (*data, policy), {**world, "policy": cfg["policy"], "imitation": cfg["imitation"], "clone": cfg["clone"]}, work.clone, data=tuple(data), policy=policy)
         steps = "first" if number == 1 else "refresh"
         warm = (vision,) if vision else ()
         if cfg["simulator"]["engine"] == "dit" and not vision:
             warm = (add("tokenizer", tuple(data), {**learned, "tokenizer": cfg["tokenizer"]}, work.tokenizer, data=tuple(data)),)
         vision = add(f"vision-{number}", (*data, *warm), {**learned, "vision": cfg["vision"][steps]}, work.vision, data=tuple(data), warm=warm, steps=steps)
         state = add(f"state-{number}", (*data, vision, *((state,) if state else ())), {**learned, "state": cfg["state"][steps]}, work.state, data=tuple(data), vision=vision, warm=state, steps=steps)
-        settings = {**learned, "judge": cfg["judge"], "judge_fit": cfg["judge_fit"][steps], "policy": cfg["policy"], "starts": cfg["measure"]["starts"]}
-        judge = add(f"judge-{number}", (*data, vision, state, policy, *((judge,) if judge else ())), settings, work.judge, data=tuple(data), vision=vision, state=state, policy=policy, warm=judge, steps=steps, number=number)
+        settings = {**learned, "judge": cfg["judge"], "judge_fit": cfg["judge_fit"][steps]}
+        judge = add(f"judge-{number}", (*data, vision, *((judge,) if judge else ())), settings, work.judge, data=tuple(data), vision=vision, warm=judge, steps=steps, number=number)
+        settings = {**settings, "policy": cfg["policy"]}
         gap = add(f"gap-{number}", (*data, vision, state, judge, policy, held_out), {**settings, "measure": cfg["measure"]}, work.gap, data=tuple(data), vision=vision, state=state, judge=judge, policy=policy, number=number)
+        cloned = add(f"clone-{number}", (*data, policy, vision), {**learned, "policy": cfg["policy"], "imitation": cfg["imitation"], "clone": cfg["clone"]}, work.clone, data=tuple(data), policy=policy, vision=vision)
         iterations = cfg["rounds"]["iterations"][min(number, len(cfg["rounds"]["iterations"])) - 1]
         settings = {**settings, "algorithm": cfg["algorithm"], "rl": cfg["rl"], "iterations": iterations}
         policy = add(f"rl-{number}", (*data, vision, state, judge, cloned, gap), settings, work.rl, data=tuple(data), vision=vision, state=state, judge=judge, policy=cloned, iterations=iterations, number=number)

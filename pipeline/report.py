@@ -212,4 +212,11 @@ def _curves(found: Found, rounds: int) -> list[str]:
                 values = smooth([row[metric] for row in rows], 25)
                 curves.append((name, list(range(len(values))), values))
         urls.append(plot(curves, title, "step", metric.split("/")[1].replace("_", " ")))
+    rows = read_metrics(found["vision-1"] / "places")
+    if rows:  # empty where no episode knows its objects' places
+        curves = []
+        for key, label in (("found_cm", "found in the first view"), ("way_cm", "moved by commands")):
+            values = smooth([row[f"places/{key}"] for row in rows], 50)
+            curves.append((label, list(range(len(values))), values))
+        urls.append(plot(curves, "Objects' places, round 1", "step", "error in cm"))
     return urls

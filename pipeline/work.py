@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
-from actors.evaluate import evaluate, imagine
+from actors.evaluate import evaluate
 from actors.factory import (
     ConfigError,
     bench_config,
@@ -29,15 +28,15 @@ from actors.factory import (
 )
 from envs.episodes import Episode, LeRobotDataset, LeRobotWriter
 from envs.episodes.clips import ClipStore
-from envs.language import tokenize
 from envs.physics.pool import BenchPool, Track
 from envs.simulators.replay import replay
 from envs.world import Starts
 from learners.factory import build_algorithm
 from learners.fit import FitConfig
 from learners.rl import RLConfig, train_rl
+from learners.stages.generated import generated_frames
 from learners.stages.imitation import Cloning, train_imitation
-from learners.stages.judge import calibrate, episode_labels, train_judge
+from learners.stages.judge import calibrate, train_judge
 from learners.stages.state import train_state
 from learners.stages.vision import VisionConfig, train_places, train_vision
 from pipeline import measurement
@@ -159,15 +158,20 @@ def worked(cfg: Cfg, store: ClipStore) -> Tensor:
     return known[torch.isin(known, split(store)[0])]
 
 
-def clone(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], policy: str) -> dict[str, Any]:
-    """The deployed policy, perception and all, learns from what worked in physics; RL then leaves its perception as it is."""
+def clone(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], policy: str, vision: str) -> dict[str, Any]:
+    """The deployed policy, perception and all, learns from what worked in physics, and to see generated pictures as it sees true ones; RL then leaves its perception as it is."""
     store = open_store(found, data)
     prepare_process(cfg["seed"])
     actor = build_policy(cfg, found[policy] / "weights.safetensors")
     episodes = worked(cfg, store)
-    stats = train_imitation(actor, store, episodes, fit_options(cfg, cfg["clone"], "clone"), folder, fresh=False)
+    section = dict(cfg["clone"])
+    own = store.select(["policy-*"])
+    own = own[torch.isin(own, split(store)[0])].flip(0)[: section.pop("imagined")]  # the newest first
+    simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
+    made = generated_frames(simulator, store, own, cfg["simulator"]["bf16"])
+    stats = train_imitation(actor, store, episodes, fit_options(cfg, section, "clone"), folder, fresh=False, generated=made)
     save_weights(actor, folder)
-    return {**stats, "episodes": len(episodes)}
+    return {**stats, "episodes": len(episodes), "generated_frames": len(made)}
 
 
 def tokenizer(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...]) -> dict[str, Any]:
@@ -188,11 +192,11 @@ def vision(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], warm: tu
     section = dict(cfg["vision"][steps])
     fit_section, places_section = section.pop("fit"), section.pop("places")
     store = open_store(found, data)
-    train, _ = split(store)
+    train, kept = split(store)
     newest = train[train >= len(store) - len(ClipStore([found[data[-1]] / "dataset"]))]
     prepare_process(cfg["seed"])
     simulator = build_simulator(cfg, found[warm[0]] / "weights.safetensors" if warm else None)
-    train_places(simulator, store, train, fit_options(cfg, places_section, f"vision.{steps}.places"), folder / "places")
+    train_places(simulator, store, train, kept, fit_options(cfg, places_section, f"vision.{steps}.places"), folder / "places")
     stats = train_vision(simulator, store, train, options(VisionConfig, section, f"vision.{steps}"), fit_options(cfg, fit_section, f"vision.{steps}.fit"), folder, newest)
     save_weights(simulator, folder)
     return {**stats, "parameters": sum(p.numel() for p in simulator.parameters())}
@@ -213,8 +217,8 @@ def state(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
     return stats
 
 
-def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, state: str, policy: str, warm: str, steps: str, number: int) -> dict[str, Any]:
-    """The judge on real and on generated frames, its threshold calibrated on the policy that was deployed last."""
+def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, warm: str, steps: str, number: int) -> dict[str, Any]:
+    """The judge on real and on generated frames, its threshold calibrated on real video of the policy that was deployed last."""
     section = dict(cfg["judge_fit"][steps])
     fit_section = section.pop("fit")
     store = open_store(found, data)
@@ -223,33 +227,15 @@ def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
     simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
     judge = build_judge(cfg, found[warm] / "weights.safetensors" if warm else None)
     pick = train[torch.randperm(len(train), generator=torch.Generator().manual_seed(cfg["seed"]))[: section["imagined"]]]
-    imagined = None
-    if len(pick):
-        made = replay(simulator, store, pick, bf16=cfg["simulator"]["bf16"])
-        labels = episode_labels(store, judge.hold)
-        tokens = torch.stack([tokenize(store.episodes[n]["instruction"]) for n in pick.tolist()])
-        valid = made.valid.reshape(-1)
-        flat = made.rows.reshape(-1)[valid]
-        imagined = TensorDict(
-            {
-                "frames": made.frames.flatten(0, 1)[valid],
-                "begin": store.start[pick].repeat_interleave(made.valid.shape[1], 0)[valid],
-                "tokens": tokens.repeat_interleave(made.valid.shape[1], 0)[valid],
-                "label": labels[flat],
-                "progress": store.arrays["progress"][flat].float(),
-            },
-            [int(valid.sum())],
-        )
+    imagined = generated_frames(simulator, store, pick, cfg["simulator"]["bf16"]) if len(pick) else None
     stats = train_judge(judge, store, train, fit_options(cfg, fit_section, f"judge_fit.{steps}.fit"), folder, imagined)
-    save_weights(judge, folder)
-    mine = store.select([f"policy-{number}"])[: cfg["measure"]["starts"]]
+    mine = store.select([f"policy-{number}"])
+    rows, valid = store.whole(mine)
+    success = measurement.judge_frames(judge, store.frames(rows), store, mine)
     rate = torch.tensor([store.episodes[n]["success"] for n in mine.tolist()]).float().mean()
-    world = load_world(cfg, {**found, "self": folder}, store, vision, state, "self", min(64, len(mine)), mine)
-    actor = build_policy(cfg, found[policy] / "weights.safetensors")
-    frames = imagine(world, actor, list(range(len(mine))), sampling_seed=cfg["seed"] + 1)
-    calibrate(judge, measurement.judge_frames(judge, frames, store, mine), float(rate))
+    calibrate(judge, torch.where(valid, success, 0.0), float(rate))
     save_weights(judge, folder)
-    return {**stats, "threshold": float(judge.threshold)}
+    return {**stats, "threshold": float(judge.threshold), "generated_frames": len(imagined) if imagined is not None else 0}
 
 
 def rl(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, state: str, judge: str, policy: str, iterations: int, number: int) -> dict[str, Any]:

@@ -157,6 +157,12 @@ class ClipStore:
             size,
         )
 
+    def whole(self, episodes: Tensor) -> tuple[Tensor, Tensor]:
+        """Rows int64 [N, T] of all frames but the first of some episodes, the last repeated up to the longest, and which are no repeats, bool [N, T]."""
+        ahead = torch.arange(1, int(self.length[episodes].max()))
+        last = self.length[episodes][:, None] - 1
+        return self.start[episodes][:, None] + torch.minimum(ahead, last), ahead <= last
+
     def shots(self, episodes: Tensor, count: int, generator: torch.Generator) -> TensorDict:
         """`count` random pictures of the first view, every other one an episode's first.
 
@@ -174,7 +180,8 @@ class ClipStore:
         """`count` random chunks without pictures, each wholly within its episode.
 
         Returns:
-            TensorDict [count] with now (command [14], objects [2, 3]) and future (commands [K, 14], objects [K, 2, 3]).
+            TensorDict [count] with recent [1 + K, 14], the commands up to now, now (objects [2, 3]) and future (commands [K, 14],
+            objects [K, 2, 3]).
         """
         choices = (self.length[episodes] - chunk).clamp(min=0)
         if not int(choices.sum()):
@@ -184,10 +191,12 @@ class ClipStore:
         chosen = torch.searchsorted(edges, draw, right=True)
         now = self.start[episodes[chosen]] + draw - (edges[chosen] - choices[chosen])
         ahead = now[:, None] + torch.arange(1, chunk + 1)
+        before = torch.maximum(now[:, None] + torch.arange(-chunk, 1), self.start[episodes[chosen]][:, None])
         commands, objects = self.arrays["commands"], self.arrays["objects"]
         return TensorDict(
             {
-                "now": TensorDict({"command": commands[now], "objects": objects[now]}, [count]),
+                "recent": commands[before],
+                "now": TensorDict({"objects": objects[now]}, [count]),
                 "future": TensorDict({"commands": commands[ahead], "objects": objects[ahead]}, [count, chunk]),
             },
             [count],

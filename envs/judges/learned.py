@@ -31,6 +31,7 @@ class LearnedJudge(Judge):
         self.main = SpatialEncoder(points, width, pictures=2)
         self.sides = nn.ModuleList(PatchEncoder(16, 8) for _ in range(views - 1))
         self.words = WordEncoder(16)
+        self.sharpness = nn.Parameter(torch.tensor(2.0))
         self.head = nn.Sequential(nn.Linear(self.main.out_features + 16 * views, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU(), nn.Linear(128, 2))
 
     def forward(self, frames: Tensor, first: Tensor, tokens: Tensor) -> tuple[Tensor, Tensor]:
@@ -38,7 +39,8 @@ class LearnedJudge(Judge):
         pictures = to_signed(frames)
         parts = [self.main(torch.cat((pictures[:, 0], to_signed(first[:, 0])), 1))] + [side(pictures[:, k + 1]) for k, side in enumerate(self.sides)]
         out = self.head(torch.cat([*parts, self.words(tokens)], -1)).float()
-        return out[:, 0], out[:, 1]
+        # Success is for the most part progress beyond some point, and progress is taught by every frame.
+        return out[:, 0] + self.sharpness * out[:, 1], out[:, 1]
 
     @torch.no_grad()
     def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
@@ -53,7 +55,7 @@ class LearnedJudge(Judge):
         return Verdict(success, progress.sigmoid().unflatten(0, (batch, count)), status)
 
     def loss(self, frames: Tensor, first: Tensor, tokens: Tensor, label: Tensor, progress: Tensor, share: float) -> tuple[Tensor, dict[str, Any]]:
-        """Class-balanced cross-entropy of success plus that of progress.
+        """Class-balanced cross-entropy of success plus the absolute error of progress.
 
         Args:
             label: float [N] in {0, 1}; progress: float [N] in 0..1.
@@ -62,6 +64,7 @@ class LearnedJudge(Judge):
         logit, towards = self(frames, first, tokens)
         weight = torch.where(label > 0.5, 0.5 / max(share, 1e-3), 0.5 / max(1 - share, 1e-3))
         success = (F.binary_cross_entropy_with_logits(logit, label, reduction="none") * weight).mean()
-        shaped = F.binary_cross_entropy_with_logits(towards, progress)
+        # Cross-entropy hardly minds a few hundredths of progress, which are the centimetre that decides.
+        shaped = (towards.sigmoid() - progress).abs().mean()
         right = ((logit > 0) == (label > 0.5)).float().mean()
-        return success + 2.0 * shaped, {"success": success.detach(), "frame_accuracy": right, "progress_error": (towards.sigmoid() - progress).abs().mean().detach()}
+        return success + 10.0 * shaped, {"success": success.detach(), "frame_accuracy": right, "progress_error": shaped.detach()}

@@ -111,7 +111,7 @@ class Simulator(nn.Module):
         )
 
     # -- the contract --------------------------------------------------------------------------------------------
-    def reset(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor, command: Tensor, state: Tensor, pose_map: Tensor, seed: Tensor) -> TensorDict:
+    def reset(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor, command: Tensor, state: Tensor, pose_map: Tensor, seed: Tensor, *, likeliest: bool = False) -> TensorDict:
         """Begin sessions from first frames.
 
         Args:
@@ -120,6 +120,7 @@ class Simulator(nn.Module):
             command: [B, 14] command in force; state: [B, 16] joint state.
             pose_map: uint8 [B, V, 3, H, W] of that command.
             seed: int64 [B].
+            likeliest: let objects go their likeliest way, for comparing with what happened; else the seed decides.
 
         Returns:
             The sessions' state, a TensorDict [B].
@@ -130,12 +131,19 @@ class Simulator(nn.Module):
         return TensorDict(
             {
                 "history": TensorDict(
-                    {"frames": frames[:, None], "pose_map": pose_map[:, None], "c2w": c2w[:, None].float(), "commands": command[:, None].float(), "states": state[:, None].float()},
+                    {
+                        "frames": frames[:, None],
+                        "pose_map": pose_map[:, None],
+                        "c2w": c2w[:, None].float(),
+                        "commands": command[:, None].float(),
+                        "states": state[:, None].float(),
+                        "places": torch.where(self.places.taught, places, torch.nan)[:, None],
+                    },
                     [*size, 1],
                 ),
                 "length": torch.ones(size, dtype=torch.int64, device=frames.device),
                 "intrinsic": intrinsic.float(),
-                "places": torch.where(self.places.taught, places, torch.nan),
+                "likeliest": torch.full(size, likeliest, device=frames.device),
                 "seed": seed.reshape(size),
                 "chunk_index": torch.zeros(size, dtype=torch.int64, device=frames.device),
             },
@@ -158,13 +166,14 @@ class Simulator(nn.Module):
         length = state["length"]
         memory = memory_indices(length, self.shape.memory)
         history = state["history"]
-        now = history[rows, length - 1]
-        ahead = self.places.push(state["places"], now["commands"], commands)
+        now = history.select("commands", "states", "places")[rows, length - 1]
+        luck = self._luck(state["seed"], state["chunk_index"]).to(commands.device).masked_fill(state["likeliest"][:, None, None], 0.0)
+        ahead = self.places.push(now["places"], self.recent(state, 1 + count)["commands"], commands, luck)
         inputs = TensorDict(
             {
-                "memory": history[rows[:, None], memory].select("frames", "pose_map", "c2w"),
+                "memory": history.select("frames", "pose_map", "c2w")[rows[:, None], memory],
                 "future": TensorDict({"pose_map": pose_map, "c2w": c2w, "commands": commands, "places": ahead}, [batch]),
-                "now": TensorDict({"command": now["commands"], "state": now["states"], "places": state["places"]}, [batch]),
+                "now": TensorDict({"command": now["commands"], "state": now["states"], "places": now["places"]}, [batch]),
                 "intrinsic": state["intrinsic"],
                 "seed": state["seed"],
                 "chunk_index": state["chunk_index"],
@@ -178,7 +187,7 @@ class Simulator(nn.Module):
             room = max(need, 2 * history.shape[1]) - history.shape[1]
             history = torch.cat([history, torch.zeros_like(history[:, :1]).expand(batch, room).clone()], 1)
         at = length[:, None] + torch.arange(count, device=length.device)
-        new = {"frames": pictures, "pose_map": pose_map, "c2w": c2w, "commands": commands, "states": now["states"][:, None].expand(-1, count, -1)}
+        new = {"frames": pictures, "pose_map": pose_map, "c2w": c2w, "commands": commands, "states": now["states"][:, None].expand(-1, count, -1), "places": ahead}
         for name, value in new.items():
             history[name][rows[:, None], at] = value
         state = TensorDict(
@@ -186,13 +195,18 @@ class Simulator(nn.Module):
                 "history": history,
                 "length": length + count,
                 "intrinsic": state["intrinsic"],
-                "places": ahead[:, -1],
+                "likeliest": state["likeliest"],
                 "seed": state["seed"],
                 "chunk_index": state["chunk_index"] + 1,
             },
             [batch],
         )
         return pictures, features.float(), state
+
+    def _luck(self, seed: Tensor, chunk_index: Tensor) -> Tensor:
+        """Standard normal numbers [B, S, 3] that belong to each session's seed and chunk; objects stray along the ground."""
+        rows = [torch.randn(self.shape.objects, 3, generator=noise_generator(s, c)) for s, c in zip(seed.tolist(), chunk_index.tolist(), strict=True)]
+        return torch.stack(rows) * torch.tensor([1.0, 1.0, 0.0])
 
     @staticmethod
     def remember_states(state: TensorDict, decoded: Tensor) -> None:
@@ -208,16 +222,21 @@ class Simulator(nn.Module):
         length = state["length"]
         rows = torch.arange(len(length), device=length.device)[:, None]
         at = (length[:, None] - count + torch.arange(count, device=length.device)).clamp(min=0)
-        return state["history"][rows, at].select("commands", "states")
+        return state["history"].select("commands", "states")[rows, at]
 
     @staticmethod
     def replace(state: TensorDict, mask: Tensor, fresh: TensorDict) -> TensorDict:
         """The state with the sessions of `mask` [B] replaced by those of `fresh` (one row per True, in order)."""
-        for name in ("length", "intrinsic", "places", "seed", "chunk_index"):
+        for name in ("length", "intrinsic", "likeliest", "seed", "chunk_index"):
             state[name][mask] = fresh[name].to(state[name].dtype)
         for name in state["history"].keys():
             state["history", name][mask.nonzero().flatten(), 0] = fresh["history", name][:, 0]
         return state
+
+
+def noise_generator(seed: int, chunk_index: int) -> torch.Generator:
+    """The generator of all randomness of one chunk of one session, whatever batch it is in."""
+    return torch.Generator().manual_seed((int(seed) * 1_000_003 + int(chunk_index)) & 0x7FFF_FFFF_FFFF)
 
 
 def hue_gap(frames: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from envs.conditioning import render_ray_map
 from envs.simulators.autoencoder import STRIDE, Autoencoder
-from envs.simulators.base import Simulator, WorldShape, foreground_weight
+from envs.simulators.base import Simulator, WorldShape, foreground_weight, noise_generator
 from envs.simulators.dit import DiTShape, MultiViewDiT
 from envs.simulators.places import in_view, place_map
 
@@ -158,8 +158,7 @@ class DiTSimulator(Simulator):
         _, views, channels, _, height, width = like.shape
         rows = []
         for s, c in zip(seed.tolist(), chunk_index.tolist(), strict=True):
-            generator = torch.Generator().manual_seed((int(s) * 1_000_003 + int(c)) & 0x7FFF_FFFF_FFFF)
-            rows.append(torch.randn(views, channels, self.shape.chunk, height, width, generator=generator))
+            rows.append(torch.randn(views, channels, self.shape.chunk, height, width, generator=noise_generator(s, c)))
         return torch.stack(rows).to(like.device)
 
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:

@@ -69,14 +69,17 @@ class Places(nn.Module):
 
     Attributes:
         taught: whether it was ever shown object positions; until then all places are NaN.
+        spread: what doubt is multiplied with, so that it fits episodes that were not learned from.
     """
 
     taught: Tensor
+    spread: Tensor
 
     def __init__(self, objects: int, chunk: int, width: int = 256):
         super().__init__()
         self.objects, self.chunk = objects, chunk
         self.register_buffer("taught", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("spread", torch.ones(()))
         self.finder = nn.Sequential(
             nn.Conv2d(3, 24, 5, stride=2, padding=2),
             nn.SiLU(),
@@ -87,8 +90,8 @@ class Places(nn.Module):
             nn.Conv2d(32, max(1, objects), 3, padding=1),
         )
         self.heights = nn.Parameter(torch.zeros(max(1, objects)))  # metres above the world's ground; objects stand on something
-        seen = 2 * 6 * (1 + chunk) + objects
-        self.ways = nn.Sequential(nn.Linear(seen, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 3 * chunk))
+        seen = 2 * 6 * (1 + 2 * chunk) + objects
+        self.ways = nn.Sequential(nn.Linear(seen, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 4 * chunk))
 
     def of(self, objects: Tensor) -> Tensor:
         """The followed ones [..., S, 3] of recorded objects [..., N, 3], NaN where there are fewer."""
@@ -108,31 +111,56 @@ class Places(nn.Module):
         pixels = torch.stack((u, v), -1)
         return on_plane(pixels, self.heights[: self.objects, None], intrinsic, c2w)
 
+    def push(self, places: Tensor, recent: Tensor, commands: Tensor, luck: Tensor) -> Tensor:
+        """Where objects at `places` [B, S, 3] will be [B, K, S, 3] under `commands` [B, K, 14].
+
+        Args:
+            recent: [B, 1 + K, 14] commands before these, the one in force last: arms lag behind what they are told.
+            luck: [B, S, 3] how far, in standard deviations, each object strays from its likeliest way. What decides a
+                push (a block's angle, its friction) is not all seen; a world in which every push goes the likeliest
+                way is one that a policy learns to exploit.
+        """
+        way, doubt = self.foresee(places, recent, commands)
+        return way + self.spread * doubt * luck[:, None]
+
     @torch.autocast("cpu", enabled=False)
     @torch.autocast("cuda", enabled=False)
-    def push(self, places: Tensor, command: Tensor, commands: Tensor) -> Tensor:
-        """Where objects at `places` [B, S, 3] will be [B, K, S, 3] under `commands` [B, K, 14] after `command` [B, 14]."""
-        tips = fingertips(torch.cat((command[:, None], commands), 1))  # [B, 1 + K, 2, 3]
+    def foresee(self, places: Tensor, recent: Tensor, commands: Tensor) -> tuple[Tensor, Tensor]:
+        """The likeliest way [B, K, S, 3] and its standard deviation [B, K, S, 1], both in metres; arguments as those of push."""
+        tips = fingertips(torch.cat((recent, commands), 1))  # [B, 1 + 2 K, 2, 3]
         gap = (tips[:, None] - places[:, :, None, None]).flatten(2)
         which = torch.eye(self.objects, device=gap.device).expand(len(gap), -1, -1)
         # Near the object millimetres count, far from it only the direction does.
-        moves = self.ways(torch.cat((10 * gap, (40 * gap).clamp(-3, 3), which), -1)).unflatten(-1, (self.chunk, 3))
-        return places[:, None] + 0.05 * moves.cumsum(2).transpose(1, 2)
+        out = self.ways(torch.cat((10 * gap, (40 * gap).clamp(-3, 3), which), -1)).unflatten(-1, (self.chunk, 4)).transpose(1, 2)
+        return places[:, None] + 0.05 * out[..., :3].cumsum(1), 0.02 * (out[..., 3:] - 2).exp().clamp(max=5.0)
 
-    def loss(self, shown: TensorDict, motion: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        """Centimetres by which objects are missed, in pictures and at the end of their way.
+    @torch.no_grad()
+    def calibrate(self, motion: TensorDict) -> None:
+        """Set `spread` by motions that were not learned from (ClipStore.motions): errors there are larger than in training."""
+        begin, ahead = self.of(motion["now", "objects"]), self.of(motion["future", "objects"])
+        way, doubt = self.foresee(torch.nan_to_num(begin), motion["recent"], motion["future", "commands"])
+        strayed = ((way - ahead)[:, -1, :, :2] / doubt[:, -1]).square()
+        # Only where something is in doubt: what lies still is foreseen to a hair either way.
+        strayed = strayed[(doubt[:, -1].expand_as(strayed) > 1e-3) & torch.isfinite(strayed)]
+        self.spread.fill_(float(strayed.mean().sqrt().clamp(0.5, 3.0)) if len(strayed) else 1.0)
+
+    def loss(self, shown: TensorDict, motion: TensorDict) -> tuple[Tensor, dict[str, Tensor]]:
+        """Centimetres by which objects are missed, in pictures and on their way, and how badly that was foreseen.
 
         Args:
             shown: ClipStore.shots, pictures with object positions; motion: ClipStore.motions, commands with them.
         """
-        at = self.of(shown["objects"])
-        found = _mean(self.find(shown["frames"], shown["intrinsic"], shown["c2w"]) - at)
-        begin, ahead = self.of(motion["now", "objects"]), self.of(motion["future", "objects"])
-        # A rollout goes on from places that are a little wrong; the object then moves as it would have from there.
-        wrong = 0.003 * torch.randn(begin.shape, generator=generator).to(begin.device)
-        way = self.push(torch.nan_to_num(begin) + wrong, motion["now", "command"], motion["future", "commands"])
-        moved = _mean(way - (begin + wrong)[:, None] - (ahead - begin[:, None]))
-        return found + moved, {"found_cm": found.detach(), "way_cm": moved.detach()}
+        found = _mean(self.find(shown["frames"], shown["intrinsic"], shown["c2w"]) - self.of(shown["objects"]))
+        begin = self.of(motion["now", "objects"])
+        ahead = torch.where(torch.isfinite(begin)[:, None], self.of(motion["future", "objects"]), torch.nan)
+        way, doubt = self.foresee(torch.nan_to_num(begin), motion["recent"], motion["future", "commands"])
+        moved = _mean(way - ahead)
+        # The doubt is fitted to the error as it is; the other way round, doubt would excuse errors.
+        known = torch.isfinite(ahead).all(-1, keepdim=True)
+        error = torch.nan_to_num(way.detach() - ahead)[..., :2].square().sum(-1, keepdim=True) / 2
+        surprise = (error / (doubt.square() + 1e-8) / 2 + (doubt + 1e-4).log()) * known
+        likely = surprise.sum() / known.sum().clamp(min=1)
+        return found + moved + 0.1 * likely, {"found_cm": found.detach(), "way_cm": moved.detach(), "surprise": likely.detach()}
 
 
 def _mean(gap: Tensor) -> Tensor:
@@ -140,4 +168,3 @@ def _mean(gap: Tensor) -> Tensor:
     known = torch.isfinite(gap).all(-1)
     length = torch.nan_to_num(gap).abs().sum(-1) * 100
     return (length * known).sum() / known.sum().clamp(min=1)
-

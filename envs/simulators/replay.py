@@ -14,12 +14,14 @@ from envs.simulators.state_base import StateDecoder
 
 
 class Replay(NamedTuple):
-    """frames uint8 [N, T, V, 3, H, W] generated, rows int64 [N, T] of the true frames, valid bool [N, T], states float32 [N, T, 16] decoded."""
+    """frames uint8 [N, T, V, 3, H, W] generated, rows int64 [N, T] of the true frames, valid bool [N, T], states float32 [N, T, 16] decoded,
+    places float32 [N, T, S, 3] where the simulator has its objects, in metres, NaN where it does not know."""
 
     frames: Tensor
     rows: Tensor
     valid: Tensor
     states: Tensor
+    places: Tensor
 
 
 @torch.no_grad()
@@ -37,8 +39,8 @@ def replay(simulator: Simulator, store: ClipStore, episodes: Tensor, decoder: St
     for ids in episodes.split(batch):
         start, last = store.start[ids], store.length[ids][:, None] - 1
         first = [store.frames(start), store.intrinsic[ids], store.arrays["c2w"][start], store.arrays["commands"][start], store.arrays["states"][start], store.pose_maps(start), ids]
-        state = simulator.reset(*(value.to(device) for value in first))
-        frames, rows, valid, states = [], [], [], []
+        state = simulator.reset(*(value.to(device) for value in first), likeliest=True)
+        frames, rows, valid, states, places = [], [], [], [], []
         for step in range(steps):
             ahead = step * chunk + torch.arange(1, chunk + 1)[None]
             at = start[:, None] + torch.minimum(ahead.expand(len(ids), -1), last)
@@ -55,5 +57,6 @@ def replay(simulator: Simulator, store: ClipStore, episodes: Tensor, decoder: St
             rows.append(at)
             valid.append(ahead <= last)
             states.append(decoded.cpu())
-        parts.append(Replay(*(torch.cat(values, 1) for values in (frames, rows, valid, states))))
+            places.append(state["history", "places"][torch.arange(len(ids))[:, None], state["length"].cpu()[:, None] - chunk + torch.arange(chunk)].cpu())
+        parts.append(Replay(*(torch.cat(values, 1) for values in (frames, rows, valid, states, places))))
     return Replay(*(torch.cat(values) for values in zip(*parts, strict=True)))

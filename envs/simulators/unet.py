@@ -36,8 +36,8 @@ class UNetConfig:
     """
 
     shrink: tuple[int, ...] = (1, 2, 2)
-    width: int = 96
-    blocks: tuple[int, int] = (2, 4)
+    width: int = 32
+    blocks: tuple[int, int] = (1, 3)
     foreground: float = 8.0
     emphasis: tuple[float, ...] = (1.0, 0.4, 0.4)
     jitter: float = 0.003

@@ -25,10 +25,14 @@ class Cloning:
     """Chunks to imitate: every frame of the given episodes, with the next K commands relative to the one in force.
 
     Past an episode's end its last command is held.
+
+    Args:
+        generated: frames of generated.py. On these the policy is asked to do what it does on the true ones: what it
+            learns in imagination is of use only as far as it sees both alike.
     """
 
-    def __init__(self, policy: ChunkPolicy, store: ClipStore, episodes: Tensor):
-        self.policy, self.store = policy, store
+    def __init__(self, policy: ChunkPolicy, store: ClipStore, episodes: Tensor, generated: TensorDict | None = None):
+        self.policy, self.store, self.generated = policy, store, generated
         chunk = policy.head.basis.shape[0]
         every = torch.cat([torch.stack([torch.full((int(store.length[n]),), n), torch.arange(int(store.length[n]))]) for n in episodes.tolist()], 1)
         self.rows = store.start[every[0]] + every[1]
@@ -56,6 +60,9 @@ class Cloning:
         else:
             out[SEEN] = self.seen[pick]
         gain = torch.where(head.gain > 0, head.gain, torch.ones_like(head.gain))
+        if self.generated is not None:
+            made = self.generated[torch.randint(len(self.generated), (count,), generator=generator)]
+            out["pair"] = TensorDict({"made": made["frames"], "true": self.store.frames(made["row"]), STATE: self.store.arrays["states"][made["row"]], TOKENS: made["tokens"]}, pick.shape)
         out["target"] = torch.linalg.pinv(head.basis) @ ((self.targets[pick] - head.offset) / gain)
         return out
 
@@ -70,12 +77,19 @@ class Cloning:
         knots = policy.head(policy.fusion(seen, state + noise))[0]
         active = (policy.head.gain > 0).float()
         error = (knots - data["target"]).abs() * active
-        return error.sum() / (active.sum() * error.shape[0] * error.shape[1])
+        cloned = error.sum() / (active.sum() * error.shape[0] * error.shape[1])
+        if "pair" not in data.keys():
+            return cloned
+        pair = data["pair"]
+        made, true = (policy.head(policy.fusion(policy.perception(pair[name], pair[TOKENS]), pair[STATE]))[0] for name in ("made", "true"))
+        # Seen alike from both sides: neither picture is the right one to be wrong about.
+        apart = (made - true).abs() * active
+        return cloned + apart.sum() / (active.sum() * apart.shape[0] * apart.shape[1])
 
 
-def train_imitation(policy: ChunkPolicy, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path, fresh: bool = True) -> dict[str, float]:
+def train_imitation(policy: ChunkPolicy, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path, fresh: bool = True, generated: TensorDict | None = None) -> dict[str, float]:
     """Clone the given episodes; a `fresh` policy gets its units from them first, one that can act already keeps its own."""
-    cloning = Cloning(policy, store, episodes)
+    cloning = Cloning(policy, store, episodes, generated)
     if fresh:
         policy.normalise(cloning.targets, store.arrays["states"][cloning.rows], torch.tensor(ACTIVE_FLOOR * 2))
     policy.head.log_std.requires_grad_(False)  # exploration is a choice, not something demonstrations tell

@@ -31,8 +31,7 @@ def train_judge(
     """Train `judge` in place.
 
     Args:
-        imagined: generated frames as a TensorDict [N] with frames uint8 [V, 3, H, W], begin (the row of their first frame), tokens, label and
-            progress; half of each batch.
+        imagined: frames of generated.py, labelled by physics under the same actions; half of each batch.
     """
     labels = episode_labels(store, judge.hold)
     rows = torch.cat([torch.arange(int(store.start[n]), int(store.start[n] + store.length[n])) for n in episodes.tolist()])
@@ -54,8 +53,9 @@ def train_judge(
             {"frames": store.frames(chosen), "begin": begin[chosen], "tokens": tokens[owner[chosen]], "label": labels[chosen], "progress": store.arrays["progress"][chosen].float()}, [len(chosen)]
         )
         if imagined is not None:
-            pick = torch.randint(len(imagined), (options.batch - real,), generator=generator)
-            out = torch.cat([out, imagined[pick]])
+            made = imagined[torch.randint(len(imagined), (options.batch - real,), generator=generator)]
+            made["label"] = labels[made["row"]]
+            out = torch.cat([out, made.exclude("row")])
         out["first"] = store.frames(out["begin"])
         return out
 
@@ -74,14 +74,15 @@ def augment(pictures: Tensor, generator: torch.Generator, strength: float = 0.08
 
 
 def calibrate(judge: Judge, success: Tensor, rate: float) -> None:
-    """Set the judge's threshold so that imagined episodes succeed as often as true ones did.
+    """Set the judge's threshold so that as many episodes pass as succeeded.
 
-    A judge that lets more through than succeed is what a policy learns to exploit. Matching the rate of a policy whose
-    episodes were counted in physics uses all of them; a threshold of best accuracy on the few dozen episodes that are
-    kept from training jumps with each of these.
+    On real video, that is: on generated video the threshold would also make up for what the simulator gets wrong, and
+    a judge made lenient for a pessimistic simulator is what a policy learns to exploit. Matching a rate uses all
+    episodes of the deployed policy; a threshold of best accuracy on the few dozen that are kept from training jumps
+    with each of these.
 
     Args:
-        success: frame probabilities [N, T] of imagined episodes of that policy; rate: its success rate in physics.
+        success: frame probabilities [N, T] of real episodes of that policy, 0 where they are over; rate: its success rate.
     """
     # An episode succeeds if its best run of `hold` frames lies above the threshold throughout.
     best = success.unfold(1, judge.hold, 1).amin(-1).amax(1)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from envs.episodes.clips import ClipSpec, ClipStore
 from envs.simulators.base import Simulator
-from learners.fit import FitConfig, fit
+from learners.fit import FitConfig, fit, step_generator
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ def train_vision(simulator: Simulator, store: ClipStore, episodes: Tensor, confi
     return fit("vision", simulator, batch, simulator.loss, options, folder)
 
 
-def train_places(simulator: Simulator, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path) -> dict[str, float]:
-    """Train `simulator.places` in place; does nothing where no episode knows its objects' places.
+def train_places(simulator: Simulator, store: ClipStore, episodes: Tensor, kept: Tensor, options: FitConfig, folder: Path) -> dict[str, float]:
+    """Train `simulator.places` in place and fit its doubt to the `kept` episodes; does nothing where no episode knows its objects' places.
 
     Motions are few numbers, so a step sees `options.batch` of them, and few pictures beside them, which are soon learned.
     """
@@ -65,8 +65,10 @@ def train_places(simulator: Simulator, store: ClipStore, episodes: Tensor, optio
         return TensorDict({"shown": shown, "motion": motion}, [])
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        return places.loss(data["shown"], data["motion"], generator)
+        return places.loss(data["shown"], data["motion"])
 
     stats = fit("places", places, batch, loss, options, folder)
     places.taught.fill_(True)
-    return stats
+    if len(kept):
+        places.calibrate(store.motions(kept, 4096, simulator.shape.chunk, step_generator(options.seed, options.steps)))
+    return {**stats, "spread": float(places.spread)}

@@ -198,14 +198,19 @@ def test_imitation_sets_units_and_learns(store: ClipStore, tmp_path: Path) -> No
     assert bool((gain[[2, 3, 4, 5, 6]] == 0).all()) and bool((gain > 0).any())  # heights, angles and grippers never move
 
 
-def rl_run(folder: Path, iterations: int) -> list[dict[str, float]]:
+def rl_run(folder: Path, iterations: int, grouped: bool = False) -> list[dict[str, float]]:
     policy = small_policy()
     env = PhysicsEnv(BenchConfig(), batch=4, chunk=4, horizon=8, workers=1)
     settings = RLConfig(iterations=iterations, envs=4, epochs=1, minibatch=8, checkpoint_every=1, lr=1e-3)
-    train_rl(env, policy, PPO(policy, PPOConfig()), settings, folder, seed_pool=range(100))
+    algorithm = GRPO(policy, GRPOConfig(group=2)) if grouped else PPO(policy, PPOConfig())
+    train_rl(env, policy, algorithm, settings, folder, seed_pool=range(100))
     env.close()
     rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     return [{k: v for k, v in row.items() if "seconds" not in k} for row in rows]
+
+
+def test_groups_of_real_rollouts_share_their_start(tmp_path: Path) -> None:
+    assert len(rl_run(tmp_path, 2, grouped=True)) == 2  # GRPO itself refuses groups of different starts
 
 
 def test_killed_and_resumed_rl_equals_the_uninterrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
