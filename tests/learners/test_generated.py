@@ -1,0 +1,42 @@
+"""Generated frames beside true ones: which are kept, and that policies learn to see both alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from actors.policies.vla import ChunkPolicy
+from envs.episodes.clips import ClipStore
+from envs.simulators.unet import UNetSimulator
+from learners.fit import FitConfig
+from learners.stages.generated import generated_frames
+from learners.stages.imitation import train_imitation
+
+
+def test_frames_gone_astray_are_left_out(simulator: UNetSimulator, store: ClipStore) -> None:
+    every = torch.arange(3)
+    count = int((store.length[every] - 1).sum())
+    assert len(generated_frames(simulator, store, every, bf16=False)) == count  # nothing is known of places, nothing astray
+    simulator.places.taught.fill_(True)  # now it believes its untrained guesses, which are far off
+    kept = generated_frames(simulator, store, every, bf16=False)
+    assert len(kept) < count
+    assert kept["frames"].shape[1:] == (3, 3, 64, 64)
+
+
+def test_cloning_brings_generated_and_true_pictures_together(simulator: UNetSimulator, store: ClipStore, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    policy = ChunkPolicy(views=3, chunk=4, knots=2, width=32, points=4)
+    demos = torch.tensor([0, 4])
+    train_imitation(policy, store, demos, FitConfig(steps=20, batch=16, lr=3e-3, bf16=False), tmp_path / "a")
+    made = generated_frames(simulator, store, torch.arange(8), bf16=False)
+
+    def apart() -> float:
+        with torch.no_grad():
+            states = store.arrays["states"][made["row"]]
+            said = [policy.head(policy.fusion(policy.perception(frames, made["tokens"]), states))[0] for frames in (made["frames"], store.frames(made["row"]))]
+        return float((said[0] - said[1]).abs()[..., policy.head.gain > 0].mean())
+
+    before = apart()
+    train_imitation(policy, store, demos, FitConfig(steps=40, batch=16, lr=2e-3, bf16=False), tmp_path / "b", fresh=False, generated=made)
+    assert apart() < 0.7 * before
