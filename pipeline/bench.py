@@ -12,7 +12,7 @@ import torch
 
 from actors.factory import ConfigError, bench_config, build_simulator, prepare_process
 from envs.conditioning import PoseMapStyle, render_pose_map, render_ray_map
-from envs.conditioning.pose_map import _AXIS_RGB, _layout, _shades
+from envs.conditioning.pose_map import AXIS_RGB, arm_shades, layout
 from envs.geometry import follow_hands, hands_of
 from envs.physics.bench import Bench
 from envs.physics.pool import BenchPool
@@ -48,17 +48,17 @@ def conditioning(cfg: dict[str, Any]) -> None:
 
     def plain() -> list[np.ndarray]:
         out = []
-        pixels, radii, shades, visible = _layout(commands, cameras, intrinsic, size, 0.15, PoseMapStyle())
+        pixels, radii, shades, visible = layout(commands, cameras, intrinsic, size, 0.15, PoseMapStyle())
         for v in range(len(intrinsic)):
             for t in range(steps):
                 canvas = np.full((*size, 3), 50, np.uint8)
                 for arm in np.flatnonzero(visible[v, t]):
                     centre = tuple(int(x) for x in pixels[v, t, arm, 0])
-                    cv2.circle(canvas, centre, int(radii[v, t, arm]), _shades()[arm][shades[v, t, arm]].tolist(), -1)
+                    cv2.circle(canvas, centre, int(radii[v, t, arm]), arm_shades()[arm][shades[v, t, arm]].tolist(), -1)
                 for arm in np.flatnonzero(visible[v, t]):
                     centre = tuple(int(x) for x in pixels[v, t, arm, 0])
                     for axis in range(3):
-                        cv2.line(canvas, centre, tuple(int(x) for x in pixels[v, t, arm, axis + 1]), _AXIS_RGB[arm][axis], 8)
+                        cv2.line(canvas, centre, tuple(int(x) for x in pixels[v, t, arm, axis + 1]), AXIS_RGB[arm][axis], 8)
                 out.append(np.ascontiguousarray(canvas.transpose(2, 0, 1)))
         return out
 
@@ -90,8 +90,6 @@ def physics(cfg: dict[str, Any]) -> None:
 
 def world(cfg: dict[str, Any]) -> None:
     """Generated frames per second, and the forward pass's share of a simulator step."""
-    from envs.conditioning import render_pose_map as draw
-
     prepare_process(0)
     simulator = build_simulator(cfg).eval()
     shape = simulator.shape
@@ -100,7 +98,7 @@ def world(cfg: dict[str, Any]) -> None:
         commands = torch.zeros(batch, shape.chunk, 14)
         intrinsic = torch.eye(3).expand(batch, shape.views, 3, 3).contiguous()
         c2w = torch.eye(4).expand(batch, shape.chunk, shape.views, 4, 4).contiguous()
-        maps = draw(commands, c2w.transpose(1, 2), intrinsic, shape.size).transpose(1, 2)
+        maps = render_pose_map(commands, c2w.transpose(1, 2), intrinsic, shape.size).transpose(1, 2)
         frames = torch.zeros(batch, shape.views, 3, *shape.size, dtype=torch.uint8)
         first = [frames, intrinsic, c2w[:, 0], commands[:, 0], torch.zeros(batch, 16), maps[:, 0], torch.arange(batch)]
         state = simulator.reset(*(t.to(device) for t in first))

@@ -19,7 +19,7 @@ from envs.geometry import eef_transforms
 _CANVAS = 50
 _AXIS = 0.1  # m
 # RGB of the x, y and z axis lines of the left and of the right arm
-_AXIS_RGB = (((0, 0, 255), (255, 255, 0), (0, 255, 255)), ((255, 0, 255), (255, 0, 0), (0, 255, 0)))
+AXIS_RGB = (((0, 0, 255), (255, 255, 0), (0, 255, 255)), ((255, 0, 255), (255, 0, 0), (0, 255, 0)))
 _REFERENCE_HEIGHT = 384  # the picture height for which radii and thickness are given
 
 
@@ -47,7 +47,7 @@ class PoseMapStyle:
 
 
 @lru_cache(maxsize=1)
-def _shades() -> np.ndarray:
+def arm_shades() -> np.ndarray:
     """Fill colours [2, 256, 3] RGB of the left (Greens) and right (Reds) circle, by colour-map index."""
     import matplotlib
 
@@ -92,12 +92,12 @@ def render_pose_map(
     if not torch.isfinite(eef_poses).all() or not torch.isfinite(c2w).all():
         raise ValueError("pose map: eef_poses or c2w hold NaN or infinite values")
     lead, views, steps = c2w.shape[:-4], c2w.shape[-4], c2w.shape[-3]
-    pixels, radii, shades, visible = _layout(eef_poses, c2w, intrinsic, size, offset, style)
+    pixels, radii, shades, visible = layout(eef_poses, c2w, intrinsic, size, offset, style)
     scale = size[0] / _REFERENCE_HEIGHT if style.scale is None else style.scale
     thickness = max(1, round(8 * scale))
     count = int(np.prod(lead)) * views * steps
     canvas = np.full((count, 3, *size), _CANVAS, np.uint8)
-    lut = _shades().tolist()
+    lut = arm_shades().tolist()
     flat_pixels = pixels.reshape(count, 2, 4, 2).tolist()
     flat_radii, flat_shades = radii.reshape(count, 2).tolist(), shades.reshape(count, 2).tolist()
     flat_visible = visible.reshape(count, 2).tolist()
@@ -114,11 +114,11 @@ def render_pose_map(
             for arm in arms:
                 origin = points[arm][0]
                 for axis in range(3):
-                    line(plane, origin, points[arm][axis + 1], _AXIS_RGB[arm][axis][channel], thickness)
+                    line(plane, origin, points[arm][axis + 1], AXIS_RGB[arm][axis][channel], thickness)
     return torch.from_numpy(canvas).reshape(*lead, views, steps, 3, *size)
 
 
-def _layout(
+def layout(
     eef_poses: Tensor, c2w: Tensor, intrinsic: Tensor, size: tuple[int, int], offset: float, style: PoseMapStyle
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Integer pixels [..., V, T, 2, 4, 2] of origin and axis tips, radii, shade indices and visibility [..., V, T, 2]."""

@@ -123,6 +123,10 @@ class LeRobotWriter:
         for episode in episodes:
             tasks.setdefault(episode.instruction, len(tasks))
         table = pa.table({"task_index": pa.array(list(tasks.values()), pa.int64()), "task": list(tasks)})
+        # LeRobot reads this file by pandas and looks tasks up in the index.
+        names = [("task_index", "int64", "int64"), ("task", "unicode", "object")]
+        columns = [{"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None} for name, kind, numpy in names]
+        table = table.replace_schema_metadata({"pandas": json.dumps({"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"})})
         _replace(self.root / "meta/tasks.parquet", lambda path: pq.write_table(table, path))
         return tasks
 
@@ -243,7 +247,8 @@ class LeRobotDataset:
         if not path.exists():
             return {}
         table = _read_table(path)
-        return dict(zip(table["task"].to_pylist(), table["task_index"].to_pylist(), strict=True))
+        column = "task" if "task" in table.column_names else "__index_level_0__"  # an index without a name, as pandas writes it
+        return dict(zip(table[column].to_pylist(), table["task_index"].to_pylist(), strict=True))
 
     def __len__(self) -> int:
         return len(self._rows)

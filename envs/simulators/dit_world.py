@@ -127,27 +127,23 @@ class DiTSimulator(Simulator):
     # -- contract --------------------------------------------------------------------------------------------------
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; noise comes from (seed, chunk_index), features from the last step."""
-        memory = self.encode(inputs["memory", "frames"])
-        conditioning = self._conditioning(inputs, memory)
-        z = self._noise(inputs["seed"], inputs["chunk_index"], memory)
-        levels = self._levels(memory.device)
-        fused = None
-        for level, following in pairwise(levels):
-            velocity, fused = self._velocity(z, memory, level.expand(len(z)), conditioning)
-            z = z + (following - level) * velocity
-        assert fused is not None
-        return self.decode(z), fused
+        latents, fused = self._denoise(inputs)
+        return self.decode(latents), fused
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is decoded to pixels."""
+        return self._denoise(inputs)[1]
+
+    def _denoise(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
+        """Future latents [B, V, C, K, h, w] by Euler steps from noise, and the features of the last step."""
         memory = self.encode(inputs["memory", "frames"])
         conditioning = self._conditioning(inputs, memory)
         z = self._noise(inputs["seed"], inputs["chunk_index"], memory)
-        levels = self._levels(memory.device)
-        for level, following in pairwise(levels):
+        fused = memory.new_zeros(())
+        for level, following in pairwise(self._levels(memory.device)):
             velocity, fused = self._velocity(z, memory, level.expand(len(z)), conditioning)
             z = z + (following - level) * velocity
-        return fused
+        return z, fused
 
     def _levels(self, device: torch.device) -> Tensor:
         even = torch.linspace(1.0, 0.0, self.config.steps + 1, device=device)

@@ -33,6 +33,7 @@ def test_format_is_lerobot_v3(dataset: Path) -> None:
     assert rows["index"][0].as_py() == sum(r["length"] for r in LeRobotDataset(dataset).episode_rows()[:4])
     episode = LeRobotDataset(dataset).episode_rows()[5]
     assert episode["videos/observation.images.head/from_timestamp"] == pytest.approx(LeRobotDataset(dataset).episode_rows()[4]["length"] / 10)
+    assert json.loads(pq.read_schema(dataset / "meta/tasks.parquet").metadata[b"pandas"])["index_columns"] == ["task"]
     stats = json.loads((dataset / "meta/stats.json").read_text())
     assert len(stats["action"]["mean"]) == 14 and len(stats["observation.images.head"]["mean"]) == 3
 
