@@ -32,7 +32,8 @@ class Cloning:
     """
 
     def __init__(self, policy: ChunkPolicy, store: ClipStore, episodes: Tensor, generated: TensorDict | None = None):
-        self.policy, self.store, self.generated = policy, store, generated
+        self.policy, self.store = policy, store
+        self.generated = generated if generated is not None and len(generated) else None  # a bad simulator leaves none
         chunk = policy.head.basis.shape[0]
         every = torch.cat([torch.stack([torch.full((int(store.length[n]),), n), torch.arange(int(store.length[n]))]) for n in episodes.tolist()], 1)
         self.rows = store.start[every[0]] + every[1]

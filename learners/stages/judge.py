@@ -33,6 +33,8 @@ def train_judge(
     Args:
         imagined: frames of generated.py, labelled by physics under the same actions; half of each batch.
     """
+    if imagined is not None and not len(imagined):
+        imagined = None  # a simulator so bad that every frame went astray
     labels = episode_labels(store, judge.hold)
     rows = torch.cat([torch.arange(int(store.start[n]), int(store.start[n] + store.length[n])) for n in episodes.tolist()])
     begin = torch.repeat_interleave(store.start, store.length)
