@@ -128,7 +128,7 @@ def build_state_decoder(cfg: Mapping[str, Any], simulator: Simulator, weights: P
 def build_judge(cfg: Mapping[str, Any], weights: Path | None = None) -> LearnedJudge:
     """The learned judge."""
     section = cfg["judge"]
-    judge = LearnedJudge(len(cfg["task"]["views"]), frames_held(cfg["task"]["hold"], cfg["task"]["control_hz"]), section["margin"], section["width"], section["points"])
+    judge = LearnedJudge(len(cfg["task"]["views"]), frames_held(cfg["task"]["hold"], cfg["task"]["control_hz"]), section["margin"], section["width"], section["points"], section["aims"])
     return load(judge, weights).to(device_of(cfg))
 
 

@@ -36,6 +36,11 @@ class SpatialEncoder(nn.Module):
         self.out_features = 2 * points + 16 * width
 
     def forward(self, pictures: Tensor) -> Tensor:
+        points, grid = self.look(pictures)
+        return torch.cat((*points.unbind(-1), grid), -1)
+
+    def look(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
+        """The key-points [B, points, 2] as (u, v) in half-pictures from the middle, and the grid of features [B, 16 * width]."""
         x = F.silu(self.norm1(self.stem(pictures.contiguous(memory_format=torch.channels_last))))
         y = F.silu(self.norm2(self.mid(x)))
         y = y + F.silu(self.norm3(self.deep(y)))
@@ -44,11 +49,11 @@ class SpatialEncoder(nn.Module):
         heat = self.heat_fine(F.silu(self.fine(x) + up)).float()
         height, width = heat.shape[-2:]
         share = (heat.flatten(2) * self.temperature.exp()[None, :, None]).softmax(-1)
-        v = torch.linspace(-1, 1, height, device=heat.device)
-        u = torch.linspace(-1, 1, width, device=heat.device)
+        v = torch.linspace(-1, 1, height, device=heat.device) * (1 - 1 / height)  # middles of the pixels
+        u = torch.linspace(-1, 1, width, device=heat.device) * (1 - 1 / width)
         grid = share.unflatten(-1, (height, width))
-        points = torch.cat(((grid.sum(-2) * u).sum(-1), (grid.sum(-1) * v).sum(-1)), -1)
-        return torch.cat((points, self.grid(y).float()), -1)
+        points = torch.stack(((grid.sum(-2) * u).sum(-1), (grid.sum(-1) * v).sum(-1)), -1)
+        return points, self.grid(y).float()
 
 
 class PatchEncoder(nn.Module):

@@ -227,7 +227,8 @@ def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
     simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
     judge = build_judge(cfg, found[warm] / "weights.safetensors" if warm else None)
     pick = train[torch.randperm(len(train), generator=torch.Generator().manual_seed(cfg["seed"]))[: section["imagined"]]]
-    imagined = generated_frames(simulator, store, pick, cfg["simulator"]["bf16"]) if len(pick) else None
+    # Half a centimetre is what the judge is to tell apart; labels further off would blur that.
+    imagined = generated_frames(simulator, store, pick, cfg["simulator"]["bf16"], within=0.005) if len(pick) else None
     stats = train_judge(judge, store, train, fit_options(cfg, fit_section, f"judge_fit.{steps}.fit"), folder, imagined)
     mine = store.select([f"policy-{number}"])
     rows, valid = store.whole(mine)

@@ -1,6 +1,8 @@
 """The learned judge: every frame gets a success probability and a progress, given the episode's first frame and the instruction.
 
-The first frame says where things were before an arm stood in front of them or a block lay upon the target.
+The first frame says where things were before an arm stood in front of them or a block lay upon the target. Whether
+it is done is a matter of millimetres between things, so some of the judge's key-points are taught to lie on them, as
+far as the data say where they are, and it is told how far these lie apart.
 """
 
 from __future__ import annotations
@@ -15,6 +17,8 @@ from envs.encoders import PatchEncoder, SpatialEncoder, WordEncoder, to_signed
 from envs.judges.base import Judge, Verdict, ok_status
 from envs.schema import Status
 
+_GAIN = 4.0  # on the distances between key-points, small numbers that decide
+
 
 class LearnedJudge(Judge):
     """Convolutional frame judge with a success and a progress head (GE-Sim 2.0's judge, at a small size).
@@ -23,30 +27,44 @@ class LearnedJudge(Judge):
         views: cameras per frame; the first is looked at closely, the others in passing.
         hold: frames in a row that make an episode a success.
         margin: half-width of the band around the threshold in which a clip's best frame makes the judge abstain.
+        width, points: of the encoder of the first view.
+        aims: key-points that are taught to lie on the objects of the data, in their order.
     """
 
-    def __init__(self, views: int = 3, hold: int = 4, margin: float = 0.0, width: int = 24, points: int = 24):
+    def __init__(self, views: int = 3, hold: int = 4, margin: float = 0.0, width: int = 24, points: int = 24, aims: int = 2):
         super().__init__(0.5, hold)
-        self.margin = margin
+        if aims > points:
+            raise ValueError(f"judge.aims={aims} cannot exceed judge.points={points}")
+        self.margin, self.aims = margin, aims
         self.main = SpatialEncoder(points, width, pictures=2)
         self.sides = nn.ModuleList(PatchEncoder(16, 8) for _ in range(views - 1))
         self.words = WordEncoder(16)
         self.sharpness = nn.Parameter(torch.tensor(2.0))
-        self.head = nn.Sequential(nn.Linear(self.main.out_features + 16 * views, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU(), nn.Linear(128, 2))
+        apart = 3 * (aims * (aims - 1) // 2)
+        self.head = nn.Sequential(nn.Linear(self.main.out_features + 16 * views + apart, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU(), nn.Linear(128, 2))
 
-    def forward(self, frames: Tensor, first: Tensor, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits of success and of progress, float32 [N], for frames and first frames uint8 or float (-1..1) [N, V, 3, H, W] and tokens [N, WORDS]."""
+    def forward(self, frames: Tensor, first: Tensor, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Logits of success and of progress, float32 [N], and where it sees the objects, [N, aims, 2] in half-pictures from the middle.
+
+        Args:
+            frames, first: uint8 or float (-1..1) [N, V, 3, H, W]; tokens: int64 [N, WORDS].
+        """
         pictures = to_signed(frames)
-        parts = [self.main(torch.cat((pictures[:, 0], to_signed(first[:, 0])), 1))] + [side(pictures[:, k + 1]) for k, side in enumerate(self.sides)]
+        points, grid = self.main.look(torch.cat((pictures[:, 0], to_signed(first[:, 0])), 1))
+        aimed = points[:, : self.aims]
+        one, other = torch.triu_indices(self.aims, self.aims, 1, device=points.device)
+        apart = _GAIN * (aimed[:, one] - aimed[:, other])
+        apart = torch.cat((apart, apart.norm(dim=-1, keepdim=True)), -1).flatten(1)
+        parts = [points.flatten(1), grid, apart, *(side(pictures[:, k + 1]) for k, side in enumerate(self.sides))]
         out = self.head(torch.cat([*parts, self.words(tokens)], -1)).float()
         # Success is for the most part progress beyond some point, and progress is taught by every frame.
-        return out[:, 0] + self.sharpness * out[:, 1], out[:, 1]
+        return out[:, 0] + self.sharpness * out[:, 1], out[:, 1], aimed
 
     @torch.no_grad()
     def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
         """See Judge.score; `objects` is ignored."""
         batch, count = frames.shape[:2]
-        logit, progress = self(frames.flatten(0, 1), first.repeat_interleave(count, 0), tokens.repeat_interleave(count, 0))
+        logit, progress, _ = self(frames.flatten(0, 1), first.repeat_interleave(count, 0), tokens.repeat_interleave(count, 0))
         success = logit.sigmoid().unflatten(0, (batch, count))
         status = ok_status(success)
         if self.margin:
@@ -54,17 +72,20 @@ class LearnedJudge(Judge):
             status = torch.where(near, Status.ABSTAIN.value, status)
         return Verdict(success, progress.sigmoid().unflatten(0, (batch, count)), status)
 
-    def loss(self, frames: Tensor, first: Tensor, tokens: Tensor, label: Tensor, progress: Tensor, share: float) -> tuple[Tensor, dict[str, Any]]:
-        """Class-balanced cross-entropy of success plus the absolute error of progress.
+    def loss(self, frames: Tensor, first: Tensor, tokens: Tensor, label: Tensor, progress: Tensor, where: Tensor, share: float) -> tuple[Tensor, dict[str, Any]]:
+        """Class-balanced cross-entropy of success plus the absolute errors of progress and of where things are seen.
 
         Args:
             label: float [N] in {0, 1}; progress: float [N] in 0..1.
+            where: float [N, aims, 2], half-pictures from the middle of the first view, NaN where nobody knows.
             share: fraction of positive frames in the data, by which the classes are balanced.
         """
-        logit, towards = self(frames, first, tokens)
+        logit, towards, aimed = self(frames, first, tokens)
         weight = torch.where(label > 0.5, 0.5 / max(share, 1e-3), 0.5 / max(1 - share, 1e-3))
         success = (F.binary_cross_entropy_with_logits(logit, label, reduction="none") * weight).mean()
         # Cross-entropy hardly minds a few hundredths of progress, which are the centimetre that decides.
         shaped = (towards.sigmoid() - progress).abs().mean()
         right = ((logit > 0) == (label > 0.5)).float().mean()
-        return success + 10.0 * shaped, {"success": success.detach(), "frame_accuracy": right, "progress_error": shaped.detach()}
+        known = torch.isfinite(where).all(-1)
+        off = ((aimed - torch.nan_to_num(where)).norm(dim=-1) * known).sum() / known.sum().clamp(min=1)
+        return success + 10.0 * shaped + 48.0 * off, {"success": success.detach(), "frame_accuracy": right, "progress_error": shaped.detach(), "aim_error": off.detach()}

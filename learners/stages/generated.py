@@ -11,22 +11,23 @@ from envs.language import tokenize
 from envs.simulators.base import Simulator
 from envs.simulators.replay import replay
 
-_ASTRAY = 0.015  # metres off its true place at which an object's picture is no longer what physics labels
 
-
-def generated_frames(simulator: Simulator, store: ClipStore, episodes: Tensor, bf16: bool) -> TensorDict:
+def generated_frames(simulator: Simulator, store: ClipStore, episodes: Tensor, bf16: bool, within: float = 0.015) -> TensorDict:
     """Frames the simulator generates under the true actions of some episodes, beside the true ones.
 
     Frames on which the simulator's object has gone another way than the true one show something else, and
     are left out.
 
+    Args:
+        within: metres off its true place at which an object's picture is no longer what physics labels.
+
     Returns:
         TensorDict [N] with frames uint8 [V, 3, H, W], row (that of the true frame), begin (that of the episode's first),
-        tokens and progress.
+        places [S, 3] where the simulator has its objects, tokens and progress.
     """
     made = replay(simulator, store, episodes, bf16=bf16)
     truth = simulator.places.of(store.arrays["objects"][made.rows])
-    astray = ((made.places - truth)[..., :2].norm(dim=-1) > _ASTRAY).any(-1)  # false for NaN, where nobody knows
+    astray = ((made.places - truth)[..., :2].norm(dim=-1) > within).any(-1)  # false for NaN, where nobody knows
     keep = (made.valid & ~astray).reshape(-1)
     rows, count = made.rows.reshape(-1)[keep], made.valid.shape[1]
     tokens = torch.stack([tokenize(store.episodes[n]["instruction"]) for n in episodes.tolist()])
@@ -34,6 +35,7 @@ def generated_frames(simulator: Simulator, store: ClipStore, episodes: Tensor, b
         {
             "frames": made.frames.flatten(0, 1)[keep],
             "row": rows,
+            "places": made.places.flatten(0, 1)[keep],
             "begin": store.start[episodes].repeat_interleave(count, 0)[keep],
             "tokens": tokens.repeat_interleave(count, 0)[keep],
             "progress": store.arrays["progress"][rows].float(),

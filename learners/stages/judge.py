@@ -11,6 +11,7 @@ from torch import Tensor
 
 from envs.encoders import to_signed
 from envs.episodes.clips import ClipStore
+from envs.geometry import project
 from envs.judges.base import Judge, frame_labels
 from envs.judges.learned import LearnedJudge
 from envs.language import tokenize
@@ -23,6 +24,15 @@ def episode_labels(store: ClipStore, hold: int) -> Tensor:
     for start, length in zip(store.start.tolist(), store.length.tolist(), strict=True):
         out[start : start + length] = frame_labels(store.arrays["success"][None, start : start + length].float(), hold)[0]
     return out
+
+
+def sights(store: ClipStore, objects: Tensor, rows: Tensor, count: int) -> Tensor:
+    """Where objects [N, S, 3] are in the first view at the cameras of `rows` [N]: [N, count, 2] in half-pictures from the middle, NaN where unknown or out of sight."""
+    owner = torch.searchsorted(store.start, rows, right=True) - 1
+    known = torch.nn.functional.pad(objects[:, :count], (0, 0, 0, max(0, count - objects.shape[1])), value=torch.nan)
+    pixels, depth = project(known, store.intrinsic[owner, 0], store.arrays["c2w"][rows, 0])
+    where = pixels / (torch.tensor(store.size[::-1]) / 2) - 1
+    return torch.where(((depth > 0.02) & (where.abs() < 1).all(-1))[..., None], where, torch.nan)
 
 
 def train_judge(
@@ -40,6 +50,9 @@ def train_judge(
     begin = torch.repeat_interleave(store.start, store.length)
     owner = torch.repeat_interleave(torch.arange(len(store)), store.length)
     tokens = torch.stack([tokenize(row["instruction"]) for row in store.episodes])
+    seen = sights(store, store.arrays["objects"], torch.arange(len(labels)), judge.aims)
+    if imagined is not None:
+        imagined = imagined.clone(recurse=False).set("where", sights(store, imagined["places"], imagined["row"], judge.aims)).exclude("places")
     share = float(labels[rows].mean().clamp(0.02, 0.98))
     positive, negative = rows[labels[rows] > 0.5], rows[labels[rows] <= 0.5]
 
@@ -51,9 +64,8 @@ def train_judge(
         if wanted:
             at.append(positive[torch.randint(len(positive), (wanted,), generator=generator)])
         chosen = torch.cat(at)
-        out = TensorDict(
-            {"frames": store.frames(chosen), "begin": begin[chosen], "tokens": tokens[owner[chosen]], "label": labels[chosen], "progress": store.arrays["progress"][chosen].float()}, [len(chosen)]
-        )
+        known = {"tokens": tokens[owner[chosen]], "label": labels[chosen], "progress": store.arrays["progress"][chosen].float(), "where": seen[chosen]}
+        out = TensorDict({"frames": store.frames(chosen), "begin": begin[chosen], **known}, [len(chosen)])
         if imagined is not None:
             made = imagined[torch.randint(len(imagined), (options.batch - real,), generator=generator)]
             made["label"] = labels[made["row"]]
@@ -64,7 +76,7 @@ def train_judge(
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         views = data["frames"].shape[1]  # the same colours for both, as one camera would give them
         pictures, first = augment(to_signed(torch.cat((data["frames"], data["first"]), 1)), generator).split(views, 1)
-        return judge.loss(pictures, first, data["tokens"], data["label"], data["progress"], max(share, 0.3))
+        return judge.loss(pictures, first, data["tokens"], data["label"], data["progress"], data["where"], max(share, 0.3))
 
     return fit("judge", judge, batch, loss, options, folder, watch="frame_accuracy")
 
