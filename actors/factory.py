@@ -14,7 +14,7 @@ from torch import nn
 from torchrl.envs import TransformedEnv
 
 from actors.policies.vla import ChunkPolicy
-from envs.judges import LearnedJudge
+from envs.judges import Judge, LearnedJudge
 from envs.physics.bench import BenchConfig, frames_held
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import available_cores
@@ -147,7 +147,7 @@ def build_physics(cfg: Mapping[str, Any], batch: int, record: bool = False, seed
     )
 
 
-def build_world(cfg: Mapping[str, Any], simulator: Simulator, decoder: StateDecoder, judge: LearnedJudge, starts: Starts, batch: int, seed: int = 0) -> TransformedEnv:
+def build_world(cfg: Mapping[str, Any], simulator: Simulator, decoder: StateDecoder, judge: Judge, starts: Starts, batch: int, seed: int = 0) -> TransformedEnv:
     """The imagined world with its three transforms."""
     task = cfg["task"]
     simulator.eval(), decoder.eval(), judge.eval()

@@ -91,8 +91,13 @@ class ChunkedEnv(EnvBase):
         )
 
     def schedule(self, seeds: Iterable[int]) -> None:
-        """Queue episode seeds; resets take them in order, lowest slot first. Replaces what was queued."""
+        """Queue episode seeds; resets take them in order, lowest slot first. Replaces what was queued.
+
+        Once they are used up, further ones are drawn, and they too depend on nothing but `seeds`.
+        """
         self._queue = deque(int(seed) for seed in seeds)
+        if self._queue:
+            self._stream.manual_seed(hash(tuple(self._queue)) & 0x7FFF_FFFF)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:

@@ -26,6 +26,8 @@ class FilteredBC:
     """See the module's docstring; an Algorithm of learners.rl."""
 
     name = "filtered_bc"
+    bootstraps = False
+    together = 1
 
     def __init__(self, policy: ChunkPolicy, config: FilteredBCConfig):
         self.policy, self.config = policy.trained, config

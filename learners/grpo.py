@@ -47,13 +47,14 @@ class GRPO:
     """See the module's docstring; an Algorithm of learners.rl."""
 
     name = "grpo"
+    bootstraps = False
 
     def __init__(self, policy: ChunkPolicy, config: GRPOConfig):
         self.policy, self.config = policy.trained, config
         self.reference = copy.deepcopy(self.policy).requires_grad_(False) if config.kl else None
         self.objective = ClipPPOLoss(self.policy, None, clip_epsilon=(config.clip_low, config.clip_high), entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy)
         self.objective.set_keys(action=CHUNK, sample_log_prob=LOG_PROB)
-        self.starts = 1
+        self.starts, self.together = 1, config.group
 
     def modules(self) -> nn.Module:
         """The policy."""

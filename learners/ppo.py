@@ -17,7 +17,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from actors.policies.vla import SEEN, ChunkPolicy
-from envs.schema import CHUNK, IMAGE, LOG_PROB, STATE, STATE_DIM, TOKENS
+from envs.schema import CHUNK, LOG_PROB, STATE, STATE_DIM
 from learners.rl import judged, transitions
 
 
@@ -57,11 +57,12 @@ class PPO:
     """See the module's docstring; an Algorithm of learners.rl."""
 
     name = "ppo"
+    bootstraps = True
+    together = 1
 
     def __init__(self, policy: ChunkPolicy, config: PPOConfig):
         self.policy, self.config = policy.trained, config
-        self.perception = policy.perception
-        value = Value(self.perception.out_features, config.critic_width)
+        value = Value(policy.perception.out_features, config.critic_width)
         self.critic = TensorDictModule(value, in_keys=[SEEN, STATE], out_keys=["state_value"])
         self.gae = GAE(gamma=config.gamma, lmbda=config.lam, value_network=self.critic, average_gae=False)
         self.objective = ClipPPOLoss(
@@ -86,7 +87,6 @@ class PPO:
 
     def prepare(self, batch: TensorDict) -> tuple[TensorDict, dict[str, float]]:
         """Advantages of all steps of the rollout, unfinished last episodes included: the critic stands in for their rest."""
-        batch["next", SEEN] = self._seen_next(batch)
         with torch.no_grad():
             self.gae(batch)
         value, target = batch["state_value"], batch["value_target"]
@@ -94,15 +94,6 @@ class PPO:
         extra = {"advantage": batch["advantage"], "value_target": target, "state_value": value}
         data = transitions(batch, judged(batch), {*self.policy.in_keys, SEEN, STATE}, **extra)
         return data, {"explained_variance": float(explained.clamp(min=-10.0)), "advantage_std": float(batch["advantage"].std())}
-
-    @torch.no_grad()
-    def _seen_next(self, batch: TensorDict) -> Tensor:
-        """What perception makes of each step's next observation: what it made of it a step later, or, where the rollout ends or a slot starts anew, computed here."""
-        seen = batch[SEEN].roll(-1, 1)
-        fresh = batch["next", "done"].squeeze(-1).clone()
-        fresh[:, -1] = True
-        seen[fresh] = self.perception(batch["next", IMAGE][fresh], batch["next", TOKENS][fresh])
-        return seen
 
     def loss(self, minibatch: TensorDict) -> tuple[Tensor, dict[str, float]]:
         """The clipped objective, the value loss and the entropy bonus."""

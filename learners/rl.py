@@ -1,8 +1,9 @@
 """The reinforcement-learning loop: collect whole episodes, let an algorithm turn them into updates, watch for trouble.
 
-Where a policy is updated: `update` below, by the losses of ppo.py, grpo.py and filtered_bc.py. The world is any
-TorchRL environment of this project, imagined or true. Every iteration starts fresh episodes and draws its
-randomness from (seed, iteration), so a run resumed from its checkpoint repeats what it would have done.
+Where a policy is updated: `update` below, by the losses of ppo.py, grpo.py and filtered_bc.py. Rollouts come from a
+fleet (actors/fleet.py): this process or any number of Ray actors, in any world of this project. Every iteration starts
+fresh episodes and draws its randomness from (seed, iteration), so a run resumed from its checkpoint repeats what it
+would have done, and so do any number of actors.
 """
 
 from __future__ import annotations
@@ -11,20 +12,22 @@ import json
 import math
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
-from torchrl.collectors import Collector
-from torchrl.envs import EnvBase
 from tqdm import tqdm
 
+from actors.fleet import Fleet
 from actors.policies.vla import ChunkPolicy
+from actors.rollouts import trained_weights
 from envs.schema import CHUNK, JUDGE_STATUS, LOG_PROB, SUCCESS, Status
+from learners.feed import AsyncFeed, Feed
 from learners.fit import TrainingDiverged, _truncate, save_atomic
+from learners.interrupt import deferred_sigterm
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,12 @@ class RLConfig:
 
     Args:
         iterations: rounds of collecting and updating.
-        envs: episodes side by side, and so the least number of episodes per iteration.
+        envs: episodes side by side over all hosts, and so the least number of episodes per iteration.
+        shards: jobs an iteration is cut into, each of envs / shards episodes; results depend on this, not on who runs them.
+        schedule: "sync" learns from rollouts of the newest policy only; "async" lets hosts run on meanwhile.
+        max_policy_lag: versions a rollout may be behind, if async.
+        queue: jobs submitted and not yet learned from at most, if async.
+        max_dropped: share of all episodes that may be lost (dead judges, NaN actions) before the run stops.
         epochs: passes over each iteration's data.
         minibatch: transitions per update.
         lr: learning rate of the policy.
@@ -49,6 +57,11 @@ class RLConfig:
 
     iterations: int = 40
     envs: int = 128
+    shards: int = 1
+    schedule: str = "sync"
+    max_policy_lag: int = 2
+    queue: int = 8
+    max_dropped: float = 0.05
     epochs: int = 3
     minibatch: int = 256
     lr: float = 2e-4
@@ -60,11 +73,25 @@ class RLConfig:
     checkpoint_every: int = 5
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        if self.schedule not in ("sync", "async"):
+            raise ValueError(f"schedule={self.schedule!r} must be sync or async")
+        if self.envs % self.shards:
+            raise ValueError(f"envs={self.envs} must be a multiple of shards={self.shards}")
+
 
 class Algorithm(Protocol):
-    """What tells algorithms apart; one file each."""
+    """What tells algorithms apart; one file each.
+
+    Attributes:
+        name: in the config.
+        bootstraps: whether it values next observations, so that rollouts must say what perception makes of them.
+        together: consecutive episodes that belong together, such as a group.
+    """
 
     name: str
+    bootstraps: bool
+    together: int
 
     def seeds(self, starts: int, envs: int, generator: torch.Generator) -> list[int]:
         """Episode seeds of one iteration, more than `envs` where early endings should be refilled."""
@@ -158,7 +185,7 @@ def judged(batch: TensorDict) -> Tensor:
 
 
 def train_rl(
-    env: EnvBase,
+    fleet: Fleet,
     policy: ChunkPolicy,
     algorithm: Algorithm,
     config: RLConfig,
@@ -171,17 +198,25 @@ def train_rl(
     """Improve `policy` in place.
 
     Args:
-        env: batch of `config.envs` episodes; its base takes `schedule`.
+        fleet: hosts of config.envs / config.shards episodes each; the policy's trained tensors are published to it.
         starts: number of start frames in imagination; None in physics, where `seed_pool` says which seeds may be used.
         folder: receives checkpoint.pt and metrics.jsonl; a checkpoint found there is resumed.
         anchor: what RLConfig.anchor speaks of.
 
     Returns:
-        Seconds spent, episodes used, alarms, and the metrics of the last iteration.
+        Seconds spent, episodes used, alarms, the fleet's books, and the metrics of the last iteration.
+
+    Raises:
+        TrainingDiverged: on numbers that are not finite.
+        FleetError: if too many episodes are lost.
+        SystemExit: after SIGTERM, once a checkpoint is written.
     """
+    if config.envs // config.shards != fleet.episodes:
+        raise ValueError(f"rl.envs={config.envs} in rl.shards={config.shards} jobs are {config.envs // config.shards} episodes each, but the hosts hold {fleet.episodes}")
+    if fleet.episodes % algorithm.together:
+        raise ValueError(f"rl.envs / rl.shards = {fleet.episodes} must be a multiple of algorithm.group={algorithm.together}, or groups would be torn apart")
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint, log = folder / "checkpoint.pt", folder / "metrics.jsonl"
-    base = getattr(env, "base_env", env)
     trained = algorithm.modules()
     optimiser = torch.optim.Adam(algorithm.groups(config.lr), lr=config.lr, eps=1e-5)
     alarms, first, episodes = Alarms(), 0, 0
@@ -193,39 +228,40 @@ def train_rl(
         first, episodes, spent = saved["iteration"], saved["episodes"], saved["spent"]
         alarms.entropy, alarms.silent, alarms.raised = saved["entropy"], saved["silent"], saved["raised"]
         _truncate(log, first)
-    steps = base.horizon // base.chunk
-    queued: list[int] = []
-    per_batch = config.envs * steps
-    collector = Collector(
-        env,
-        policy,
-        frames_per_batch=per_batch,
-        total_frames=per_batch * max(1, config.iterations - first),
-        reset_at_each_iter=True,
-        # Right before the reset: the collector also resets when it is set up, and would use up the first seeds.
-        pre_collect_hook=lambda: base.schedule(queued),
-        auto_register_policy_transforms=False,
-    )
+
+    def seeds(iteration: int) -> list[int]:
+        pool = starts or len(seed_pool or ())
+        drawn = algorithm.seeds(pool, config.envs, torch.Generator().manual_seed(config.seed * 1_000_003 + iteration))
+        return drawn if seed_pool is None else [seed_pool[s % pool] for s in drawn]
+
+    def sampling(iteration: int, shard: int) -> int:
+        return config.seed * 7_919 + iteration + shard * 1_000_000_007
+
+    common = (fleet, config.shards, seeds, sampling, lambda: trained_weights(policy), config.max_dropped, first)
+    feed = Feed(*common) if config.schedule == "sync" else AsyncFeed(*common, config.max_policy_lag, config.queue)
     bar = tqdm(total=config.iterations, initial=first, desc=name, unit="it", dynamic_ncols=True)
     figures: dict[str, float] = {}
-    stream = iter(collector)
-    with log.open("a") as rows:
+
+    def save(iteration: int) -> None:
+        state = {"modules": trained.state_dict(), "optimiser": optimiser.state_dict(), "iteration": iteration, "episodes": episodes, "spent": spent}
+        save_atomic({**state, "entropy": alarms.entropy, "silent": alarms.silent, "raised": alarms.raised}, checkpoint)
+
+    with log.open("a") as rows, deferred_sigterm() as asked:
         for iteration in range(first, config.iterations):
-            generator = torch.Generator().manual_seed(config.seed * 1_000_003 + iteration)
-            torch.manual_seed(config.seed * 7_919 + iteration)
-            pool = starts or len(seed_pool or ())
-            seeds = algorithm.seeds(pool, config.envs, generator)
-            queued[:] = seeds if seed_pool is None else [seed_pool[s % pool] for s in seeds]
             began = time.perf_counter()
-            batch = next(stream)
+            batch, supply = feed.gather(iteration)
             collected = time.perf_counter()
-            figures = update(batch, algorithm, optimiser, config, generator, anchor)
+            # Minibatches are drawn by the iteration alone, whatever collecting has used up.
+            figures = update(batch, algorithm, optimiser, config, torch.Generator().manual_seed(config.seed * 2_000_003 + iteration), anchor)
             updated = time.perf_counter()
             spent["rollout"] += collected - began
             spent["update"] += updated - collected
-            started = batch["next", "done"].sum().item() + (~batch["next", "done"][:, -1]).sum().item()
-            episodes += int(started)
-            figures |= {"rollout_seconds": collected - began, "update_seconds": updated - collected}
+            done = batch["next", "done"]
+            episodes += int(done.sum() + (~done[:, -1]).sum())
+            fleet.books.drop("judge", int(figures["dropped_by_judge"]))
+            fleet.books.learned += len(batch) - int(figures["dropped_by_judge"])
+            figures |= supply | {"time/rollout": collected - began, "time/update": updated - collected}
+            figures["time/actors_idle_share"] = max(0.0, 1 - supply["time/actors_busy"] / (fleet.size * (updated - began)))
             alarms.check(figures, iteration)
             rows.write(json.dumps({"step": iteration, **{f"{name}/{k}": v for k, v in figures.items()}}) + "\n")
             rows.flush()
@@ -233,24 +269,18 @@ def train_rl(
             bar.set_postfix_str(f"success {figures['success']:.2f}", refresh=False)
             if iteration == first:
                 tqdm.write(f"{name}: about {(updated - began) * (config.iterations - first - 1) / 60:.1f} min for {config.iterations - first - 1} more iterations")
-            if (iteration + 1) % config.checkpoint_every == 0:
-                save_atomic(
-                    {
-                        "modules": trained.state_dict(),
-                        "optimiser": optimiser.state_dict(),
-                        "iteration": iteration + 1,
-                        "episodes": episodes,
-                        "spent": spent,
-                        "entropy": alarms.entropy,
-                        "silent": alarms.silent,
-                        "raised": alarms.raised,
-                    },
-                    checkpoint,
-                )
+            if (iteration + 1) % config.checkpoint_every == 0 or asked():
+                save(iteration + 1)
+            if asked() and iteration + 1 < config.iterations:
+                bar.close()
+                tqdm.write(f"{name}: SIGTERM; stopped after iteration {iteration}, the same command goes on from there")
+                raise SystemExit(143)
     bar.close()
-    collector.shutdown(close_env=False)
     checkpoint.unlink(missing_ok=True)
-    return {**{f"{k}_seconds": v for k, v in spent.items()}, "episodes": episodes, "alarms": alarms.raised, "last": figures}
+    books = fleet.books
+    # What was submitted ahead and never learned from is no loss, but it was asked for.
+    books.drop("unused", books.asked - books.learned - sum(books.dropped.values()))
+    return {**{f"{k}_seconds": v for k, v in spent.items()}, "episodes": episodes, "alarms": alarms.raised, "books": asdict(books), "last": figures}
 
 
 def update(

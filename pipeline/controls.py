@@ -11,6 +11,8 @@ import torch
 
 from actors.evaluate import evaluate
 from actors.factory import ConfigError, build_physics, build_policy, options
+from actors.launch import build_fleet
+from actors.recipe import Recipe
 from learners.factory import build_algorithm
 from learners.rl import RLConfig, train_rl
 from learners.stages.imitation import train_imitation
@@ -59,11 +61,15 @@ def run_controls(cfg: Mapping[str, Any], root: Path) -> None:
         envs = min(cfg["rl"]["envs"], 64)
         iterations = max(1, round(budget / envs))
         settings = options(RLConfig, {**cfg["rl"], "envs": envs, "iterations": iterations, "seed": cfg["seed"]}, "rl")
-        env = build_physics(cfg, envs)
+        if settings.freeze_perception:
+            policy.freeze_perception()
+        algorithm = build_algorithm(cfg, policy)
+        start = str((loop.folder("imitation") / "weights.safetensors").resolve())
+        fleet = build_fleet(Recipe(cfg, envs // settings.shards, start, freeze_perception=settings.freeze_perception, bootstrap=algorithm.bootstraps))
         try:
-            stats = train_rl(env, policy, build_algorithm(cfg, policy), settings, folder, name="rl-physics", seed_pool=work.seeds_of(cfg, CONTROL, 4 * budget))
+            stats = train_rl(fleet, policy, algorithm, settings, folder, name="rl-physics", seed_pool=work.seeds_of(cfg, CONTROL, 4 * budget))
         finally:
-            env.close()
+            fleet.close()
         save_weights(policy, folder)
         return {"episodes_used": stats["episodes"], **_judge(cfg, policy, folder)}
 

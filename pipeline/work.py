@@ -26,6 +26,8 @@ from actors.factory import (
     options,
     prepare_process,
 )
+from actors.launch import build_fleet
+from actors.recipe import Recipe
 from envs.episodes import Episode, LeRobotDataset, LeRobotWriter
 from envs.episodes.clips import ClipStore
 from envs.physics.pool import BenchPool, Track
@@ -245,12 +247,19 @@ def rl(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str,
     store = open_store(found, data)
     actor = build_policy(cfg, found[policy] / "weights.safetensors")
     settings = options(RLConfig, {**cfg["rl"], "iterations": iterations, "seed": cfg["seed"] * 100 + number}, "rl")
-    world = load_world(cfg, found, store, vision, state, judge, settings.envs)
     anchor = Cloning(actor, store, worked(cfg, store))
     if settings.freeze_perception:
         actor.freeze_perception()
         anchor.look()
-    stats = train_rl(world, actor, build_algorithm(cfg, actor), settings, folder, starts=len(store), anchor=anchor)
+    algorithm = build_algorithm(cfg, actor)
+    weights = [str((found[name] / "weights.safetensors").resolve()) for name in (policy, vision, state, judge)]
+    datasets = tuple(str((found[name] / "dataset").resolve()) for name in data)
+    recipe = Recipe(cfg, settings.envs // settings.shards, weights[0], weights[1], weights[2], weights[3], datasets, settings.freeze_perception, algorithm.bootstraps)
+    fleet = build_fleet(recipe)
+    try:
+        stats = train_rl(fleet, actor, algorithm, settings, folder, starts=len(store), anchor=anchor)
+    finally:
+        fleet.close()
     save_weights(actor, folder)
     return {**{k: v for k, v in stats.items() if k != "last"}, **{f"last_{k}": v for k, v in stats["last"].items()}}
 

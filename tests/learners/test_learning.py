@@ -11,8 +11,10 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from actors.fleet import LocalFleet
 from actors.policies.chunk_gaussian import ChunkGaussian, knot_basis
-from actors.policies.vla import ChunkPolicy
+from actors.policies.vla import SEEN, ChunkPolicy
+from actors.rollouts import Host, seen_next
 from envs.episodes.clips import ClipStore
 from envs.judges import LearnedJudge
 from envs.physics.bench import BenchConfig
@@ -112,6 +114,7 @@ def rollout(rewards: list[list[float]], policy: ChunkPolicy) -> TensorDict:
     with torch.no_grad():
         td = policy(td)
     td["next"] = TensorDict({**obs, "reward": reward, "done": done, "terminated": done, "truncated": torch.zeros_like(done), SUCCESS: (reward > 0.5) & done}, size)
+    td["next", SEEN] = seen_next(td, policy.perception)
     return td
 
 
@@ -200,13 +203,14 @@ def test_imitation_sets_units_and_learns(store: ClipStore, tmp_path: Path) -> No
 
 def rl_run(folder: Path, iterations: int, grouped: bool = False) -> list[dict[str, float]]:
     policy = small_policy()
-    env = PhysicsEnv(BenchConfig(), batch=4, chunk=4, horizon=8, workers=1)
-    settings = RLConfig(iterations=iterations, envs=4, epochs=1, minibatch=8, checkpoint_every=1, lr=1e-3)
+    fleet = LocalFleet(Host(PhysicsEnv(BenchConfig(), batch=2, chunk=4, horizon=8, workers=1), small_policy()))
+    settings = RLConfig(iterations=iterations, envs=4, shards=2, epochs=1, minibatch=8, checkpoint_every=1, lr=1e-3)
     algorithm = GRPO(policy, GRPOConfig(group=2)) if grouped else PPO(policy, PPOConfig())
-    train_rl(env, policy, algorithm, settings, folder, seed_pool=range(100))
-    env.close()
+    stats = train_rl(fleet, policy, algorithm, settings, folder, seed_pool=range(100))
+    fleet.close()
+    assert stats["books"]["learned"] == stats["books"]["asked"]
     rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    return [{k: v for k, v in row.items() if "seconds" not in k} for row in rows]
+    return [{k: v for k, v in row.items() if "/time/" not in k} for row in rows]
 
 
 def test_groups_of_real_rollouts_share_their_start(tmp_path: Path) -> None:

@@ -1,0 +1,134 @@
+"""Who runs jobs: the contract that learners see, and the fleet of one that runs them in this process."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from tensordict import TensorDict
+
+from actors.rollouts import Host, Job, Stopwatch, Weights, size_of
+
+
+class FleetError(RuntimeError):
+    """Collection cannot go on; the message says who failed, why, and what to change."""
+
+
+@dataclass
+class Result:
+    """A finished job.
+
+    Args:
+        job: which.
+        version: of the weights that acted.
+        batch: the rollout [B, T]; None if the job was given up, for the reason in `failure`.
+        seconds: the host was busy with it.
+        load_seconds: of these, taking over new weights.
+        bytes: that travelled.
+    """
+
+    job: Job
+    version: int
+    batch: TensorDict | None
+    seconds: float = 0.0
+    load_seconds: float = 0.0
+    bytes: int = 0
+    failure: str = ""
+
+
+@dataclass
+class Books:
+    """Episodes and why they were lost; `asked == learned + sum(dropped.values())` once a run has ended.
+
+    Episodes of a job that is run again after its host died count in `rerun`: they were begun, nobody learned from
+    them, and the same episodes came later.
+    """
+
+    asked: int = 0
+    learned: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
+    rerun: int = 0
+    deaths: int = 0
+
+    def drop(self, reason: str, episodes: int) -> None:
+        """Episodes that nobody will learn from."""
+        if episodes:
+            self.dropped[reason] = self.dropped.get(reason, 0) + episodes
+
+    @property
+    def balanced(self) -> bool:
+        """Whether every episode asked for is accounted for."""
+        return self.asked == self.learned + sum(self.dropped.values())
+
+
+class Fleet(Protocol):
+    """Runs jobs with the newest published weights."""
+
+    books: Books
+    size: int
+    episodes: int
+
+    def publish(self, version: int, weights: Weights) -> dict[str, float]:
+        """Make weights known; jobs that begin from now on use them. Returns sync_bytes and sync_ms."""
+        ...
+
+    def submit(self, job: Job) -> None:
+        """Queue a job."""
+        ...
+
+    def take(self, wait: bool = True) -> Result | None:
+        """A finished job; without `wait` only if there is one already.
+
+        Raises:
+            FleetError: if nobody is left to wait for.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of all hosts."""
+        ...
+
+
+class LocalFleet:
+    """One host in this process; a job runs when somebody takes its result, and its errors are raised as they are.
+
+    Args:
+        host: runs the jobs; closed with the fleet.
+    """
+
+    def __init__(self, host: Host):
+        self.host, self.books, self.size = host, Books(), 1
+        self.episodes = host.env.batch_size[0]
+        self._queue: deque[Job] = deque()
+        self._newest: tuple[int, Weights] = (-1, {})
+
+    def publish(self, version: int, weights: Weights) -> dict[str, float]:
+        """See Fleet.publish."""
+        watch = Stopwatch()
+        self._newest = (version, weights)
+        return {"sync_bytes": float(size_of(weights)), "sync_ms": 1e3 * watch.read()}
+
+    def submit(self, job: Job) -> None:
+        """See Fleet.submit."""
+        self._queue.append(job)
+
+    def take(self, wait: bool = True) -> Result | None:
+        """See Fleet.take."""
+        if not self._queue:
+            if wait:
+                raise FleetError("nothing was submitted, so there is nothing to wait for")
+            return None
+        if not wait:
+            return None  # running it would make the caller wait
+        watch = Stopwatch()
+        job, (version, weights) = self._queue.popleft(), self._newest
+        if self.host.version != version:
+            self.host.load(version, weights)
+        loaded = watch.read()
+        batch = self.host.run(job)
+        return Result(job, version, batch, loaded + watch.read(), loaded)
+
+    def close(self) -> None:
+        """See Fleet.close."""
+        self.host.close()

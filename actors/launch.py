@@ -1,0 +1,32 @@
+"""From a recipe and configs/launch to a running fleet."""
+
+from __future__ import annotations
+
+from actors.factory import ConfigError, options
+from actors.fleet import Fleet, LocalFleet
+from actors.recipe import Recipe, build_host
+
+
+def build_fleet(recipe: Recipe) -> Fleet:
+    """The fleet of launch.backend: one host in this process, or Ray actors.
+
+    Raises:
+        ConfigError: if the backend is unknown or the plan cannot be scheduled.
+    """
+    launch = recipe.config["launch"]
+    if launch["backend"] == "local":
+        return LocalFleet(build_host(recipe))
+    if launch["backend"] != "ray":
+        raise ConfigError(f"launch.backend={launch['backend']!r} is unknown; choose launch=local or launch=ray")
+    # Ray takes seconds to import, which a local run need not spend.
+    from actors.cluster import Plan, connect, threads_of
+    from actors.ray_fleet import Patience, RayFleet
+
+    plan = Plan.of(launch)
+    nodes = connect(launch)
+    plan.check(nodes)
+    missing = recipe.missing()
+    if missing:
+        raise ConfigError(f"{missing} do not exist; run the stages that make them")
+    own = Recipe(**{**recipe.plain(), "data": tuple(recipe.data), "threads": launch["threads"] or threads_of(plan.cpus["actors"])})
+    return RayFleet(own, launch["actors"], plan.options("actors"), options(Patience, launch["patience"], "launch.patience"))
