@@ -14,7 +14,7 @@ import torch
 
 from actors.factory import ConfigError
 
-ROLES = ("learner", "actors", "judge", "evaluator")
+ROLES = ("learner", "actors", "judge")
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Plan:
         unknown = sorted(set(place) - set(ROLES))
         if unknown or set(ROLES) - set(place):
             raise ConfigError(f"launch.place must name {list(ROLES)}, it names {sorted(place)}")
-        counts = {"learner": 1, "actors": launch["actors"], "judge": int(launch["judge_service"]), "evaluator": 1 if place["evaluator"]["num_cpus"] else 0}
+        counts = {"learner": 1, "actors": launch["actors"], "judge": int(launch["judge_service"])}
         for role in ROLES:
             for key in ("num_cpus", "num_gpus"):
                 if place[role].get(key, 0) < 0:

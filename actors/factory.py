@@ -147,13 +147,13 @@ def build_physics(cfg: Mapping[str, Any], batch: int, record: bool = False, seed
     )
 
 
-def build_world(cfg: Mapping[str, Any], simulator: Simulator, decoder: StateDecoder, judge: Judge, starts: Starts, batch: int, seed: int = 0) -> TransformedEnv:
-    """The imagined world with its three transforms."""
+def build_world(cfg: Mapping[str, Any], simulator: Simulator, decoder: StateDecoder, judge: Judge, starts: Starts, batch: int, later: bool = False, seed: int = 0) -> TransformedEnv:
+    """The imagined world with its three transforms; `later` is JudgeReward's."""
     task = cfg["task"]
     simulator.eval(), decoder.eval(), judge.eval()
     base = WorldEnv(simulator, starts, batch, task["horizon"], ActionMode(task["mode"]), cfg["simulator"]["shared_noise"], cfg["simulator"]["bf16"], seed)
     rewards = options(Rewards, cfg["judge"]["rewards"], "judge.rewards")
-    return TransformedEnv(base, world_transforms(decoder, judge, rewards, tuple(task["views"])))
+    return TransformedEnv(base, world_transforms(decoder, judge, rewards, tuple(task["views"]), later))
 
 
 def load(module: T, weights: Path | None) -> T:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import uuid
+from dataclasses import replace
+from typing import Any
+
 from actors.factory import ConfigError, options
 from actors.fleet import Fleet, LocalFleet
 from actors.recipe import Recipe, build_host
@@ -20,6 +24,7 @@ def build_fleet(recipe: Recipe) -> Fleet:
         raise ConfigError(f"launch.backend={launch['backend']!r} is unknown; choose launch=local or launch=ray")
     # Ray takes seconds to import, which a local run need not spend.
     from actors.cluster import Plan, connect, threads_of
+    from actors.judge_service import ServiceConfig, start_service
     from actors.ray_fleet import Patience, RayFleet
 
     plan = Plan.of(launch)
@@ -28,5 +33,11 @@ def build_fleet(recipe: Recipe) -> Fleet:
     missing = recipe.missing()
     if missing:
         raise ConfigError(f"{missing} do not exist; run the stages that make them")
-    own = Recipe(**{**recipe.plain(), "data": tuple(recipe.data), "threads": launch["threads"] or threads_of(plan.cpus["actors"])})
-    return RayFleet(own, launch["actors"], plan.options("actors"), options(Patience, launch["patience"], "launch.patience"))
+    own = replace(recipe, threads=launch["threads"] or threads_of(plan.cpus["actors"]))
+    attached: tuple[Any, ...] = ()
+    if launch["judge_service"] and recipe.judge:
+        name = f"judge-{uuid.uuid4().hex[:8]}"
+        settings = options(ServiceConfig, launch["service"], "launch.service")
+        attached = (start_service(name, recipe.config, recipe.judge, settings, plan.options("judge"), threads_of(plan.cpus["judge"])),)
+        own = replace(own, service=name)
+    return RayFleet(own, launch["actors"], plan.options("actors"), options(Patience, launch["patience"], "launch.patience"), attached)

@@ -31,8 +31,8 @@ from actors.rollouts import Host, Job, Stopwatch, Weights, pack, size_of, unpack
 class HostActor:
     """A Host in a Ray actor; see rollouts.Host."""
 
-    def __init__(self, recipe: dict[str, Any], judge: Any = None):
-        self.host: Host = build_host_process(recipe, judge)
+    def __init__(self, recipe: dict[str, Any]):
+        self.host: Host = build_host_process(recipe)
 
     def ready(self) -> int:
         """This process's id, once built."""
@@ -90,13 +90,14 @@ class RayFleet:
         actors: how many.
         resources: options of the actors, such as num_cpus and num_gpus.
         patience: deadlines and retries.
-        judge: handed to every host, such as a service's client; None for the recipe's own.
+        attached: further actors that end with the fleet, such as the judge service.
     """
 
-    def __init__(self, recipe: Recipe, actors: int, resources: dict[str, Any] | None = None, patience: Patience | None = None, judge: Any = None):
+    def __init__(self, recipe: Recipe, actors: int, resources: dict[str, Any] | None = None, patience: Patience | None = None, attached: tuple[Any, ...] = ()):
         self.books, self.size, self.episodes = Books(), actors, recipe.episodes
         self.patience = patience or Patience()
-        self._recipe, self._resources, self._judge = recipe.plain(), dict(resources or {"num_cpus": 1}), judge
+        self._recipe, self._resources = recipe.plain(), dict(resources or {"num_cpus": 1})
+        self._attached = attached
         self._actor_class: Any = ray.remote(HostActor)
         self._queue: deque[Job] = deque()
         self._done: deque[Result] = deque()
@@ -172,13 +173,13 @@ class RayFleet:
             self._closing = True
             self._changed.notify_all()
         self._thread.join(timeout=30)
-        for member in self._members:
-            ray.kill(member.actor, no_restart=True)
+        for actor in (*(member.actor for member in self._members), *self._attached):
+            ray.kill(actor, no_restart=True)
         self._members.clear()
 
     # -- the supervisor's side -----------------------------------------------------------------------------------
     def _build(self) -> _Member:
-        actor = self._actor_class.options(max_restarts=0, **self._resources).remote(self._recipe, self._judge)
+        actor = self._actor_class.options(max_restarts=0, **self._resources).remote(self._recipe)
         self._count += 1
         return _Member(self._count, actor, actor.ready.remote(), time.monotonic())
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from actors.factory import ConfigError, build_judge, build_physics, build_policy, build_simulator, build_state_decoder, build_world, prepare_process
+from actors.factory import ConfigError, build_judge, build_physics, build_policy, build_simulator, build_state_decoder, build_world, options, prepare_process
 from actors.rollouts import Host
 from envs.episodes.clips import ClipStore
 from envs.judges import Judge
@@ -25,6 +25,8 @@ class Recipe:
         simulator, decoder, judge: weights of the imagined world; without a simulator it is physics.
         data: data sets in whose first frames imagination begins.
         freeze_perception, bootstrap: see RLConfig and Host.
+        later: let rewards arrive after the episode, see JudgeReward.
+        service: name of the judge service to ask instead of a judge of its own.
         threads: of the process that hosts it, 0 for all cores.
     """
 
@@ -37,6 +39,8 @@ class Recipe:
     data: tuple[str, ...] = ()
     freeze_perception: bool = False
     bootstrap: bool = True
+    later: bool = False
+    service: str = ""
     threads: int = 0
 
     def plain(self) -> dict[str, Any]:
@@ -48,11 +52,8 @@ class Recipe:
         return [path for path in (self.policy, self.simulator, self.decoder, self.judge, *self.data) if path and not Path(path).exists()]
 
 
-def build_host(recipe: Recipe, judge: Judge | None = None) -> Host:
+def build_host(recipe: Recipe) -> Host:
     """A host as the recipe says.
-
-    Args:
-        judge: used instead of the recipe's, such as one that asks a service.
 
     Raises:
         ConfigError: if weights or data are missing here.
@@ -67,13 +68,18 @@ def build_host(recipe: Recipe, judge: Judge | None = None) -> Host:
         return Host(build_physics(cfg, recipe.episodes), policy, recipe.bootstrap)
     simulator = build_simulator(cfg, Path(recipe.simulator))
     decoder = build_state_decoder(cfg, simulator, Path(recipe.decoder))
-    referee = judge or build_judge(cfg, Path(recipe.judge))
+    if recipe.service:
+        from actors.judge_service import JudgeClient, ServiceConfig  # Ray takes seconds to import, which a local run need not spend
+
+        referee: Judge = JudgeClient(recipe.service, options(ServiceConfig, cfg["launch"]["service"], "launch.service"))
+    else:
+        referee = build_judge(cfg, Path(recipe.judge))
     starts = Starts.of(ClipStore([Path(folder) for folder in recipe.data]))
-    return Host(build_world(cfg, simulator, decoder, referee, starts, recipe.episodes), policy, recipe.bootstrap)
+    return Host(build_world(cfg, simulator, decoder, referee, starts, recipe.episodes, recipe.later), policy, recipe.bootstrap)
 
 
-def build_host_process(plain: Mapping[str, Any], judge: Judge | None = None) -> Host:
+def build_host_process(plain: Mapping[str, Any]) -> Host:
     """build_host in a process of its own: from the wire's form of a recipe, with its threads."""
     recipe = Recipe(**{**plain, "data": tuple(plain["data"])})
     prepare_process(0, recipe.threads)
-    return build_host(recipe, judge)
+    return build_host(recipe)

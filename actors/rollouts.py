@@ -21,6 +21,7 @@ from torchrl.envs import EnvBase
 
 from actors.policies.vla import SEEN, ChunkPolicy, Perception
 from envs.schema import CHUNK, EPISODE, IMAGE, JUDGE_STATUS, LOG_PROB, STATE, SUCCESS, TOKENS
+from envs.transforms import JudgeReward
 
 VERSION = "policy_version"  # int64 [B, T, 1]: which weights acted
 Weights = dict[str, NDArray[Any]]
@@ -64,6 +65,7 @@ class Host:
         self.steps = self.base.horizon // self.base.chunk
         self.version = -1
         self._job: Job | None = None
+        self._judging = next((t for t in getattr(env, "transform", None) or () if isinstance(t, JudgeReward)), None)
         self._collect()
         seen = {key for key in policy.trained.in_keys if isinstance(key, tuple)}
         self._keys: list[NestedKey] = [*sorted(seen | {STATE, SEEN}), CHUNK, LOG_PROB, EPISODE]
@@ -85,6 +87,8 @@ class Host:
     def _begin(self) -> None:
         if self._job is not None:
             torch.manual_seed(self._job.sampling)
+            if self._judging is not None:
+                self._judging.forget()
             self.base.schedule(self._job.seeds)
 
     def load(self, version: int, weights: Mapping[str, NDArray[Any]]) -> None:
@@ -116,6 +120,8 @@ class Host:
                 self._collector.shutdown(close_env=False)
                 self._collect()
                 raise
+        if self._judging is not None and self._judging.later:
+            self._judging.settle(batch)
         if self.bootstrap:
             batch["next", SEEN] = seen_next(batch, self.policy.perception)
         after = [*self._after, *([SEEN] if self.bootstrap else []), *([JUDGE_STATUS] if JUDGE_STATUS in batch["next"].keys(True, True) else [])]

@@ -26,6 +26,7 @@ class FilteredBC:
     """See the module's docstring; an Algorithm of learners.rl."""
 
     name = "filtered_bc"
+    patient = True
     bootstraps = False
     together = 1
 

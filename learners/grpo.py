@@ -47,6 +47,7 @@ class GRPO:
     """See the module's docstring; an Algorithm of learners.rl."""
 
     name = "grpo"
+    patient = True
     bootstraps = False
 
     def __init__(self, policy: ChunkPolicy, config: GRPOConfig):

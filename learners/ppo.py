@@ -57,6 +57,7 @@ class PPO:
     """See the module's docstring; an Algorithm of learners.rl."""
 
     name = "ppo"
+    patient = False
     bootstraps = True
     together = 1
 

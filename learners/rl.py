@@ -50,6 +50,7 @@ class RLConfig:
         anchor: weight of cloning what is known to have worked in physics (demonstrations and the policy's own true
             successes) beside the algorithm's loss; it keeps RL from wandering where only the simulator says it works.
         anchor_batch: frames of that per update.
+        rewards_later: let rollouts go on without waiting for the judge, whose verdicts are filled in at their end.
         freeze_perception: train only what follows the policy's encoder, so that no picture is encoded twice.
         checkpoint_every: iterations between checkpoints.
         seed: of start frames, exploration and minibatches.
@@ -69,6 +70,7 @@ class RLConfig:
     kl_stop: float = 0.15
     anchor: float = 0.0
     anchor_batch: int = 96
+    rewards_later: bool = False
     freeze_perception: bool = False
     checkpoint_every: int = 5
     seed: int = 0
@@ -86,11 +88,13 @@ class Algorithm(Protocol):
     Attributes:
         name: in the config.
         bootstraps: whether it values next observations, so that rollouts must say what perception makes of them.
+        patient: whether it learns from whole first episodes only, so that rewards may arrive after them.
         together: consecutive episodes that belong together, such as a group.
     """
 
     name: str
     bootstraps: bool
+    patient: bool
     together: int
 
     def seeds(self, starts: int, envs: int, generator: torch.Generator) -> list[int]:
@@ -215,6 +219,8 @@ def train_rl(
         raise ValueError(f"rl.envs={config.envs} in rl.shards={config.shards} jobs are {config.envs // config.shards} episodes each, but the hosts hold {fleet.episodes}")
     if fleet.episodes % algorithm.together:
         raise ValueError(f"rl.envs / rl.shards = {fleet.episodes} must be a multiple of algorithm.group={algorithm.together}, or groups would be torn apart")
+    if config.rewards_later and not algorithm.patient:
+        raise ValueError(f"rl.rewards_later=true, but algorithm={algorithm.name} learns from every step as it was rewarded; use grpo or filtered_bc")
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint, log = folder / "checkpoint.pt", folder / "metrics.jsonl"
     trained = algorithm.modules()

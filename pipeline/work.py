@@ -254,7 +254,7 @@ def rl(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str,
     algorithm = build_algorithm(cfg, actor)
     weights = [str((found[name] / "weights.safetensors").resolve()) for name in (policy, vision, state, judge)]
     datasets = tuple(str((found[name] / "dataset").resolve()) for name in data)
-    recipe = Recipe(cfg, settings.envs // settings.shards, weights[0], weights[1], weights[2], weights[3], datasets, settings.freeze_perception, algorithm.bootstraps)
+    recipe = Recipe(cfg, settings.envs // settings.shards, weights[0], weights[1], weights[2], weights[3], datasets, settings.freeze_perception, algorithm.bootstraps, settings.rewards_later)
     fleet = build_fleet(recipe)
     try:
         stats = train_rl(fleet, actor, algorithm, settings, folder, starts=len(store), anchor=anchor)

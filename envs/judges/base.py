@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -43,6 +43,14 @@ class Judge(nn.Module):
             objects: float32 [B, T, 2, 3] true positions of block and target in metres; only the rule judge looks.
         """
         raise NotImplementedError
+
+    def begin(self, frames: Tensor, first: Tensor, tokens: Tensor) -> Any:
+        """Hand clips over for a verdict that is fetched later with `end`; a judge in this process puts it off until then."""
+        return frames, first, tokens
+
+    def end(self, ticket: Any) -> Verdict:
+        """The verdict on what `begin` was given."""
+        return self.score(*ticket)
 
     def streak(self, success: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         """Whether `hold` frames in a row were successes by the end of each frame.

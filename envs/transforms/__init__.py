@@ -12,6 +12,6 @@ from envs.transforms.state_expert import StateExpertTransform
 __all__ = ["JudgeReward", "PoseMapTransform", "StateExpertTransform", "world_transforms"]
 
 
-def world_transforms(decoder: StateDecoder, judge: Judge, rewards: Rewards, views: tuple[str, ...]) -> Compose:
-    """The three transforms in their order: commands to pose maps going in, joint states and rewards coming out."""
-    return Compose(PoseMapTransform(views), StateExpertTransform(decoder), JudgeReward(judge, rewards))
+def world_transforms(decoder: StateDecoder, judge: Judge, rewards: Rewards, views: tuple[str, ...], later: bool = False) -> Compose:
+    """The three transforms in their order: commands to pose maps going in, joint states and rewards coming out, the latter at once or `later`."""
+    return Compose(PoseMapTransform(views), StateExpertTransform(decoder), JudgeReward(judge, rewards, later))

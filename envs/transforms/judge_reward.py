@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from envs.judges import Judge
+from envs.judges import Judge, Verdict
 from envs.schema import FEATURES, FRAMES, IMAGE, JUDGE_STATUS, PROGRESS, SUCCESS, TOKENS, Rewards, Status
 
 
@@ -19,17 +21,50 @@ class JudgeReward(Transform):
     Args:
         judge: scores frames.
         rewards: turns progress and success into a number.
+        later: do not wait for verdicts. Episodes then run to their horizon, and `settle` writes rewards and ends into
+            the finished rollout; what a slot did after its success belongs to no episode.
     """
 
-    def __init__(self, judge: Judge, rewards: Rewards):
+    def __init__(self, judge: Judge, rewards: Rewards, later: bool = False):
         super().__init__(in_keys=[FRAMES], out_keys=["reward", SUCCESS, PROGRESS, JUDGE_STATUS])
-        self.judge, self.rewards = judge, rewards
+        self.judge, self.rewards, self.later = judge, rewards, later
+        self._tickets: list[Any] = []
+        self._opening = torch.zeros(0, 1)
         self._run = torch.zeros(0, dtype=torch.int64)
         self._progress = torch.zeros(0, 1)
         self._first = torch.zeros(0, dtype=torch.uint8)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        verdict = self.judge.score(next_tensordict[FRAMES], self._first, tensordict[TOKENS])
+        clips = (next_tensordict[FRAMES], self._first, tensordict[TOKENS])
+        if self.later:
+            if not self._tickets:
+                self._opening = self._progress
+            self._tickets.append(self.judge.begin(*clips))
+            nothing = torch.zeros_like(self._progress)
+            next_tensordict["reward"], next_tensordict[SUCCESS], next_tensordict[PROGRESS] = nothing, nothing.bool(), self._progress
+            next_tensordict[JUDGE_STATUS] = torch.full_like(self._run, Status.OK.value).unsqueeze(-1)
+            return next_tensordict.exclude(FRAMES, FEATURES, "world")
+        self._decide(self.judge.score(*clips), next_tensordict)
+        return next_tensordict.exclude(FRAMES, FEATURES, "world")
+
+    def forget(self) -> None:
+        """Drop what waits for a verdict, of a rollout that came to nothing."""
+        self._tickets = []
+
+    def settle(self, batch: TensorDictBase) -> None:
+        """Write the verdicts of a finished rollout [B, T] of whole episodes into it."""
+        tickets, self._tickets = self._tickets, []
+        if len(tickets) != batch.shape[1]:
+            raise RuntimeError(f"{len(tickets)} chunks were handed to the judge, the rollout holds {batch.shape[1]}; settle each rollout before the next begins")
+        # By now the collector has begun the next episodes; these begin where theirs did.
+        self._run, self._progress = torch.zeros_like(self._run), self._opening
+        for number, ticket in enumerate(tickets):
+            after = batch["next"][:, number]
+            self._decide(self.judge.end(ticket), after)
+            batch["next"][:, number] = after
+
+    def _decide(self, verdict: Verdict, next_tensordict: TensorDictBase) -> None:
+        """Reward, success, progress, status and ends of one step; remembers progress and the run of successes."""
         done, self._run = self.judge.streak(verdict.success, self._run)
         failed = (verdict.status != Status.OK.value).unsqueeze(-1)
         success = done.any(1, keepdim=True) & ~failed
@@ -41,7 +76,6 @@ class JudgeReward(Transform):
         next_tensordict["terminated"] = success | failed
         next_tensordict["truncated"] = next_tensordict["truncated"] & ~next_tensordict["terminated"]
         next_tensordict["done"] = next_tensordict["terminated"] | next_tensordict["truncated"]
-        return next_tensordict.exclude(FRAMES, FEATURES, "world")
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         mask = tensordict.get("_reset", None)

@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDict
 
 from actors.cluster import Plan, connect
-from actors.factory import ConfigError, build_judge, build_policy, build_simulator, build_state_decoder
+from actors.factory import ConfigError, build_policy
 from actors.fleet import Fleet, FleetError, LocalFleet
 from actors.launch import build_fleet
 from actors.ray_fleet import Patience, RayFleet
@@ -23,7 +23,6 @@ from actors.recipe import Recipe, build_host
 from actors.rollouts import Job, pack, trained_weights, unpack
 from learners.factory import build_algorithm
 from learners.rl import RLConfig, train_rl
-from pipeline.artefact import save_weights
 from pipeline.config import load_config
 
 
@@ -37,21 +36,6 @@ def cluster(cfg: dict[str, Any]) -> Iterator[None]:
     connect(cfg["launch"])
     yield
     ray.shutdown()
-
-
-@pytest.fixture(scope="module")
-def recipe(cfg: dict[str, Any], dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Recipe:
-    """An imagined world of untrained networks: what it shows is poor, but it shows the same to everybody."""
-    torch.manual_seed(0)
-    root = tmp_path_factory.mktemp("weights")
-    simulator = build_simulator(cfg)
-    parts = {"policy": build_policy(cfg), "simulator": simulator, "decoder": build_state_decoder(cfg, simulator), "judge": build_judge(cfg)}
-    paths = {}
-    for name, module in parts.items():
-        (root / name).mkdir()
-        save_weights(module, root / name)
-        paths[name] = str(root / name / "weights.safetensors")
-    return Recipe(cfg, 4, paths["policy"], paths["simulator"], paths["decoder"], paths["judge"], (str(dataset),), freeze_perception=True, threads=1)
 
 
 def learn(fleet: Fleet, recipe: Recipe, folder: Path, **changes: Any) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:

@@ -1,0 +1,96 @@
+"""The judge as a service: same verdicts, remembered, within its budget, and an honest ERROR when it is gone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import ray
+import torch
+
+from actors.cluster import connect
+from actors.factory import ConfigError, build_judge
+from actors.fleet import LocalFleet
+from actors.judge_service import JudgeClient, ServiceConfig, start_service
+from actors.recipe import Recipe, build_host
+from actors.rollouts import Job
+from envs.schema import JUDGE_STATUS, SUCCESS, Status
+from learners.rl import first_episode
+from pipeline.artefact import save_weights
+from pipeline.config import load_config
+
+OPTIONS = ServiceConfig(batch=8, wait_ms=20.0, budget=40, deadline=20.0, retries=1, pause=0.1)
+
+
+@pytest.fixture(scope="module")
+def cfg() -> dict[str, Any]:
+    return load_config(["experiment=smoke", "launch=ray", "launch.cpus=4", "launch.object_store_mb=200"])
+
+
+@pytest.fixture(scope="module")
+def weights(cfg: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> str:
+    folder = tmp_path_factory.mktemp("judge")
+    torch.manual_seed(0)
+    save_weights(build_judge(cfg), folder)
+    return str(folder / "weights.safetensors")
+
+
+@pytest.fixture(scope="module")
+def service(cfg: dict[str, Any], weights: str) -> Iterator[Any]:
+    connect(cfg["launch"])
+    yield start_service("judge-test", cfg, weights, OPTIONS, {"num_cpus": 0.5}, 1)
+    ray.shutdown()
+
+
+def clips(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    draw = torch.Generator().manual_seed(seed)
+    frames = torch.randint(0, 256, (count, 4, 3, 3, 64, 64), dtype=torch.uint8, generator=draw)
+    return frames, frames[:, 0], torch.randint(0, 50, (count, 12), generator=draw)
+
+
+def test_service_agrees_remembers_and_gathers(cfg: dict[str, Any], weights: str, service: Any) -> None:
+    from pathlib import Path
+
+    inline, client = build_judge(cfg, Path(weights)).eval(), JudgeClient("judge-test", OPTIONS)
+    assert client.hold == inline.hold and torch.equal(client.threshold, inline.threshold)
+    asked = clips(6, 0)
+    said, wanted = client.score(*asked), inline.score(*asked)
+    assert torch.allclose(said.success, wanted.success, atol=1e-5) and torch.equal(said.status, wanted.status)
+    tickets = [client.begin(*clips(2, 1)), client.begin(*clips(2, 2)), client.begin(*asked)]
+    for ticket in tickets:
+        client.end(ticket)
+    stats = ray.get(service.stats.remote())
+    assert stats["clips"] == 16 and stats["judged"] == 10 and stats["remembered"] == 6
+    assert stats["batches"] < 4  # two callers' clips were judged together
+
+
+def test_spent_budget_abstains(service: Any) -> None:
+    said = JudgeClient("judge-test", OPTIONS).score(*clips(40, 7))
+    assert set(said.status.tolist()) == {Status.OK.value, Status.ABSTAIN.value}
+
+
+def test_restarted_service_is_found_again_and_a_lost_one_is_an_error(service: Any) -> None:
+    client = JudgeClient("judge-test", ServiceConfig(deadline=60.0, retries=5, pause=0.5))
+    ray.kill(service, no_restart=False)
+    assert client.score(*clips(2, 9)).status.tolist() == [Status.OK.value] * 2
+    ray.kill(service, no_restart=True)
+    client.options = replace(client.options, retries=1, pause=0.1)
+    said = client.score(*clips(2, 10))
+    assert said.status.tolist() == [Status.ERROR.value] * 2
+    with pytest.raises(ConfigError, match="does not answer"):
+        JudgeClient("judge-test", OPTIONS)
+
+
+def test_rewards_that_come_later_are_those_that_come_at_once(recipe: Recipe) -> None:
+    now, later = (LocalFleet(build_host(replace(recipe, later=flag, bootstrap=False))) for flag in (False, True))
+    now.host._judging.judge.threshold.fill_(0.0)  # type: ignore[union-attr]
+    later.host._judging.judge.threshold.fill_(0.0)  # type: ignore[union-attr]
+    job = Job(0, tuple(range(4)), 5)
+    one, other = now.host.run(job), later.host.run(job)
+    mine = first_episode(one["next", "done"].squeeze(-1))
+    assert torch.equal(mine, first_episode(other["next", "done"].squeeze(-1)))
+    assert bool(one["next", SUCCESS][:, 0].all())  # a threshold of zero lets everything through
+    for key in ("reward", SUCCESS, "terminated", JUDGE_STATUS):
+        assert torch.allclose(one["next", key][mine].float(), other["next", key][mine].float(), atol=1e-6), key
