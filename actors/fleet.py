@@ -25,6 +25,7 @@ class Result:
         batch: the rollout [B, T]; None if the job was given up, for the reason in `failure`.
         seconds: the host was busy with it.
         load_seconds: of these, taking over new weights.
+        forward_seconds: of these, inside the networks.
         bytes: that travelled.
     """
 
@@ -33,6 +34,7 @@ class Result:
     batch: TensorDict | None
     seconds: float = 0.0
     load_seconds: float = 0.0
+    forward_seconds: float = 0.0
     bytes: int = 0
     failure: str = ""
 
@@ -125,9 +127,9 @@ class LocalFleet:
         job, (version, weights) = self._queue.popleft(), self._newest
         if self.host.version != version:
             self.host.load(version, weights)
-        loaded = watch.read()
+        loaded, forward = watch.read(), self.host.meter.seconds
         batch = self.host.run(job)
-        return Result(job, version, batch, loaded + watch.read(), loaded)
+        return Result(job, version, batch, loaded + watch.read(), loaded, self.host.meter.seconds - forward)
 
     def close(self) -> None:
         """See Fleet.close."""

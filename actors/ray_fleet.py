@@ -38,14 +38,14 @@ class HostActor:
         """This process's id, once built."""
         return os.getpid()
 
-    def run(self, job: Job, version: int, weights: list[Any]) -> tuple[Weights, float, float]:
-        """The rollout's arrays, seconds of all of it, and of taking over weights; `weights` holds a reference, fetched only if needed."""
+    def run(self, job: Job, version: int, weights: list[Any]) -> tuple[Weights, float, float, float]:
+        """The rollout's arrays, seconds of all of it, of taking over weights and inside the networks; `weights` holds a reference, fetched only if needed."""
         watch = Stopwatch()
         if self.host.version != version:
             self.host.load(version, ray.get(weights[0]))
-        loaded = watch.read()
+        loaded, forward = watch.read(), self.host.meter.seconds
         arrays = pack(self.host.run(job))
-        return arrays, loaded + watch.read(), loaded
+        return arrays, loaded + watch.read(), loaded, self.host.meter.seconds - forward
 
 
 @dataclass
@@ -167,6 +167,11 @@ class RayFleet:
         with self._changed:
             ray.kill(self._members[number % len(self._members)].actor, no_restart=True)
 
+    def kill_attached(self) -> None:
+        """Kill what is attached, such as the judge service, which Ray then restarts; for chaos tests."""
+        for actor in self._attached:
+            ray.kill(actor, no_restart=False)
+
     def close(self) -> None:
         """See Fleet.close."""
         with self._changed:
@@ -231,10 +236,10 @@ class RayFleet:
                 if self._lost_at:
                     self.recoveries.append(time.monotonic() - self._lost_at.popleft())
                 return
-            arrays, seconds, loaded = value
+            arrays, seconds, loaded, forward = value
             assert member.job is not None
             batch = unpack(arrays)
-            self._done.append(Result(member.job, member.version, batch, seconds, loaded, size_of(arrays)))
+            self._done.append(Result(member.job, member.version, batch, seconds, loaded, forward, size_of(arrays)))
             self._tries.pop(member.job.number, None)
             member.job = None
 

@@ -19,9 +19,10 @@ from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
+from actors.meter import Meter
 from actors.policies.vla import SEEN, ChunkPolicy, Perception
 from envs.schema import CHUNK, EPISODE, IMAGE, JUDGE_STATUS, LOG_PROB, STATE, SUCCESS, TOKENS
-from envs.transforms import JudgeReward
+from envs.transforms import JudgeReward, StateExpertTransform
 
 VERSION = "policy_version"  # int64 [B, T, 1]: which weights acted
 Weights = dict[str, NDArray[Any]]
@@ -65,7 +66,17 @@ class Host:
         self.steps = self.base.horizon // self.base.chunk
         self.version = -1
         self._job: Job | None = None
-        self._judging = next((t for t in getattr(env, "transform", None) or () if isinstance(t, JudgeReward)), None)
+        transforms = list(getattr(env, "transform", None) or ())
+        self._judging = next((t for t in transforms if isinstance(t, JudgeReward)), None)
+        self.meter = Meter()
+        self.meter.watch(policy, "forward")
+        for transform in transforms:  # none in physics
+            if isinstance(transform, StateExpertTransform):
+                self.meter.watch(transform.decoder, "decode")
+            if isinstance(transform, JudgeReward):
+                self.meter.watch(transform.judge, "score")
+        if self._judging is not None:
+            self.meter.watch(self.base.simulator, "predict")
         self._collect()
         seen = {key for key in policy.trained.in_keys if isinstance(key, tuple)}
         self._keys: list[NestedKey] = [*sorted(seen | {STATE, SEEN}), CHUNK, LOG_PROB, EPISODE]

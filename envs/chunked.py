@@ -118,7 +118,7 @@ class ChunkedEnv(EnvBase):
         return self._seeds
 
     def _with_identity(self, out: TensorDict, instructions: Sequence[str]) -> TensorDict:
-        out[EPISODE] = self._seeds.to(self.device).unsqueeze(-1)
+        out[EPISODE] = self._seeds.to(self.device, copy=True).unsqueeze(-1)  # a rollout keeps it while resets go on
         out[TOKENS] = torch.stack([tokenize(text) for text in instructions]).to(self.device)
         self.instructions = list(instructions)
         return out

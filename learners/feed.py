@@ -28,7 +28,7 @@ class Feed:
         sampling: exploration seed of a job's iteration and place in it.
         weights: what is trained, now.
         max_dropped: share of the episodes asked for that may be lost before the run stops.
-        first: iteration to begin with.
+        first: wave of jobs to begin with; the waves of a synchronous feed are its iterations.
     """
 
     fleet: Fleet
@@ -39,6 +39,7 @@ class Feed:
     max_dropped: float = 0.05
     first: int = 0
     idle: float = field(default=0.0, init=False)
+    learned: list[tuple[int, int]] = field(default_factory=list, init=False)  # jobs of the last rollout, and their versions
 
     def jobs(self, iteration: int) -> list[Job]:
         """The jobs of an iteration; consecutive seeds stay together, so groups are never torn apart."""
@@ -55,6 +56,10 @@ class Feed:
             self._submit(job)
         results = [self._take() for _ in range(self.shards)]
         return self._join(results, iteration, sync)
+
+    def upcoming(self, iteration: int) -> int:
+        """The wave of jobs that a run resumed after `iteration` iterations begins with; what was under way is lost with the learner, and counted."""
+        return iteration
 
     def _submit(self, job: Job) -> None:
         self.fleet.books.asked += self.fleet.episodes
@@ -80,11 +85,12 @@ class Feed:
                 self._given_up(result)
         if not good:
             raise FleetError(f"no job of iteration {iteration} came through; the last: {results[-1].failure}")
+        self.learned = [(r.job.number, r.version) for r in good]
         batch = torch.cat([r.batch for r in good if r.batch is not None])
         lag = [iteration - r.version for r in good]
         busy = sum(r.seconds for r in good)
         figures = {"sync_bytes": sync["sync_bytes"], "wire_bytes": float(sum(r.bytes for r in good)), "policy_lag": sum(lag) / len(lag), "policy_lag_max": float(max(lag))}
-        clock = {"time/sync_ms": sync["sync_ms"], "time/load_ms": 1e3 * sum(r.load_seconds for r in good), "time/actors_busy": busy, "time/learner_idle": self._idle()}
+        clock = {"time/sync_ms": sync["sync_ms"], "time/load_ms": 1e3 * sum(r.load_seconds for r in good), "time/actors_busy": busy, "time/forward_share": sum(r.forward_seconds for r in good) / max(busy, 1e-9), "time/learner_idle": self._idle()}
         return batch, figures | clock
 
     def _idle(self) -> float:
@@ -130,6 +136,10 @@ class AsyncFeed(Feed):
         self._fill()  # work for the hosts while the learner updates
         batch, figures = self._join(fresh, iteration, sync)
         return batch, figures | {"queue_depth": depth}
+
+    def upcoming(self, iteration: int) -> int:
+        """See Feed.upcoming; jobs that were submitted ahead are not asked for again, or some would be learned from twice."""
+        return self._wave
 
     def _fill(self) -> None:
         while self._waiting < self.queue:

@@ -181,7 +181,8 @@ def _announce(name: str, steps: int, seconds: float) -> None:
 
 
 def _truncate(log: Path, step: int) -> None:
-    """Drop log rows of steps that will be run again."""
+    """Drop log rows of steps that will be run again, and the half-written one that a killed process leaves."""
     if log.exists():
-        rows = [line for line in log.read_text().splitlines() if line and json.loads(line)["step"] < step]
+        lines = log.read_text()
+        rows = [line for line in lines[: lines.rfind("\n") + 1].splitlines() if json.loads(line)["step"] < step]
         log.write_text("".join(row + "\n" for row in rows))

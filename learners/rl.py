@@ -21,7 +21,7 @@ from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from actors.fleet import Fleet
+from actors.fleet import Books, Fleet
 from actors.policies.vla import ChunkPolicy
 from actors.rollouts import trained_weights
 from envs.schema import CHUNK, JUDGE_STATUS, LOG_PROB, SUCCESS, Status
@@ -204,7 +204,7 @@ def train_rl(
     Args:
         fleet: hosts of config.envs / config.shards episodes each; the policy's trained tensors are published to it.
         starts: number of start frames in imagination; None in physics, where `seed_pool` says which seeds may be used.
-        folder: receives checkpoint.pt and metrics.jsonl; a checkpoint found there is resumed.
+        folder: receives checkpoint.pt, metrics.jsonl and learned.jsonl, the jobs that were learned from; a checkpoint found there is resumed.
         anchor: what RLConfig.anchor speaks of.
 
     Returns:
@@ -222,10 +222,10 @@ def train_rl(
     if config.rewards_later and not algorithm.patient:
         raise ValueError(f"rl.rewards_later=true, but algorithm={algorithm.name} learns from every step as it was rewarded; use grpo or filtered_bc")
     folder.mkdir(parents=True, exist_ok=True)
-    checkpoint, log = folder / "checkpoint.pt", folder / "metrics.jsonl"
+    checkpoint, log, learned = folder / "checkpoint.pt", folder / "metrics.jsonl", folder / "learned.jsonl"
     trained = algorithm.modules()
     optimiser = torch.optim.Adam(algorithm.groups(config.lr), lr=config.lr, eps=1e-5)
-    alarms, first, episodes = Alarms(), 0, 0
+    alarms, first, episodes, wave = Alarms(), 0, 0, 0
     spent = {"rollout": 0.0, "update": 0.0}
     if checkpoint.exists():
         saved = torch.load(checkpoint, weights_only=True)
@@ -233,7 +233,11 @@ def train_rl(
         optimiser.load_state_dict(saved["optimiser"])
         first, episodes, spent = saved["iteration"], saved["episodes"], saved["spent"]
         alarms.entropy, alarms.silent, alarms.raised = saved["entropy"], saved["silent"], saved["raised"]
+        books = fleet.books = Books(**saved["books"])
+        books.drop("learner died", books.asked - books.learned - sum(books.dropped.values()))
+        wave = saved["wave"]
         _truncate(log, first)
+        _truncate(learned, first)
 
     def seeds(iteration: int) -> list[int]:
         pool = starts or len(seed_pool or ())
@@ -243,16 +247,17 @@ def train_rl(
     def sampling(iteration: int, shard: int) -> int:
         return config.seed * 7_919 + iteration + shard * 1_000_000_007
 
-    common = (fleet, config.shards, seeds, sampling, lambda: trained_weights(policy), config.max_dropped, first)
+    common = (fleet, config.shards, seeds, sampling, lambda: trained_weights(policy), config.max_dropped, wave)
     feed = Feed(*common) if config.schedule == "sync" else AsyncFeed(*common, config.max_policy_lag, config.queue)
     bar = tqdm(total=config.iterations, initial=first, desc=name, unit="it", dynamic_ncols=True)
     figures: dict[str, float] = {}
 
     def save(iteration: int) -> None:
-        state = {"modules": trained.state_dict(), "optimiser": optimiser.state_dict(), "iteration": iteration, "episodes": episodes, "spent": spent}
+        state = {"modules": trained.state_dict(), "optimiser": optimiser.state_dict(), "iteration": iteration, "episodes": episodes, "spent": spent, "books": asdict(fleet.books)}
+        state |= {"wave": feed.upcoming(iteration), "episodes_per_job": fleet.episodes}
         save_atomic({**state, "entropy": alarms.entropy, "silent": alarms.silent, "raised": alarms.raised}, checkpoint)
 
-    with log.open("a") as rows, deferred_sigterm() as asked:
+    with log.open("a") as rows, learned.open("a") as jobs, deferred_sigterm() as asked:
         for iteration in range(first, config.iterations):
             began = time.perf_counter()
             batch, supply = feed.gather(iteration)
@@ -271,6 +276,8 @@ def train_rl(
             alarms.check(figures, iteration)
             rows.write(json.dumps({"step": iteration, **{f"{name}/{k}": v for k, v in figures.items()}}) + "\n")
             rows.flush()
+            jobs.write(json.dumps({"step": iteration, "jobs": [job for job, _ in feed.learned], "versions": [version for _, version in feed.learned]}) + "\n")
+            jobs.flush()
             bar.update()
             bar.set_postfix_str(f"success {figures['success']:.2f}", refresh=False)
             if iteration == first:

@@ -17,6 +17,7 @@ from envs.geometry import follow_hands, hands_of
 from envs.physics.bench import Bench
 from envs.physics.pool import BenchPool
 from envs.precision import mixed_precision
+from pipeline.bench_actors import actors
 from pipeline.config import load_config
 
 
@@ -121,13 +122,14 @@ def world(cfg: dict[str, Any]) -> None:
         print(f"batch {batch}: {8 * batch * shape.chunk / total:.0f} frames/s, forward pass {100 * spent[0] / total:.1f}% of the step")
 
 
-BENCHES: dict[str, Callable[[dict[str, Any]], None]] = {"conditioning": conditioning, "physics": physics, "world": world}
+BENCHES: dict[str, Callable[[dict[str, Any]], None]] = {"conditioning": conditioning, "physics": physics, "world": world, "actors": actors}
 
 
 def run_bench(words: list[str]) -> None:
     """`worldloop bench NAME [overrides]`."""
     if not words or words[0] not in BENCHES:
         raise ConfigError(f"say which: worldloop bench {'|'.join(BENCHES)}")
-    BENCHES[words[0]](load_config(words[1:]))
+    extra = ["launch=ray"] if words[0] == "actors" and not any(word.startswith("launch=") for word in words) else []
+    BENCHES[words[0]](load_config([*extra, *words[1:]]))
 
 

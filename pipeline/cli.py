@@ -11,6 +11,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from actors.factory import ConfigError, build_physics, build_policy, prepare_process
+from actors.fleet import FleetError
 from envs.episodes.episode import EpisodeError
 from envs.physics.pool import PoolError
 from envs.physics.render import MissingGL
@@ -51,6 +52,16 @@ def stage(words: list[str]) -> None:
     if words[0] not in graph.stages:
         raise ConfigError(f"no stage {words[0]}; choose from {list(graph.stages)}")
     graph.run(words[0])
+
+
+def rl(words: list[str]) -> None:
+    """the loop up to its last policy, on any launch: worldloop rl launch=ray launch.actors=4 experiment=quickstart"""
+    cfg = load_config(words)
+    prepare_process(cfg["seed"])
+    graph = build_loop(cfg, _root(cfg))
+    last = f"rl-{cfg['rounds']['count']}"
+    graph.run(last)
+    print(f"\nthe policy lies in {graph.folder(last)}; worldloop evaluate policy={last} {' '.join(words)}")
 
 
 def stages(words: list[str]) -> None:
@@ -94,13 +105,28 @@ def evaluate(words: list[str]) -> None:
     print(f"{folder} in {world}: {entry['successes']}/{entry['episodes']} = {100 * outcome.rate:.1f}% [{100 * entry['low']:.1f}, {100 * entry['high']:.1f}], {int((~outcome.judged).sum())} dropped by the judge")
 
 
+def chaos(words: list[str]) -> None:
+    """kill parts of a small Ray run by a seeded schedule and check its books: worldloop chaos chaos.seconds=60"""
+    from pipeline.chaos import ChaosFailure, run_chaos
+
+    base = ["experiment=smoke", "algorithm=grpo", "launch=ray", "launch.judge_service=true", "launch.cpus=8"]
+    words = [*(word for word in base if not any(own.startswith(word.split("=")[0] + "=") for own in words)), *words]
+    cfg = load_config(words)
+    try:
+        found = run_chaos(cfg, words, Path(cfg["runs"]) / f"chaos-{cfg['seed']}")
+    except ChaosFailure as error:
+        print(f"worldloop chaos: {error}", file=sys.stderr)
+        sys.exit(1)
+    print(json.dumps(found, indent=1))
+
+
 def config(words: list[str]) -> None:
     """print the resolved config"""
     print(OmegaConf.to_yaml(OmegaConf.create(load_config(words))), end="")
 
 
 def bench(words: list[str]) -> None:
-    """measure performance: worldloop bench conditioning|physics|world"""
+    """measure performance: worldloop bench conditioning|physics|world|actors"""
     from pipeline.bench import run_bench
 
     run_bench(words)
@@ -122,7 +148,7 @@ def controls(words: list[str]) -> None:
     run_controls(cfg, _root(cfg))
 
 
-COMMANDS: dict[str, Callable[[list[str]], None]] = {f.__name__: f for f in (run, stage, stages, evaluate, controls, bench, config, doctor)}
+COMMANDS: dict[str, Callable[[list[str]], None]] = {f.__name__: f for f in (run, rl, stage, stages, evaluate, controls, bench, chaos, config, doctor)}
 
 
 def _help() -> str:
@@ -141,7 +167,7 @@ def main() -> None:
         sys.exit(2)
     try:
         COMMANDS[words[0]](words[1:])
-    except (ConfigError, EpisodeError, MissingGL, PoolError, TrainingDiverged, OSError) as error:
+    except (ConfigError, EpisodeError, FleetError, MissingGL, PoolError, TrainingDiverged, OSError) as error:
         print(f"worldloop {words[0]}: {error}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:

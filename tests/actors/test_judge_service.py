@@ -16,7 +16,7 @@ from actors.fleet import LocalFleet
 from actors.judge_service import JudgeClient, ServiceConfig, start_service
 from actors.recipe import Recipe, build_host
 from actors.rollouts import Job
-from envs.schema import JUDGE_STATUS, SUCCESS, Status
+from envs.schema import EPISODE, JUDGE_STATUS, SUCCESS, Status
 from learners.rl import first_episode
 from pipeline.artefact import save_weights
 from pipeline.config import load_config
@@ -92,5 +92,6 @@ def test_rewards_that_come_later_are_those_that_come_at_once(recipe: Recipe) -> 
     mine = first_episode(one["next", "done"].squeeze(-1))
     assert torch.equal(mine, first_episode(other["next", "done"].squeeze(-1)))
     assert bool(one["next", SUCCESS][:, 0].all())  # a threshold of zero lets everything through
+    assert one[EPISODE][:, 0, 0].tolist() == [0, 1, 2, 3] and not torch.equal(one[EPISODE][:, 0], one[EPISODE][:, 1])  # slots began anew
     for key in ("reward", SUCCESS, "terminated", JUDGE_STATUS):
         assert torch.allclose(one["next", key][mine].float(), other["next", key][mine].float(), atol=1e-6), key

@@ -1,0 +1,69 @@
+"""The process that chaos.py kills: a learner with its fleet, and a thread that kills parts of the fleet."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import random
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import ray
+
+from actors.factory import build_policy, options, prepare_process
+from actors.launch import build_fleet
+from actors.ray_fleet import RayFleet
+from learners.factory import build_algorithm
+from learners.rl import RLConfig, train_rl
+from pipeline.config import load_config
+from pipeline.demo_world import demo_recipe
+
+
+def plague(fleet: RayFleet, section: dict[str, Any], seed: int, events: Path) -> None:
+    """Kill parts of the fleet until the process ends; every event is a row of `events`."""
+    chance = random.Random(seed)
+    began = time.monotonic()
+    while True:
+        time.sleep(section["every"] * chance.uniform(0.5, 1.5))
+        kind = chance.choices(["ray.kill", "SIGKILL", "judge", "resize"], [4, 4, 1, 2])[0]
+        with contextlib.suppress(Exception):  # what it wanted to kill may have died just now
+            if kind == "ray.kill":
+                fleet.kill(chance.randrange(fleet.size))
+            elif kind == "SIGKILL" and fleet.processes:
+                os.kill(chance.choice(fleet.processes), signal.SIGKILL)
+            elif kind == "judge":
+                fleet.kill_attached()
+            else:
+                fleet.resize(chance.randint(1, section["actors"] + 1))
+            with events.open("a") as rows:
+                rows.write(json.dumps({"event": kind, "at": time.monotonic() - began}) + "\n")
+
+
+def main() -> None:
+    """`python -m pipeline.chaos_learner FOLDER LIFE [overrides]`."""
+    folder, life, words = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
+    cfg = load_config(words)
+    section = cfg["chaos"]
+    prepare_process(cfg["seed"], 1)
+    settings = options(RLConfig, {**cfg["rl"], "iterations": 1_000_000, "checkpoint_every": 1, "seed": cfg["seed"]}, "rl")
+    recipe = demo_recipe(cfg, folder / "world", settings.envs // settings.shards)
+    policy = build_policy(cfg, Path(recipe.policy))
+    if settings.freeze_perception:
+        policy.freeze_perception()
+    fleet = build_fleet(recipe)
+    assert isinstance(fleet, RayFleet)
+    threading.Thread(target=plague, args=(fleet, section, 1000 * cfg["seed"] + life, folder / "events.jsonl"), daemon=True).start()
+    try:
+        train_rl(fleet, policy, build_algorithm(cfg, policy), settings, folder, starts=16)
+    finally:
+        fleet.close()
+        ray.shutdown()
+
+
+if __name__ == "__main__":
+    main()
