@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import socket
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,7 @@ import tensordict
 import torch
 
 from actors.factory import ConfigError
+from actors.reaper import reap_after_me
 
 ROLES = ("learner", "actors", "judge")
 
@@ -108,10 +110,12 @@ def connect(launch: Mapping[str, Any]) -> list[Mapping[str, float]]:
     """
     if not ray.is_initialized():
         try:
+            _knock(str(launch["address"]))
             if launch["address"] == "local":
                 cpus = launch["cpus"] or None
                 store = int(launch["object_store_mb"]) * 2**20
                 ray.init(address="local", num_cpus=cpus, include_dashboard=False, object_store_memory=store, _node_ip_address="127.0.0.1", log_to_driver=False, configure_logging=False)
+                reap_after_me()
             else:
                 ray.init(address=launch["address"], log_to_driver=True, configure_logging=False)
         except Exception as error:
@@ -120,6 +124,13 @@ def connect(launch: Mapping[str, Any]) -> list[Mapping[str, float]]:
     if launch["address"] != "local":
         _compare(len(nodes))
     return nodes
+
+
+def _knock(address: str) -> None:
+    """Fail in seconds where nobody listens; Ray itself tries for minutes."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if colon and port.isdigit():
+        socket.create_connection((host, int(port)), timeout=5).close()
 
 
 def _advice(address: str, error: Exception) -> str:

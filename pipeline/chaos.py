@@ -113,7 +113,7 @@ def _check(folder: Path, before: set[str]) -> dict[str, Any]:
         wrong.append(f"{books.asked} episodes asked are fewer than {books.learned} learned and {books.dropped} dropped")
     if any(later < sooner for sooner, later in itertools.pairwise(versions)):
         wrong.append("versions went backwards")
-    for _ in range(50):  # what was told to end may take a moment
+    for _ in range(60):  # what was told to end may take a moment
         left = _left_behind() - before
         if not left:
             break

@@ -105,6 +105,16 @@ def evaluate(words: list[str]) -> None:
     print(f"{folder} in {world}: {entry['successes']}/{entry['episodes']} = {100 * outcome.rate:.1f}% [{100 * entry['low']:.1f}, {100 * entry['high']:.1f}], {int((~outcome.judged).sum())} dropped by the judge")
 
 
+def submit(words: list[str]) -> None:
+    """run a command on a Ray cluster: worldloop submit http://head:8265 rl launch=ray launch.actors=8"""
+    from pipeline.submit import submit as send
+
+    if not words or not words[0].startswith("http"):
+        raise ConfigError("say where: worldloop submit http://head:8265 rl experiment=quickstart launch=ray launch.actors=8")
+    load_config(words[2:])  # mistakes are better found here than there
+    send(words[0], words[1:])
+
+
 def chaos(words: list[str]) -> None:
     """kill parts of a small Ray run by a seeded schedule and check its books: worldloop chaos chaos.seconds=60"""
     from pipeline.chaos import ChaosFailure, run_chaos
@@ -148,7 +158,7 @@ def controls(words: list[str]) -> None:
     run_controls(cfg, _root(cfg))
 
 
-COMMANDS: dict[str, Callable[[list[str]], None]] = {f.__name__: f for f in (run, rl, stage, stages, evaluate, controls, bench, chaos, config, doctor)}
+COMMANDS: dict[str, Callable[[list[str]], None]] = {f.__name__: f for f in (run, rl, stage, stages, evaluate, controls, bench, submit, chaos, config, doctor)}
 
 
 def _help() -> str:

@@ -11,9 +11,16 @@ import torch
 from actors.factory import build_judge, build_policy, build_simulator, build_state_decoder
 from actors.recipe import Recipe
 from pipeline.artefact import save_weights
+from pipeline.config import load_config
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
+def cfg() -> dict[str, Any]:
+    """The smoke experiment on Ray, on more CPUs than there may be."""
+    return load_config(["experiment=smoke", "launch=ray", "launch.cpus=8", "launch.object_store_mb=200"])
+
+
+@pytest.fixture(scope="session")
 def recipe(cfg: dict[str, Any], dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Recipe:
     """An imagined world of untrained networks: what it shows is poor, but it shows the same to everybody."""
     torch.manual_seed(0)

@@ -19,14 +19,8 @@ from actors.rollouts import Job
 from envs.schema import EPISODE, JUDGE_STATUS, SUCCESS, Status
 from learners.rl import first_episode
 from pipeline.artefact import save_weights
-from pipeline.config import load_config
 
 OPTIONS = ServiceConfig(batch=8, wait_ms=20.0, budget=40, deadline=20.0, retries=1, pause=0.1)
-
-
-@pytest.fixture(scope="module")
-def cfg() -> dict[str, Any]:
-    return load_config(["experiment=smoke", "launch=ray", "launch.cpus=4", "launch.object_store_mb=200"])
 
 
 @pytest.fixture(scope="module")

@@ -23,12 +23,6 @@ from actors.recipe import Recipe, build_host
 from actors.rollouts import Job, pack, trained_weights, unpack
 from learners.factory import build_algorithm
 from learners.rl import RLConfig, train_rl
-from pipeline.config import load_config
-
-
-@pytest.fixture(scope="module")
-def cfg() -> dict[str, Any]:
-    return load_config(["experiment=smoke", "launch=ray", "launch.cpus=8", "launch.object_store_mb=200"])
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,59 @@
+"""Three nodes on this machine, one of them lost while running; and the words for what goes wrong with clusters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import ray
+from ray.cluster_utils import Cluster
+
+from actors.cluster import _advice, connect
+from actors.factory import ConfigError, build_policy
+from actors.launch import build_fleet
+from actors.ray_fleet import RayFleet
+from actors.recipe import Recipe
+from actors.rollouts import Job, trained_weights
+from pipeline.config import load_config
+from pipeline.submit import entrypoint
+
+
+def test_a_lost_node_costs_no_job(recipe: Recipe) -> None:
+    # Ray gives a silent node half a minute by default.
+    soon = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_timeout_ms": 1000, "health_check_failure_threshold": 3}
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False, "_system_config": soon})
+    nodes = [cluster.add_node(num_cpus=2) for _ in range(2)]
+    cfg = load_config(["experiment=smoke", "launch=ray", f"launch.address={cluster.address}", "launch.actors=4", "launch.place.actors.num_cpus=1", "launch.strategy=disaggregated"])
+    try:
+        fleet = build_fleet(replace(recipe, config=cfg))
+        assert isinstance(fleet, RayFleet)
+        policy = build_policy(cfg)
+        policy.freeze_perception()
+        fleet.publish(0, trained_weights(policy))
+        for number in range(8):
+            fleet.submit(Job(number, tuple(range(4 * number, 4 * number + 4)), number))
+        first = fleet.take()
+        cluster.remove_node(nodes[0], allow_graceful=False)
+        fleet.resize(3)  # what the remaining nodes can hold
+        rest = [fleet.take() for _ in range(7)]
+        assert sorted(r.job.number for r in [first, *rest] if r is not None and r.batch is not None) == list(range(8))
+        fleet.close()
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+
+
+def test_unreachable_cluster_and_wrong_token_are_named() -> None:
+    cfg: dict[str, Any] = load_config(["experiment=smoke", "launch=ray", "launch.address=127.0.0.1:1"])
+    with pytest.raises(ConfigError, match=r"launch\.address=127\.0\.0\.1:1 cannot be reached"):
+        connect(cfg["launch"])
+    assert "auth_token" in _advice("head:6379", RuntimeError("Unauthenticated: invalid token"))
+    assert "constraints.txt" in _advice("head:6379", RuntimeError("Version mismatch: the cluster was started with Ray 2.50"))
+
+
+def test_what_is_submitted_runs_on_the_cluster() -> None:
+    assert entrypoint(["rl", "launch=ray", "launch.actors=8"]) == "python -m pipeline rl launch=ray launch.actors=8 launch.address=auto"
+    for words in ([], ["launch=ray"], ["rl", "seed=1"]):
+        with pytest.raises(ConfigError):
+            entrypoint(words)
