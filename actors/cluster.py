@@ -45,7 +45,7 @@ class Plan:
         unknown = sorted(set(place) - set(ROLES))
         if unknown or set(ROLES) - set(place):
             raise ConfigError(f"launch.place must name {list(ROLES)}, it names {sorted(place)}")
-        counts = {"learner": 1, "actors": launch["actors"], "judge": int(launch["judge_service"])}
+        counts = {"learner": launch["learners"], "actors": launch["actors"], "judge": int(launch["judge_service"])}
         for role in ROLES:
             for key in ("num_cpus", "num_gpus"):
                 if place[role].get(key, 0) < 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -60,7 +61,8 @@ def prepare_process(seed: int, threads: int = 0) -> None:
     # started later inherit the setting.
     torch.set_flush_denormal(True)
     torch.manual_seed(seed)
-    torch.set_num_threads(threads or available_cores())
+    # Processes that train together on a machine share its cores; Ray Train and torchrun say how many they are.
+    torch.set_num_threads(threads or max(1, available_cores() // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))))
     try:
         libc = ctypes.CDLL("libc.so.6")
     except OSError:

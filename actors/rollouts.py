@@ -46,7 +46,7 @@ class Job:
 def trained_weights(policy: nn.Module) -> Weights:
     """The tensors that learning changes, by name; the rest of a policy is built from files by every host itself."""
     # A fresh array each: a published version must not change when the optimiser goes on.
-    return {name: value.detach().cpu().numpy().copy() for name, value in policy.named_parameters() if value.requires_grad}
+    return {name: value.detach().cpu().clone().numpy() for name, value in policy.named_parameters() if value.requires_grad}
 
 
 class Host:

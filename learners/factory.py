@@ -7,10 +7,10 @@ from typing import Any
 
 from actors.factory import ConfigError, options
 from actors.policies.vla import ChunkPolicy
+from learners.algorithm import Algorithm
 from learners.filtered_bc import FilteredBC, FilteredBCConfig
 from learners.grpo import GRPO, GRPOConfig
 from learners.ppo import PPO, PPOConfig
-from learners.rl import Algorithm
 
 
 def build_algorithm(cfg: Mapping[str, Any], policy: ChunkPolicy) -> Algorithm:

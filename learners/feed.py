@@ -26,7 +26,6 @@ class Feed:
         shards: jobs per iteration.
         seeds: episode seeds of an iteration's number, shared out to its jobs in order.
         sampling: exploration seed of a job's iteration and place in it.
-        weights: what is trained, now.
         max_dropped: share of the episodes asked for that may be lost before the run stops.
         first: wave of jobs to begin with; the waves of a synchronous feed are its iterations.
     """
@@ -35,7 +34,6 @@ class Feed:
     shards: int
     seeds: Callable[[int], list[int]]
     sampling: Callable[[int, int], int]
-    weights: Callable[[], Weights]
     max_dropped: float = 0.05
     first: int = 0
     idle: float = field(default=0.0, init=False)
@@ -49,9 +47,9 @@ class Feed:
             raise ValueError(f"{len(seeds)} episode seeds cannot be shared out to rl.shards={self.shards} evenly")
         return [Job(iteration * self.shards + k, tuple(seeds[k * part : (k + 1) * part]), self.sampling(iteration, k)) for k in range(self.shards)]
 
-    def gather(self, iteration: int) -> tuple[TensorDict, dict[str, float]]:
-        """The rollout [B, T] of an iteration, and figures; those that no two runs share are named time/*."""
-        sync = self.fleet.publish(iteration, self.weights())
+    def gather(self, iteration: int, weights: Weights) -> tuple[TensorDict, dict[str, float]]:
+        """The rollout [B, T] of an iteration that begins with these weights, and figures; those that no two runs share are named time/*."""
+        sync = self.fleet.publish(iteration, weights)
         for job in self.jobs(iteration):
             self._submit(job)
         results = [self._take() for _ in range(self.shards)]
@@ -118,9 +116,9 @@ class AsyncFeed(Feed):
         if self.queue < self.shards:
             raise ValueError(f"rl.queue={self.queue} must hold at least the rl.shards={self.shards} jobs of one iteration")
 
-    def gather(self, iteration: int) -> tuple[TensorDict, dict[str, float]]:
+    def gather(self, iteration: int, weights: Weights) -> tuple[TensorDict, dict[str, float]]:
         """The next rollouts that are young enough, whichever they are."""
-        sync = self.fleet.publish(iteration, self.weights())
+        sync = self.fleet.publish(iteration, weights)
         fresh: list[Result] = []
         while len(fresh) < self.shards:
             self._fill()

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from actors.policies.vla import ChunkPolicy
 from envs.schema import CHUNK, SUCCESS
-from learners.rl import first_episode, judged, transitions
+from learners.algorithm import first_episode, judged, transitions
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from torchrl.objectives import ClipPPOLoss
 from actors.policies.chunk_gaussian import ChunkGaussian
 from actors.policies.vla import ChunkPolicy
 from envs.schema import CHUNK, EPISODE, LOG_PROB
-from learners.rl import first_episode, judged, transitions
+from learners.algorithm import first_episode, judged, transitions
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class GRPO:
     def __init__(self, policy: ChunkPolicy, config: GRPOConfig):
         self.policy, self.config = policy.trained, config
         self.reference = copy.deepcopy(self.policy).requires_grad_(False) if config.kl else None
-        self.objective = ClipPPOLoss(self.policy, None, clip_epsilon=(config.clip_low, config.clip_high), entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy)
+        self.objective = ClipPPOLoss(self.policy, None, clip_epsilon=(config.clip_low, config.clip_high), entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy, functional=False)
         self.objective.set_keys(action=CHUNK, sample_log_prob=LOG_PROB)
         self.starts, self.together = 1, config.group
 

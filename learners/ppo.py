@@ -18,7 +18,7 @@ from torchrl.objectives.value import GAE
 
 from actors.policies.vla import SEEN, ChunkPolicy
 from envs.schema import CHUNK, LOG_PROB, STATE, STATE_DIM
-from learners.rl import judged, transitions
+from learners.algorithm import judged, transitions
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class PPO:
         self.critic = TensorDictModule(value, in_keys=[SEEN, STATE], out_keys=["state_value"])
         self.gae = GAE(gamma=config.gamma, lmbda=config.lam, value_network=self.critic, average_gae=False)
         self.objective = ClipPPOLoss(
-            self.policy, self.critic, clip_epsilon=config.clip, entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy, critic_coeff=config.critic, normalize_advantage=True
+            self.policy, self.critic, clip_epsilon=config.clip, entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy, critic_coeff=config.critic, normalize_advantage=True, functional=False
         )
         self.objective.set_keys(action=CHUNK, sample_log_prob=LOG_PROB)
         # The loss registers both as functional parameters; optimising the originals needs them in one place.

@@ -18,6 +18,8 @@ from omegaconf import OmegaConf
 from safetensors.torch import save_file
 from torch import nn
 
+from learners.parallel import leads
+
 _PACKAGES = ("worldloop", "torch", "torchrl", "tensordict", "numpy", "mujoco")
 
 
@@ -34,7 +36,9 @@ def write_text(path: Path, text: str) -> None:
 
 
 def save_weights(module: nn.Module, folder: Path, name: str = "weights") -> Path:
-    """Write a module's state as safetensors."""
+    """Write a module's state as safetensors; of several workers that hold it, the leading one writes."""
+    if not leads():
+        return folder / f"{name}.safetensors"
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.safetensors"
     temporary = folder / f".{name}.part"

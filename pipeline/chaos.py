@@ -19,10 +19,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from tqdm import tqdm
 
 from actors.fleet import Books
+from learners.checkpoint import Checkpoints
 
 LEARNER = "pipeline.chaos_learner"
 
@@ -91,10 +91,9 @@ def _rows(folder: Path) -> list[dict[str, Any]]:
 
 
 def _check(folder: Path, before: set[str]) -> dict[str, Any]:
-    checkpoint = folder / "checkpoint.pt"
-    if not checkpoint.exists():
+    saved = Checkpoints(folder).facts()
+    if saved is None:
         raise ChaosFailure(f"no checkpoint was ever written; the run is too short for this machine, raise chaos.seconds (see {folder}/learner.log)")
-    saved = torch.load(checkpoint, weights_only=True)
     books = Books(**saved["books"])
     rows = _rows(folder)
     steps = [row["step"] for row in rows]

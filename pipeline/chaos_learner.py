@@ -15,13 +15,14 @@ from typing import Any
 
 import ray
 
-from actors.factory import build_policy, options, prepare_process
+from actors.factory import build_policy, prepare_process
 from actors.launch import build_fleet
 from actors.ray_fleet import RayFleet
 from learners.factory import build_algorithm
-from learners.rl import RLConfig, train_rl
+from learners.rl import train_rl
 from pipeline.config import load_config
 from pipeline.demo_world import demo_recipe
+from pipeline.work import rl_options
 
 
 def plague(fleet: RayFleet, section: dict[str, Any], seed: int, events: Path) -> None:
@@ -50,7 +51,7 @@ def main() -> None:
     cfg = load_config(words)
     section = cfg["chaos"]
     prepare_process(cfg["seed"], 1)
-    settings = options(RLConfig, {**cfg["rl"], "iterations": 1_000_000, "checkpoint_every": 1, "seed": cfg["seed"]}, "rl")
+    settings = rl_options(cfg, iterations=1_000_000, checkpoint_every=1, seed=cfg["seed"])
     recipe = demo_recipe(cfg, folder / "world", settings.envs // settings.shards)
     policy = build_policy(cfg, Path(recipe.policy))
     if settings.freeze_perception:

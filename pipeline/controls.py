@@ -10,11 +10,11 @@ from typing import Any
 import torch
 
 from actors.evaluate import evaluate
-from actors.factory import ConfigError, build_physics, build_policy, options
+from actors.factory import ConfigError, build_physics, build_policy
 from actors.launch import build_fleet
 from actors.recipe import Recipe
 from learners.factory import build_algorithm
-from learners.rl import RLConfig, train_rl
+from learners.rl import train_rl
 from learners.stages.imitation import train_imitation
 from pipeline import work
 from pipeline.artefact import save_weights, write_text
@@ -43,7 +43,7 @@ def run_controls(cfg: Mapping[str, Any], root: Path) -> None:
     data = [loop.folder("collect"), *(loop.folder(f"deploy-{n}") for n in range(1, rounds + 1))]
     budget = sum(json.loads((folder / "manifest.json").read_text())["result"]["episodes"] for folder in data[1:])
     graph = Graph(root / "controls")
-    base = {"cfg": {key: cfg[key] for key in ("task", "policy", "imitation", "rl", "algorithm", "evaluate", "judge", "seed")}, "key": loop.key(f"rl-{rounds}")}
+    base = {"cfg": {key: cfg[key] for key in ("task", "policy", "imitation", "rl", "algorithm", "evaluate", "judge", "seed", "microbatches")}, "key": loop.key(f"rl-{rounds}")}
 
     def cloning(folder: Path, found: Mapping[str, Path]) -> dict[str, Any]:
         from envs.episodes.clips import ClipStore
@@ -60,7 +60,7 @@ def run_controls(cfg: Mapping[str, Any], root: Path) -> None:
         policy = build_policy(cfg, loop.folder("imitation") / "weights.safetensors")
         envs = min(cfg["rl"]["envs"], 64)
         iterations = max(1, round(budget / envs))
-        settings = options(RLConfig, {**cfg["rl"], "envs": envs, "iterations": iterations, "seed": cfg["seed"]}, "rl")
+        settings = work.rl_options(cfg, envs=envs, iterations=iterations, seed=cfg["seed"])
         if settings.freeze_perception:
             policy.freeze_perception()
         algorithm = build_algorithm(cfg, policy)

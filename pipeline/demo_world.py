@@ -31,7 +31,9 @@ def demo_recipe(cfg: Mapping[str, Any], folder: Path, episodes: int, starts: int
             tracks = pool.script([(seed, (seed % 4) / 3) for seed in range(starts)])
         finally:
             pool.close()
-        LeRobotWriter(data, bench.views, bench.size, cfg["task"]["control_hz"]).write([Episode.from_track(t, "noisy", bench.views, cfg["task"]["control_hz"]) for t in tracks])
+        LeRobotWriter(data, bench.views, bench.size, cfg["task"]["control_hz"]).write(
+            [Episode.from_track(track, "noisy" if number % 4 else "expert", bench.views, cfg["task"]["control_hz"]) for number, track in enumerate(tracks)]
+        )
         simulator = build_simulator(cfg)
         modules: list[nn.Module] = [build_policy(cfg), simulator, build_state_decoder(cfg, simulator), build_judge(cfg)]
         for name, module in zip(parts, modules, strict=True):

@@ -11,6 +11,7 @@ from typing import Any
 
 from pipeline import work
 from pipeline.graph import Graph, Stage
+from pipeline.stage_workers import SHARED, learners_of, run_shared
 
 Cfg = Mapping[str, Any]
 
@@ -18,19 +19,21 @@ Cfg = Mapping[str, Any]
 def build_loop(cfg: Cfg, root: Path) -> Graph:
     """The graph of an experiment; `cfg` is the resolved config as plain containers."""
     graph = Graph(root / "stages")
-    seed = cfg["seed"]
+    seed, learners = cfg["seed"], learners_of(cfg)
     world = {"task": cfg["task"], "seed": seed}
-    learned = {**world, "simulator": cfg["simulator"]}
+    learned = {**world, "simulator": cfg["simulator"], "microbatches": cfg["microbatches"]}
 
     def add(name: str, parents: tuple[str, ...], config: dict[str, Any], run: Any, **known: Any) -> str:
         def go(folder: Path, found: dict[str, Path]) -> Mapping[str, Any]:
+            if learners > 1 and run.__name__ in SHARED:
+                return run_shared(run.__name__, cfg, folder, found, known)
             return run(cfg, folder, found, **known)
 
         return graph.add(Stage(name, parents, config, go))
 
     collect = add("collect", (), {**world, "collect": cfg["collect"]}, work.collect, part="train")
     held_out = add("held-out", (), {**world, "collect": cfg["collect"]}, work.collect, part="held_out")
-    imitation = add("imitation", (collect,), {**world, "policy": cfg["policy"], "imitation": cfg["imitation"]}, work.imitation)
+    imitation = add("imitation", (collect,), {**world, "policy": cfg["policy"], "imitation": cfg["imitation"], "microbatches": cfg["microbatches"]}, work.imitation)
     policy, data = imitation, [collect]
     vision = state = judge = ""
     for number in range(1, cfg["rounds"]["count"] + 1):

@@ -33,9 +33,11 @@ from envs.episodes.clips import ClipStore
 from envs.physics.pool import BenchPool, Track
 from envs.simulators.replay import replay
 from envs.world import Starts
+from learners.algorithm import RLConfig
 from learners.factory import build_algorithm
 from learners.fit import FitConfig
-from learners.rl import RLConfig, train_rl
+from learners.parallel import leads
+from learners.rl import train_rl
 from learners.stages.generated import generated_frames
 from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.judge import calibrate, train_judge
@@ -61,7 +63,12 @@ def seeds_of(cfg: Cfg, purpose: int, count: int, offset: int = 0) -> list[int]:
 
 def fit_options(cfg: Cfg, section: Mapping[str, Any], key: str) -> FitConfig:
     """FitConfig of a section, seeded by the experiment."""
-    return options(FitConfig, {**section, "seed": cfg["seed"]}, key)
+    return options(FitConfig, {**section, "seed": cfg["seed"], "microbatches": cfg["microbatches"]}, key)
+
+
+def rl_options(cfg: Cfg, **more: Any) -> RLConfig:
+    """RLConfig of the section rl, and what it leaves open."""
+    return options(RLConfig, {**cfg["rl"], "microbatches": cfg["microbatches"], **more}, "rl")
 
 
 # -- data ------------------------------------------------------------------------------------------------------------
@@ -246,7 +253,7 @@ def rl(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str,
     prepare_process(cfg["seed"])
     store = open_store(found, data)
     actor = build_policy(cfg, found[policy] / "weights.safetensors")
-    settings = options(RLConfig, {**cfg["rl"], "iterations": iterations, "seed": cfg["seed"] * 100 + number}, "rl")
+    settings = rl_options(cfg, iterations=iterations, seed=cfg["seed"] * 100 + number)
     anchor = Cloning(actor, store, worked(cfg, store))
     if settings.freeze_perception:
         actor.freeze_perception()
@@ -255,11 +262,12 @@ def rl(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str,
     weights = [str((found[name] / "weights.safetensors").resolve()) for name in (policy, vision, state, judge)]
     datasets = tuple(str((found[name] / "dataset").resolve()) for name in data)
     recipe = Recipe(cfg, settings.envs // settings.shards, weights[0], weights[1], weights[2], weights[3], datasets, settings.freeze_perception, algorithm.bootstraps, settings.rewards_later)
-    fleet = build_fleet(recipe)
+    fleet = build_fleet(recipe) if leads() else None
     try:
         stats = train_rl(fleet, actor, algorithm, settings, folder, starts=len(store), anchor=anchor)
     finally:
-        fleet.close()
+        if fleet is not None:
+            fleet.close()
     save_weights(actor, folder)
     return {**{k: v for k, v in stats.items() if k != "last"}, **{f"last_{k}": v for k, v in stats["last"].items()}}
 

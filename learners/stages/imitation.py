@@ -98,6 +98,6 @@ def train_imitation(policy: ChunkPolicy, store: ClipStore, episodes: Tensor, opt
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         return cloning.loss(data, generator), {}
 
-    stats = fit("imitation", policy, lambda step, generator: cloning.sample(options.batch, generator), loss, options, folder)
+    stats = fit("imitation", policy, lambda step, generator: cloning.sample(options.part, generator), loss, options, folder)
     policy.head.log_std.requires_grad_(True)
     return stats

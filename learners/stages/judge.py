@@ -57,7 +57,7 @@ def train_judge(
     positive, negative = rows[labels[rows] > 0.5], rows[labels[rows] <= 0.5]
 
     def batch(step: int, generator: torch.Generator) -> TensorDict:
-        real = options.batch if imagined is None else options.batch // 2
+        real = options.part if imagined is None else options.part // 2
         # A third of the batch is positive whatever the data's share is, so that no batch is without a success.
         wanted = real // 3 if len(positive) else 0
         at = [negative[torch.randint(len(negative), (real - wanted,), generator=generator)]]
@@ -67,7 +67,7 @@ def train_judge(
         known = {"tokens": tokens[owner[chosen]], "label": labels[chosen], "progress": store.arrays["progress"][chosen].float(), "where": seen[chosen]}
         out = TensorDict({"frames": store.frames(chosen), "begin": begin[chosen], **known}, [len(chosen)])
         if imagined is not None:
-            made = imagined[torch.randint(len(imagined), (options.batch - real,), generator=generator)]
+            made = imagined[torch.randint(len(imagined), (options.part - real,), generator=generator)]
             made["label"] = labels[made["row"]]
             out = torch.cat([out, made.exclude("row")])
         out["first"] = store.frames(out["begin"])

@@ -21,7 +21,7 @@ def train_state(decoder: StateDecoder, simulator: Simulator, store: ClipStore, e
     simulator.eval().requires_grad_(False)
 
     def batch(step: int, generator: torch.Generator) -> TensorDict:
-        return store.sample(episodes, options.batch, ClipSpec(shape.memory, shape.chunk), generator)
+        return store.sample(episodes, options.part, ClipSpec(shape.memory, shape.chunk), generator)
 
     def loss(clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         inputs = simulator.asked(clip, 0, generator=generator)

@@ -21,7 +21,7 @@ def train_tokenizer(simulator: DiTSimulator, store: ClipStore, episodes: Tensor,
     gain = simulator.config.foreground
 
     def batch(step: int, generator: torch.Generator) -> Tensor:
-        return store.frames(rows[torch.randint(len(rows), (options.batch,), generator=generator)]).flatten(0, 1)
+        return store.frames(rows[torch.randint(len(rows), (options.part,), generator=generator)]).flatten(0, 1)
 
     def loss(frames: Tensor, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         truth = frames.float() / 255

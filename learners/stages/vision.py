@@ -39,7 +39,7 @@ def train_vision(simulator: Simulator, store: ClipStore, episodes: Tensor, confi
         chunks = 1 if step < config.alone * options.steps else config.unroll
         stride = config.strides[int(torch.randint(len(config.strides), (1,), generator=generator))]
         spec = ClipSpec(shape.memory, shape.chunk, chunks, stride)
-        count = max(1, options.batch // chunks)
+        count = max(1, options.part // chunks)
         recent = round(count * config.fresh) if newest is not None and len(newest) else 0
         parts = [store.sample(episodes, count - recent, spec, generator)]
         if recent and newest is not None:
@@ -60,8 +60,8 @@ def train_places(simulator: Simulator, store: ClipStore, episodes: Tensor, kept:
         return {}
 
     def batch(step: int, generator: torch.Generator) -> TensorDict:
-        shown = store.shots(episodes, max(1, options.batch // 32), generator)
-        motion = store.motions(episodes, options.batch, simulator.shape.chunk, generator)
+        shown = store.shots(episodes, max(1, options.part // 32), generator)
+        motion = store.motions(episodes, options.part, simulator.shape.chunk, generator)
         return TensorDict({"shown": shown, "motion": motion}, [])
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:

@@ -17,7 +17,7 @@ from actors.judge_service import JudgeClient, ServiceConfig, start_service
 from actors.recipe import Recipe, build_host
 from actors.rollouts import Job
 from envs.schema import EPISODE, JUDGE_STATUS, SUCCESS, Status
-from learners.rl import first_episode
+from learners.algorithm import first_episode
 from pipeline.artefact import save_weights
 
 OPTIONS = ServiceConfig(batch=8, wait_ms=20.0, budget=40, deadline=20.0, retries=1, pause=0.1)

@@ -21,8 +21,9 @@ from actors.launch import build_fleet
 from actors.ray_fleet import Patience, RayFleet
 from actors.recipe import Recipe, build_host
 from actors.rollouts import Job, pack, trained_weights, unpack
+from learners.algorithm import RLConfig
 from learners.factory import build_algorithm
-from learners.rl import RLConfig, train_rl
+from learners.rl import train_rl
 
 
 @pytest.fixture(scope="module")

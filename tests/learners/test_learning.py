@@ -20,11 +20,13 @@ from envs.judges import LearnedJudge
 from envs.physics.bench import BenchConfig
 from envs.physics.env import PhysicsEnv
 from envs.schema import CHUNK, EPISODE, IMAGE, JUDGE_STATUS, LOG_PROB, STATE, SUCCESS, TOKENS, Status
+from learners.alarms import Alarms
+from learners.algorithm import RLConfig, first_episode, judged
 from learners.filtered_bc import FilteredBC, FilteredBCConfig
 from learners.fit import FitConfig, TrainingDiverged, fit
 from learners.grpo import GRPO, GRPOConfig
 from learners.ppo import PPO, PPOConfig
-from learners.rl import Alarms, RLConfig, first_episode, judged, train_rl
+from learners.rl import train_rl
 from learners.stages.imitation import train_imitation
 from learners.stages.judge import calibrate
 
@@ -58,7 +60,7 @@ def run_fit(folder: Path, stop_at: int | None = None) -> list[float]:
 def test_killed_and_resumed_training_equals_the_uninterrupted(tmp_path: Path) -> None:
     whole = run_fit(tmp_path / "whole")
     run_fit(tmp_path / "cut", stop_at=15)
-    assert (tmp_path / "cut/checkpoint.pt").exists()
+    assert (tmp_path / "cut/checkpoint-000000012").exists()
     assert run_fit(tmp_path / "cut") == whole
     assert len(whole) == 24
 

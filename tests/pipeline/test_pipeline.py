@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from actors.factory import ConfigError, build_policy, build_simulator
-from learners.fit import save_atomic
+from learners.checkpoint import Checkpoints
 from pipeline.artefact import save_weights, write_text
 from pipeline.config import load_config
 from pipeline.graph import Graph, Stage
@@ -138,19 +138,22 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
 
 def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_text(tmp_path / "a.json", "old")
-    save_atomic({"x": 1}, tmp_path / "c.pt")
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, {"x": torch.ones(3)}, {"step": 1})
 
     def full(*args: Any, **kwargs: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", full)
-    monkeypatch.setattr(torch, "save", full)
     with pytest.raises(OSError, match="disk space"):
         write_text(tmp_path / "a.json", "new")
     with pytest.raises(OSError, match="disk space"):
-        save_atomic({"x": 2}, tmp_path / "c.pt")
+        checkpoints.save(2, {"x": torch.zeros(3)}, {"step": 2})
     assert (tmp_path / "a.json").read_text() == "old"
-    assert torch.load(tmp_path / "c.pt", weights_only=True) == {"x": 1}
+    found = {"x": torch.zeros(3)}
+    assert checkpoints.load(found) == {"step": 1} and found["x"].tolist() == [1.0, 1.0, 1.0]
+    with pytest.raises(RuntimeError, match="another architecture"):
+        checkpoints.load({"x": torch.zeros(4)})
 
 
 def entry(successes: int) -> dict[str, Any]:

@@ -1,0 +1,96 @@
+"""One worker or two: the same losses, the same policy, and checkpoints that either reads."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import torch.distributed as dist
+import torch.multiprocessing as mp
+from torch import Tensor, nn
+
+from learners.fit import FitConfig, fit
+
+STEPS = 8
+
+
+class Net(nn.Module):
+    """Blocks large enough to be gathered one by one, a frozen layer, a buffer, and a parameter shared by two layers."""
+
+    shift: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.enter, self.leave = nn.Linear(6, 750), nn.Linear(750, 1)
+        self.blocks = nn.ModuleList(nn.Linear(750, 750) for _ in range(2))
+        self.frozen = nn.Linear(1, 1).requires_grad_(False)
+        self.twin = nn.Linear(750, 1)
+        self.twin.weight = self.leave.weight
+        self.register_buffer("shift", torch.tensor(0.5))
+
+    def score(self, x: Tensor) -> Tensor:
+        """Not named forward: losses call what they like."""
+        h = self.enter(x)
+        for block in self.blocks:
+            h = h + torch.tanh(block(h))
+        return self.frozen(self.leave(h) + self.twin(h)) + self.shift
+
+
+def train(folder: Path, stop_after: int | None = None) -> list[float]:
+    """Losses of all steps, then figures of the weights at the end."""
+    torch.manual_seed(0)
+    net = Net()
+
+    def batch(step: int, generator: torch.Generator) -> Tensor:
+        if step == stop_after:
+            raise KeyboardInterrupt
+        return torch.randn(4, 6, generator=generator)
+
+    def loss(data: Tensor, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
+        noise = torch.randn(4, 1, generator=generator)
+        return (net.score(data) - data.sum(1, keepdim=True) + 0.1 * noise).square().mean(), {}
+
+    try:
+        fit("toy", net, batch, loss, FitConfig(STEPS, 8, microbatches=2, lr=1e-3, warmup=2, bf16=False, checkpoint_every=3), folder)
+    except KeyboardInterrupt:
+        return []
+    assert type(net.blocks[0]) is nn.Linear and type(net.leave.weight) is nn.Parameter and net.leave.weight is net.twin.weight
+    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == list(range(STEPS))
+    return [row["toy/loss"] for row in rows] + [float(p.detach().abs().sum()) for p in net.parameters()]
+
+
+def worker(rank: int, rendezvous: str, folder: str, stop_after: int | None) -> None:
+    os.environ |= {"RANK": str(rank), "WORLD_SIZE": "2"}
+    dist.init_process_group("gloo", init_method=f"file://{rendezvous}", rank=rank, world_size=2)
+    values = train(Path(folder), stop_after)
+    if values:
+        (Path(folder) / f"values-{rank}.json").write_text(json.dumps(values))
+    dist.destroy_process_group()
+
+
+def two(folder: Path, stop_after: int | None = None) -> list[list[float]]:
+    folder.mkdir(exist_ok=True)
+    rendezvous = folder / "rendezvous"
+    rendezvous.unlink(missing_ok=True)
+    mp.spawn(worker, (str(rendezvous), str(folder), stop_after), nprocs=2)
+    return [json.loads(path.read_text()) for path in sorted(folder.glob("values-*.json"))]
+
+
+def test_two_workers_follow_one_and_either_goes_on_from_the_others_checkpoint(tmp_path: Path) -> None:
+    alone = train(tmp_path / "alone")
+    leader, follower = two(tmp_path / "two")
+    assert leader == follower == pytest.approx(alone, rel=1e-4)
+    assert two(tmp_path / "from-two", stop_after=5) == []
+    assert train(tmp_path / "from-two") == pytest.approx(alone, rel=1e-4)
+    assert train(tmp_path / "from-one", stop_after=5) == []
+    assert two(tmp_path / "from-one")[1] == pytest.approx(alone, rel=1e-4)
+
+
+def test_microbatches_that_cannot_be_shared_out_are_refused() -> None:
+    with pytest.raises(ValueError, match="microbatches"):
+        FitConfig(1, 8, microbatches=3)

@@ -1,0 +1,56 @@
+"""Stages in two processes under Ray Train write what one process writes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import ray
+import torch
+from safetensors.torch import load_file
+
+from actors.factory import ConfigError
+from pipeline import work
+from pipeline.config import load_config
+from pipeline.demo_world import demo_recipe
+from pipeline.loop import build_loop
+from pipeline.stage_workers import run_shared
+
+WORDS = ["experiment=smoke", "launch=ray", "microbatches=2", "launch.cpus=4", "launch.object_store_mb=200", "launch.learners=2", "rl.shards=1", "imitation.demos=3"]
+
+
+@pytest.fixture
+def cluster() -> Iterator[None]:
+    yield
+    ray.shutdown()
+
+
+def losses(folder: Path, name: str) -> list[float]:
+    return [json.loads(line)[name] for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+def test_two_learners_write_what_one_writes(cluster: None, tmp_path: Path) -> None:
+    cfg: dict[str, Any] = load_config([*WORDS, "rl.epochs=1", "rl.anchor=0.0", "launch.actors=1"])
+    recipe = demo_recipe(cfg, tmp_path / "world", cfg["rl"]["envs"])
+    found = {name: Path(path).parent for name, path in (("policy", recipe.policy), ("vision", recipe.simulator), ("state", recipe.decoder), ("judge", recipe.judge))}
+    found["data"] = Path(recipe.data[0]).parent
+    names = {"data": ("data",), "vision": "vision", "state": "state", "judge": "judge", "policy": "policy", "iterations": 1, "number": 1}
+    for function, known, figure, parents in (("imitation", {}, "imitation/loss", {"data": found["data"]}), ("rl", names, "rl/loss", found)):
+        alone, both = tmp_path / f"{function}-alone", tmp_path / f"{function}-both"
+        for folder in (alone, both):
+            folder.mkdir()
+        one = getattr(work, function)(load_config([*WORDS, "rl.epochs=1", "rl.anchor=0.0", "launch.actors=1", "launch.learners=1"]), alone, parents, **known)
+        two = run_shared(function, cfg, both, parents, known)
+        assert two.keys() == one.keys()
+        assert losses(both, figure) == pytest.approx(losses(alone, figure), rel=1e-3, abs=1e-5)
+        weights = load_file(alone / "weights.safetensors")
+        for name, value in load_file(both / "weights.safetensors").items():
+            torch.testing.assert_close(value, weights[name], rtol=1e-3, atol=2e-4)
+
+
+def test_microbatches_must_fit_the_learners(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="microbatches=2"):
+        build_loop(load_config([*WORDS, "microbatches=1"]), tmp_path)
