@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,6 +15,9 @@ from safetensors.torch import load_file
 from torch import nn
 from torchrl.envs import TransformedEnv
 
+from actors.policies.chunk_gaussian import ChunkGaussianHead
+from actors.policies.chunk_tokens import ChunkTokenHead
+from actors.policies.heads import Head
 from actors.policies.vla import ChunkPolicy
 from envs.judges import Judge, LearnedJudge
 from envs.physics.bench import BenchConfig, frames_held
@@ -137,8 +141,14 @@ def build_judge(cfg: Mapping[str, Any], weights: Path | None = None) -> LearnedJ
 def build_policy(cfg: Mapping[str, Any], weights: Path | None = None) -> ChunkPolicy:
     """The policy; it acts and learns on the CPU, for it is small."""
     section = cfg["policy"]
-    policy = ChunkPolicy(len(cfg["task"]["views"]), cfg["task"]["chunk"], section["knots"], section["width"], section["points"], section["std"])
-    return load(policy, weights)
+    chunk = cfg["task"]["chunk"]
+    if section["head"] == "gaussian":
+        head: Callable[[int], Head] = partial(ChunkGaussianHead, chunk=chunk, knots=section["knots"], std=section["std"])
+    elif section["head"] == "tokens":
+        head = partial(ChunkTokenHead, chunk=chunk, bins=section["bins"])
+    else:
+        raise ConfigError(f"policy.head={section['head']!r} is unknown; choose gaussian or tokens")
+    return load(ChunkPolicy(len(cfg["task"]["views"]), head, section["width"], section["points"]), weights)
 
 
 def build_physics(cfg: Mapping[str, Any], batch: int, record: bool = False, seed: int = 0) -> PhysicsEnv:

@@ -30,6 +30,7 @@ class ChunkedEnv(EnvBase):
         mode: meaning of the chunk's numbers.
         device: where observations live.
         seed: of the stream of episode seeds.
+        states, actions: numbers of a state and of an action; worlds of another robot say so.
 
     Raises:
         ValueError: if the horizon is not a multiple of the chunk.
@@ -45,6 +46,8 @@ class ChunkedEnv(EnvBase):
         mode: ActionMode,
         device: torch.device | str = "cpu",
         seed: int = 0,
+        states: int = STATE_DIM,
+        actions: int = ACTION_DIM,
     ):
         if horizon % chunk:
             raise ValueError(f"task.horizon={horizon} must be a multiple of task.chunk={chunk}")
@@ -63,8 +66,8 @@ class ChunkedEnv(EnvBase):
         self.observation_spec = Composite(
             observation=Composite(
                 image=Bounded(0, 255, (*shape, views, 3, height, width), dtype=torch.uint8),
-                state=Unbounded((*shape, STATE_DIM)),
-                command=Unbounded((*shape, ACTION_DIM)),
+                state=Unbounded((*shape, states)),
+                command=Unbounded((*shape, actions)),
                 tokens=Bounded(0, VOCABULARY - 1, (*shape, WORDS), dtype=torch.int64),
                 shape=shape,
             ),
@@ -82,7 +85,7 @@ class ChunkedEnv(EnvBase):
         self._observation_keys = list(self.observation_spec.keys(True, True))
         # A spec must be bounded to be sampled from; a metre or a radian per chunk is beyond what any arm does.
         self.action_spec = Composite(
-            vla_action=Composite(chunk=Bounded(-1.0, 1.0, (*shape, chunk, ACTION_DIM)), shape=shape), shape=shape, device=device
+            vla_action=Composite(chunk=Bounded(-1.0, 1.0, (*shape, chunk, actions)), shape=shape), shape=shape, device=device
         )
         self.reward_spec = Unbounded((*shape, 1), device=device)
         flag = Categorical(2, (*shape, 1), dtype=torch.bool, device=device)

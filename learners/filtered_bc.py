@@ -53,6 +53,5 @@ class FilteredBC:
 
     def loss(self, minibatch: TensorDict) -> tuple[Tensor, dict[str, float]]:
         """Negative log-likelihood with the exploration spread held fixed, so that only means move."""
-        dist = self.policy.get_dist(minibatch.clone(False))
-        dist = type(dist)(dist.loc, dist.scale.detach(), dist.basis, dist.gain, dist.offset)
+        dist = self.policy.get_dist(minibatch.clone(False)).held()
         return -dist.log_prob(minibatch[CHUNK]).mean(), {}

@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.distributions import kl_divergence
 from torchrl.objectives import ClipPPOLoss
 
-from actors.policies.chunk_gaussian import ChunkGaussian
 from actors.policies.vla import ChunkPolicy
 from envs.schema import CHUNK, EPISODE, LOG_PROB
 from learners.algorithm import first_episode, judged, transitions
@@ -113,14 +113,7 @@ class GRPO:
             now = self.policy.get_dist(minibatch.clone(False))
             with torch.no_grad():
                 start = self.reference.get_dist(minibatch.clone(False))
-            distance = gaussian_kl(now, start).mean()
+            distance = kl_divergence(now, start).mean()
             total = total + self.config.kl * distance
             figures["kl_start"] = float(distance.detach())
         return total, figures
-
-
-def gaussian_kl(p: ChunkGaussian, q: ChunkGaussian) -> Tensor:
-    """KL(p || q) in nats, [...], over the dimensions that vary."""
-    ratio = (p.scale / q.scale).square()
-    shift = ((p.loc - q.loc) / q.scale).square()
-    return (0.5 * (ratio + shift - 1 - ratio.log()) * p.active).sum((-2, -1))

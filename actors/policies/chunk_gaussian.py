@@ -5,8 +5,11 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch import Tensor, nn
+from torch.distributions import Distribution, constraints, register_kl
+
+from actors.policies.heads import Head
+from envs.schema import ACTION_DIM
 
 
 def knot_basis(chunk: int, knots: int) -> Tensor:
@@ -71,3 +74,81 @@ class ChunkGaussian(Distribution):
 
     def entropy(self) -> Tensor:
         return (torch.distributions.Normal(self.loc, self.scale).entropy() * self.active).sum((-2, -1))
+
+    def held(self) -> ChunkGaussian:
+        """The same with a spread that does not learn."""
+        return ChunkGaussian(self.loc, self.scale.detach(), self.basis, self.gain, self.offset)
+
+
+@register_kl(ChunkGaussian, ChunkGaussian)
+def _kl(p: ChunkGaussian, q: ChunkGaussian) -> Tensor:
+    """KL(p || q) in nats, [...], over the dimensions that vary."""
+    ratio = (p.scale / q.scale).square()
+    shift = ((p.loc - q.loc) / q.scale).square()
+    return (0.5 * (ratio + shift - 1 - ratio.log()) * p.active).sum((-2, -1))
+
+
+class ChunkGaussianHead(Head):
+    """Mean and spread of the knots of a chunk; spreads are learned and do not depend on the observation.
+
+    Args:
+        width: of the trunk's output.
+        chunk: actions per chunk, K.
+        knots: free points per dimension and chunk.
+        std: initial spread, in units of the demonstrations' own spread.
+        actions: numbers of an action, A.
+    """
+
+    names = ("loc", "scale", "basis", "gain", "offset")
+    distribution = ChunkGaussian
+    basis: Tensor
+    gain: Tensor
+    offset: Tensor
+
+    def __init__(self, width: int, chunk: int, knots: int = 2, std: float = 0.3, actions: int = ACTION_DIM):
+        super().__init__()
+        self.chunk, self.knots, self.actions = chunk, knots, actions
+        self.mean = nn.Linear(width, knots * actions)
+        nn.init.normal_(self.mean.weight, std=1e-2)
+        nn.init.zeros_(self.mean.bias)
+        self.log_std = nn.Parameter(torch.full((knots, actions), float(torch.tensor(std).log())))
+        self.register_buffer("basis", knot_basis(chunk, knots))
+        self.register_buffer("gain", torch.ones(actions))
+        self.register_buffer("offset", torch.zeros(actions))
+
+    def forward(self, hidden: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        loc = self.mean(hidden.float()).unflatten(-1, (self.knots, self.actions))
+        scale = self.log_std.clamp(-4.0, 0.5).exp().expand_as(loc)
+        lead = hidden.shape[:-1]
+        return loc, scale, self.basis.expand(*lead, *self.basis.shape), self.gain.expand(*lead, -1), self.offset.expand(*lead, -1)
+
+    def normalise(self, chunks: Tensor, floor: Tensor) -> None:
+        """See Head.normalise; the knots of dimensions that vary get unit spread."""
+        knots = torch.linalg.pinv(self.basis) @ chunks
+        spread = knots.flatten(0, 1).std(0)
+        centre = chunks.flatten(0, 1).mean(0)
+        active = spread > floor
+        self.gain.copy_(torch.where(active, spread, 0.0))
+        self.offset.copy_(torch.where(active, 0.0, centre))
+
+    def target(self, chunks: Tensor) -> Tensor:
+        """Knots [N, knots, A] in normalised units."""
+        gain = torch.where(self.gain > 0, self.gain, torch.ones_like(self.gain))
+        return torch.linalg.pinv(self.basis) @ ((chunks - self.offset) / gain)
+
+    def error(self, hidden: Tensor, target: Tensor) -> Tensor:
+        """Mean absolute error of the knots that vary, in units of the demonstrations' spread."""
+        return self._gap(self(hidden)[0], target)
+
+    def apart(self, one: Tensor, other: Tensor) -> Tensor:
+        """Mean absolute distance of the mean knots that vary."""
+        return self._gap(self(one)[0], self(other)[0])
+
+    def exploration(self) -> list[nn.Parameter]:
+        """The learned spread."""
+        return [self.log_std]
+
+    def _gap(self, one: Tensor, other: Tensor) -> Tensor:
+        active = (self.gain > 0).float()
+        error = (one - other).abs() * active
+        return error.sum() / (active.sum() * error.shape[0] * error.shape[1])

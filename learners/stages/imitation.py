@@ -34,7 +34,7 @@ class Cloning:
     def __init__(self, policy: ChunkPolicy, store: ClipStore, episodes: Tensor, generated: TensorDict | None = None):
         self.policy, self.store = policy, store
         self.generated = generated if generated is not None and len(generated) else None  # a bad simulator leaves none
-        chunk = policy.head.basis.shape[0]
+        chunk = policy.head.chunk
         every = torch.cat([torch.stack([torch.full((int(store.length[n]),), n), torch.arange(int(store.length[n]))]) for n in episodes.tolist()], 1)
         self.rows = store.start[every[0]] + every[1]
         last = store.start[every[0]] + store.length[every[0]] - 1
@@ -53,39 +53,33 @@ class Cloning:
 
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
         """Random observations with the knots their chunks have under the policy's units."""
-        head = self.policy.head
         pick = torch.randint(len(self.rows), (count,), generator=generator)
         out = TensorDict({STATE: self.store.arrays["states"][self.rows[pick]]}, pick.shape)
         if self.seen is None:
             out[IMAGE], out[TOKENS] = self.store.frames(self.rows[pick]), self.tokens[pick]
         else:
             out[SEEN] = self.seen[pick]
-        gain = torch.where(head.gain > 0, head.gain, torch.ones_like(head.gain))
         if self.generated is not None:
             made = self.generated[torch.randint(len(self.generated), (count,), generator=generator)]
             out["pair"] = TensorDict({"made": made["frames"], "true": self.store.frames(made["row"]), STATE: self.store.arrays["states"][made["row"]], TOKENS: made["tokens"]}, pick.shape)
-        out["target"] = torch.linalg.pinv(head.basis) @ ((self.targets[pick] - head.offset) / gain)
+        out["target"] = self.policy.head.target(self.targets[pick])
         return out
 
     def loss(self, data: TensorDict, generator: torch.Generator) -> Tensor:
-        """Mean absolute error of the knots that vary, in units of the demonstrations' spread.
+        """The head's imitation loss.
 
         Pictures and states are disturbed a little, for robustness.
         """
         policy, state = self.policy, data[STATE]
         seen = data[SEEN] if self.seen is not None else policy.perception(augment(to_signed(data[IMAGE]), generator), data[TOKENS])
         noise = torch.randn(state.shape, generator=generator).to(state.device) * 0.05 * policy.fusion.state_std
-        knots = policy.head(policy.fusion(seen, state + noise))[0]
-        active = (policy.head.gain > 0).float()
-        error = (knots - data["target"]).abs() * active
-        cloned = error.sum() / (active.sum() * error.shape[0] * error.shape[1])
+        cloned = policy.head.error(policy.fusion(seen, state + noise), data["target"])
         if "pair" not in data.keys():
             return cloned
         pair = data["pair"]
-        made, true = (policy.head(policy.fusion(policy.perception(pair[name], pair[TOKENS]), pair[STATE]))[0] for name in ("made", "true"))
+        made, true = (policy.fusion(policy.perception(pair[name], pair[TOKENS]), pair[STATE]) for name in ("made", "true"))
         # Seen alike from both sides: neither picture is the right one to be wrong about.
-        apart = (made - true).abs() * active
-        return cloned + apart.sum() / (active.sum() * apart.shape[0] * apart.shape[1])
+        return cloned + policy.head.apart(made, true)
 
 
 def train_imitation(policy: ChunkPolicy, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path, fresh: bool = True, generated: TensorDict | None = None) -> dict[str, float]:
@@ -93,11 +87,13 @@ def train_imitation(policy: ChunkPolicy, store: ClipStore, episodes: Tensor, opt
     cloning = Cloning(policy, store, episodes, generated)
     if fresh:
         policy.normalise(cloning.targets, store.arrays["states"][cloning.rows], torch.tensor(ACTIVE_FLOOR * 2))
-    policy.head.log_std.requires_grad_(False)  # exploration is a choice, not something demonstrations tell
+    for parameter in policy.head.exploration():
+        parameter.requires_grad_(False)
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         return cloning.loss(data, generator), {}
 
     stats = fit("imitation", policy, lambda step, generator: cloning.sample(options.part, generator), loss, options, folder)
-    policy.head.log_std.requires_grad_(True)
+    for parameter in policy.head.exploration():
+        parameter.requires_grad_(True)
     return stats

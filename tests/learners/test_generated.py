@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict
 
+from actors.policies.chunk_gaussian import ChunkGaussianHead
 from actors.policies.vla import ChunkPolicy
 from envs.episodes.clips import ClipStore
 from envs.simulators.unet import UNetSimulator
@@ -32,7 +34,7 @@ def test_cloning_brings_generated_and_true_pictures_together(simulator: UNetSimu
     def apart(generated: TensorDict | None) -> float:
         """How differently a cloned policy acts on generated and on true pictures."""
         torch.manual_seed(0)
-        policy = ChunkPolicy(views=3, chunk=4, knots=2, width=32, points=4)
+        policy = ChunkPolicy(3, partial(ChunkGaussianHead, chunk=4), width=32, points=4)
         train_imitation(policy, store, demos, FitConfig(steps=60, batch=16, lr=3e-3, bf16=False), tmp_path / str(generated is None), generated=generated)
         with torch.no_grad():
             states = store.arrays["states"][made["row"]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from actors.fleet import LocalFleet
-from actors.policies.chunk_gaussian import ChunkGaussian, knot_basis
+from actors.policies.chunk_gaussian import ChunkGaussian, ChunkGaussianHead, knot_basis
 from actors.policies.vla import SEEN, ChunkPolicy
 from actors.rollouts import Host, seen_next
 from envs.episodes.clips import ClipStore
@@ -73,7 +74,7 @@ def test_divergence_stops_with_advice(tmp_path: Path) -> None:
 
 def small_policy() -> ChunkPolicy:
     torch.manual_seed(0)
-    return ChunkPolicy(views=3, chunk=4, knots=2, width=32, points=4, std=0.4)
+    return ChunkPolicy(3, partial(ChunkGaussianHead, chunk=4, std=0.4), width=32, points=4)
 
 
 def test_chunk_gaussian_is_smooth_and_its_density_consistent() -> None:

@@ -1,0 +1,135 @@
+"""Action tokens (Brohan et al. 2023, RT-2): every number of a chunk is one of a few bins, said independently of the others."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.distributions import Distribution, constraints, register_kl
+
+from actors.policies.heads import Head
+from envs.schema import ACTION_DIM
+
+
+class ChunkTokens(Distribution):
+    """chunk[k, a] = low[a] + (bin + 1/2) / bins * (high[a] - low[a]) with bin ~ Categorical(logits[k, a]).
+
+    Dimensions with low = high are constant and count neither in the density nor in the entropy.
+
+    Args:
+        logits: [..., K, A, bins].
+        low, high: [A] in action units.
+    """
+
+    arg_constraints: ClassVar[dict[str, Any]] = {"logits": constraints.real_vector}
+
+    def __init__(self, logits: Tensor, low: Tensor, high: Tensor, validate_args: bool | None = None):
+        self.log_share = logits.log_softmax(-1)
+        # TensorDict hands shared tensors over with batch dimensions; every row is the same.
+        self.low, self.high = low[(0,) * (low.ndim - 1)], high[(0,) * (high.ndim - 1)]
+        self.active = self.high > self.low
+        self.bins = logits.shape[-1]
+        super().__init__(logits.shape[:-3], logits.shape[-3:-1], validate_args=False)
+
+    def _decode(self, bins: Tensor) -> Tensor:
+        return self.low + (bins + 0.5) / self.bins * (self.high - self.low)
+
+    @property
+    def mode(self) -> Tensor:
+        return self._decode(self.log_share.argmax(-1))
+
+    @property
+    def mean(self) -> Tensor:
+        middles = torch.arange(self.bins, device=self.log_share.device)
+        return self._decode((self.log_share.exp() * middles).sum(-1))
+
+    deterministic_sample = mode
+
+    def sample(self, sample_shape: Any = ()) -> Tensor:
+        with torch.no_grad():
+            share = self.log_share.exp()
+            drawn = torch.multinomial(share.flatten(0, -2), max(1, torch.Size(sample_shape).numel()), replacement=True)
+            return self._decode(drawn.movedim(-1, 0).reshape(*sample_shape, *share.shape[:-1]))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        said = self.log_share.expand(*value.shape, self.bins).gather(-1, bins_of(value, self.low, self.high, self.bins).unsqueeze(-1)).squeeze(-1)
+        return (said * self.active).sum((-2, -1))
+
+    def entropy(self) -> Tensor:
+        return -((self.log_share.exp() * self.log_share).sum(-1) * self.active).sum((-2, -1))
+
+    def held(self) -> ChunkTokens:
+        """Itself: how sure tokens are cannot be told from which they are."""
+        return self
+
+
+@register_kl(ChunkTokens, ChunkTokens)
+def _kl(p: ChunkTokens, q: ChunkTokens) -> Tensor:
+    """KL(p || q) in nats, [...], over the dimensions that vary."""
+    return ((p.log_share.exp() * (p.log_share - q.log_share)).sum(-1) * p.active).sum((-2, -1))
+
+
+def bins_of(chunk: Tensor, low: Tensor, high: Tensor, bins: int) -> Tensor:
+    """Bin numbers int64 [..., K, A] of chunks [..., K, A]; beyond the ends, the last ones."""
+    share = (chunk - low) / torch.where(high > low, high - low, torch.ones_like(low))
+    return (share * bins).floor().long().clamp(0, bins - 1)
+
+
+class ChunkTokenHead(Head):
+    """Logits of the bins of every number of a chunk.
+
+    Args:
+        width: of the trunk's output.
+        chunk: actions per chunk, K.
+        bins: per number.
+        low, high: range of every number until `normalise` finds a narrower one.
+        actions: numbers of an action, A.
+    """
+
+    names = ("logits", "low", "high")
+    distribution = ChunkTokens
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, width: int, chunk: int, bins: int = 64, low: float = -1.0, high: float = 1.0, actions: int = ACTION_DIM):
+        super().__init__()
+        self.chunk, self.bins, self.actions = chunk, bins, actions
+        self.logits = nn.Linear(width, chunk * actions * bins)
+        nn.init.normal_(self.logits.weight, std=1e-2)
+        nn.init.zeros_(self.logits.bias)
+        self.register_buffer("low", torch.full((actions,), low))
+        self.register_buffer("high", torch.full((actions,), high))
+
+    def forward(self, hidden: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        logits = self.logits(hidden.float()).unflatten(-1, (self.chunk, self.actions, self.bins))
+        lead = hidden.shape[:-1]
+        return logits, self.low.expand(*lead, -1), self.high.expand(*lead, -1)
+
+    def normalise(self, chunks: Tensor, floor: Tensor) -> None:
+        """See Head.normalise; the bins span the demonstrations and a tenth more on either side."""
+        rows = chunks.flatten(0, 1)
+        low, high, centre = rows.amin(0), rows.amax(0), rows.mean(0)
+        active, margin = rows.std(0) > floor, 0.1 * (high - low)
+        self.low.copy_(torch.where(active, low - margin, centre))
+        self.high.copy_(torch.where(active, high + margin, centre))
+
+    def target(self, chunks: Tensor) -> Tensor:
+        """Bin numbers [N, K, A]."""
+        return bins_of(chunks, self.low, self.high, self.bins)
+
+    def error(self, hidden: Tensor, target: Tensor) -> Tensor:
+        """Cross-entropy per number that varies, in nats."""
+        wrong = F.cross_entropy(self(hidden)[0].flatten(0, -2), target.flatten(), reduction="none").view(target.shape)
+        active = (self.high > self.low).float()
+        return (wrong * active).sum() / (active.sum() * target.shape[0] * target.shape[1])
+
+    def apart(self, one: Tensor, other: Tensor) -> Tensor:
+        """Symmetric KL divergence per number that varies, in nats."""
+        p, q = (ChunkTokens(*self(hidden)) for hidden in (one, other))
+        return 0.5 * (_kl(p, q) + _kl(q, p)).mean() / (p.active.sum().clamp(min=1) * self.chunk)
+
+    def exploration(self) -> list[nn.Parameter]:
+        """None: how sure tokens are cannot be told from which they are."""
+        return []
