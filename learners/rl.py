@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -43,6 +43,7 @@ def train_rl(
     name: str = "rl",
     seed_pool: Sequence[int] | None = None,
     anchor: Anchor | None = None,
+    until: Callable[[int], bool] | None = None,
 ) -> dict[str, Any]:
     """Improve `policy` in place.
 
@@ -52,6 +53,7 @@ def train_rl(
         starts: number of start frames in imagination; None in physics, where `seed_pool` says which seeds may be used.
         folder: receives checkpoints, metrics.jsonl and learned.jsonl, the jobs that were learned from; a checkpoint found there is resumed.
         anchor: what RLConfig.anchor speaks of.
+        until: asked after every iteration, with its number; true ends the run early.
 
     Returns:
         Seconds spent, episodes used, alarms, the fleet's books, and the metrics of the last iteration.
@@ -140,6 +142,8 @@ def train_rl(
             stop = from_leader(asked)
             if (iteration + 1) % config.checkpoint_every == 0 or stop:
                 save(iteration + 1)
+            if until is not None and until(iteration):
+                break
             if stop and iteration + 1 < config.iterations:
                 bar.close()
                 tqdm.write(f"{name}: SIGTERM; stopped after iteration {iteration}, the same command goes on from there")

@@ -18,6 +18,7 @@ from envs.physics.bench import Bench
 from envs.physics.pool import BenchPool
 from envs.precision import mixed_precision
 from pipeline.bench_actors import actors
+from pipeline.bench_learning import learning
 from pipeline.config import load_config
 
 
@@ -122,7 +123,7 @@ def world(cfg: dict[str, Any]) -> None:
         print(f"batch {batch}: {8 * batch * shape.chunk / total:.0f} frames/s, forward pass {100 * spent[0] / total:.1f}% of the step")
 
 
-BENCHES: dict[str, Callable[[dict[str, Any]], None]] = {"conditioning": conditioning, "physics": physics, "world": world, "actors": actors}
+BENCHES: dict[str, Callable[[dict[str, Any]], None]] = {"conditioning": conditioning, "physics": physics, "world": world, "actors": actors, "learning": learning}
 
 
 def run_bench(words: list[str]) -> None:

@@ -25,11 +25,12 @@ class Perception(nn.Module):
     Args:
         views: number of cameras.
         points: soft key-points of the first view.
+        channels: of its features.
     """
 
-    def __init__(self, views: int = 3, points: int = 32):
+    def __init__(self, views: int = 3, points: int = 32, channels: int = 32):
         super().__init__()
-        self.main = SpatialEncoder(points, 32)
+        self.main = SpatialEncoder(points, channels)
         self.sides = nn.ModuleList(PatchEncoder(32) for _ in range(views - 1))
         self.words = WordEncoder(16)
         self.out_features = self.main.out_features + 32 * (views - 1) + 16
@@ -78,6 +79,7 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         width: of that vector.
         points: soft key-points of the first view.
         states: numbers of the joint state.
+        channels: of the first view's features.
 
     Reads image, state and instruction tokens; writes ("vla_action", "chunk") and its log-probability.
 
@@ -87,8 +89,8 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         "('vla_action', 'log_probs')"
     """
 
-    def __init__(self, views: int, head: Callable[[int], Head], width: int = 256, points: int = 32, states: int = STATE_DIM):
-        eyes = Perception(views, points)
+    def __init__(self, views: int, head: Callable[[int], Head], width: int = 256, points: int = 32, states: int = STATE_DIM, channels: int = 32):
+        eyes = Perception(views, points, channels)
         perception = TensorDictModule(eyes, in_keys=[IMAGE, TOKENS], out_keys=[SEEN])
         fusion = TensorDictModule(Fusion(eyes.out_features, width, states), in_keys=[SEEN, STATE], out_keys=[HIDDEN])
         speaker = head(width)

@@ -1,0 +1,34 @@
+"""TorchRL's toy tracking task as one of our worlds."""
+
+from __future__ import annotations
+
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from envs.schema import CHUNK, STATE, SUCCESS
+from envs.toy_tracking import ToyTrackingEnv
+
+
+def test_specs_and_targets_of_seeds() -> None:
+    env = ToyTrackingEnv(6, starts=4)
+    check_env_specs(env)
+    env.schedule([1, 5, 2, 9, 3, 0])  # 1, 5 and 9 are the same start
+    state = env.reset()[STATE]
+    assert torch.equal(state[0], state[1]) and torch.equal(state[0], state[3]) and not torch.equal(state[0], state[2])
+    assert not torch.equal(ToyTrackingEnv(1, targets=1).targets, ToyTrackingEnv(1).targets)
+
+
+def test_an_oracle_wins_a_coward_does_not() -> None:
+    env = ToyTrackingEnv(4)
+    env.schedule(range(4))
+    now = env.reset()
+    now[CHUNK] = now[STATE][:, None, 2:].expand(-1, 4, -1).clone()
+    now[CHUNK][2:] = -1.0
+    after = env.step(now)["next"]
+    assert after[SUCCESS].squeeze(-1).tolist() == [True, True, False, False] == after["reward"].squeeze(-1).bool().tolist()
+    for _ in range(4):
+        after[CHUNK] = torch.full((4, 4, 2), -1.0)
+        after = env.step(after)["next"]
+    assert not bool(after["truncated"][2:].any())
+    after[CHUNK] = torch.full((4, 4, 2), -1.0)
+    assert bool(env.step(after)["next", "truncated"][2:].all())
