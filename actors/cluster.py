@@ -16,7 +16,7 @@ import torch
 from actors.factory import ConfigError
 from actors.reaper import reap_after_me
 
-ROLES = ("learner", "actors", "judge")
+ROLES = ("learner", "actors", "judge", "evaluator")
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Plan:
         unknown = sorted(set(place) - set(ROLES))
         if unknown or set(ROLES) - set(place):
             raise ConfigError(f"launch.place must name {list(ROLES)}, it names {sorted(place)}")
-        counts = {"learner": launch["learners"], "actors": launch["actors"], "judge": int(launch["judge_service"])}
+        counts = {"learner": launch["learners"], "actors": launch["actors"], "judge": int(launch["judge_service"]), "evaluator": 1}
         for role in ROLES:
             for key in ("num_cpus", "num_gpus"):
                 if place[role].get(key, 0) < 0:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
 from tensordict import TensorDict
 
 from actors.rollouts import Host, Job, Stopwatch, Weights, size_of
+
+HARMLESS = ("stale", "unused", "learner died")  # reasons to drop episodes that say nothing against the hosts
 
 
 class FleetError(RuntimeError):
@@ -57,6 +60,17 @@ class Books:
         """Episodes that nobody will learn from."""
         if episodes:
             self.dropped[reason] = self.dropped.get(reason, 0) + episodes
+
+    def settle(self, episodes: int, spoiled: Mapping[str, int]) -> None:
+        """A rollout of so many episodes was learned from, but for those that something spoiled."""
+        for reason, count in spoiled.items():
+            self.drop(reason, count)
+        self.learned += episodes - sum(spoiled.values())
+
+    @property
+    def lost(self) -> int:
+        """Episodes dropped because something failed; not those that came too late or were not needed any more."""
+        return sum(count for reason, count in self.dropped.items() if reason not in HARMLESS)
 
     @property
     def balanced(self) -> bool:

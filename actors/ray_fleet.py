@@ -20,7 +20,7 @@ from typing import Any
 
 import ray
 from ray.actor import ActorHandle
-from ray.exceptions import GetTimeoutError, RayActorError, RayError, RayTaskError
+from ray.exceptions import GetTimeoutError, ObjectStoreFullError, OutOfDiskError, RayActorError, RayError, RayTaskError
 from tqdm import tqdm
 
 from actors.fleet import Books, FleetError, Result
@@ -118,7 +118,10 @@ class RayFleet:
     def publish(self, version: int, weights: Weights) -> dict[str, float]:
         """See Fleet.publish."""
         watch = Stopwatch()
-        ref = ray.put(weights)
+        try:
+            ref = ray.put(weights)
+        except (ObjectStoreFullError, OutOfDiskError) as error:
+            raise FleetError(f"the object store is full ({type(error).__name__}); raise launch.object_store_mb, free disk space for what Ray spills, or lower rl.queue and rl.envs") from error
         with self._changed:
             if version < self._newest[0]:
                 raise ValueError(f"weights of version {version} were published after version {self._newest[0]}; versions only grow")

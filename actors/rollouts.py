@@ -14,14 +14,15 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import NestedKey, TensorDict
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from actors.meter import Meter
 from actors.policies.vla import SEEN, ChunkPolicy, Perception
-from envs.schema import CHUNK, EPISODE, IMAGE, JUDGE_STATUS, LOG_PROB, STATE, SUCCESS, TOKENS
+from envs.schema import CHUNK, COMMAND, EPISODE, IMAGE, JUDGE_STATUS, LOG_PROB, SPOILED, STATE, SUCCESS, TOKENS, ActionMode
 from envs.transforms import JudgeReward, StateExpertTransform
 
 VERSION = "policy_version"  # int64 [B, T, 1]: which weights acted
@@ -47,6 +48,32 @@ def trained_weights(policy: nn.Module) -> Weights:
     """The tensors that learning changes, by name; the rest of a policy is built from files by every host itself."""
     # A fresh array each: a published version must not change when the optimiser goes on.
     return {name: value.detach().cpu().clone().numpy() for name, value in policy.named_parameters() if value.requires_grad}
+
+
+class Careful(TensorDictModuleBase):
+    """A policy whose numbers that are NaN or infinite never reach a world: the arms rest instead, and SPOILED says so.
+
+    Args:
+        policy: acts.
+        mode: of its chunks.
+    """
+
+    def __init__(self, policy: ChunkPolicy, mode: ActionMode):
+        super().__init__()
+        self.policy, self.mode = policy, mode
+        self.in_keys, self.out_keys = [*policy.in_keys, COMMAND], [*policy.out_keys, SPOILED]
+
+    def forward(self, observed: TensorDictBase) -> TensorDictBase:
+        out = self.policy(observed)
+        bad = ~(out[CHUNK].isfinite().flatten(1).all(1) & out[LOG_PROB].isfinite())
+        if bad.any():
+            chunk = out[CHUNK]
+            rest = torch.zeros_like(chunk) if self.mode is ActionMode.RELATIVE else out[COMMAND].unsqueeze(1).expand_as(chunk)
+            out[CHUNK] = torch.where(bad[:, None, None], rest, chunk)
+            out[LOG_PROB] = torch.where(bad, 0.0, out[LOG_PROB])
+            out[SEEN] = torch.where(bad[:, None], 0.0, out[SEEN])
+        out[SPOILED] = bad.unsqueeze(-1)
+        return out
 
 
 class Host:
@@ -79,13 +106,13 @@ class Host:
             self.meter.watch(self.base.simulator, "predict")
         self._collect()
         seen = {key for key in policy.trained.in_keys if isinstance(key, tuple)}
-        self._keys: list[NestedKey] = [*sorted(seen | {STATE, SEEN}), CHUNK, LOG_PROB, EPISODE]
+        self._keys: list[NestedKey] = [*sorted(seen | {STATE, SEEN}), CHUNK, LOG_PROB, SPOILED, EPISODE]
         self._after: list[NestedKey] = ["reward", "done", "terminated", "truncated", SUCCESS, STATE]
 
     def _collect(self) -> None:
         self._collector = Collector(
             self.env,
-            self.policy,
+            Careful(self.policy, self.base.mode),
             frames_per_batch=self.env.batch_size[0] * self.steps,
             total_frames=-1,
             reset_at_each_iter=True,

@@ -17,6 +17,7 @@ STATE_DIM = 16  # [left joints 7, left gripper, right joints 7, right gripper]; 
 
 CHUNK = ACTION_CHUNK_KEY  # ("vla_action", "chunk") float32 [B, K, 14]
 LOG_PROB = ("vla_action", "log_probs")  # float32 [B]
+SPOILED = ("policy", "spoiled")  # bool [B, 1]: the policy said NaN, and rested instead; nobody may learn from the episode
 IMAGE = IMAGE_KEY  # ("observation", "image") uint8 [B, V, 3, H, W]: the last frame of each view
 STATE = STATE_KEY  # ("observation", "state") float32 [B, 16]
 COMMAND = ("observation", "command")  # float32 [B, 14]: the absolute command now in force

@@ -10,7 +10,7 @@ import torch
 from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
 
-from envs.schema import CHUNK, JUDGE_STATUS, LOG_PROB, Status
+from envs.schema import CHUNK, JUDGE_STATUS, LOG_PROB, SPOILED, Status
 
 
 @dataclass(frozen=True)
@@ -125,14 +125,26 @@ def judged(batch: TensorDict) -> Tensor:
     """Which steps [B, T] belong to episodes that no judge's error or abstention has spoiled."""
     if JUDGE_STATUS not in batch["next"].keys(True, True):
         return torch.ones(batch.shape, dtype=torch.bool, device=batch.device)
-    bad = batch["next", JUDGE_STATUS].squeeze(-1) != Status.OK.value
-    done = batch["next", "done"].squeeze(-1)
-    spoiled = torch.zeros_like(bad)
-    poison = torch.zeros_like(bad[:, 0])
-    for t in reversed(range(batch.shape[1])):  # a bad verdict ends its episode, so it spoils what came before it
-        poison = torch.where(done[:, t], bad[:, t], poison)
-        spoiled[:, t] = poison
-    return ~spoiled
+    return ~_episodes_with(batch["next", JUDGE_STATUS].squeeze(-1) != Status.OK.value, batch["next", "done"].squeeze(-1))
+
+
+def finite(batch: TensorDict) -> Tensor:
+    """Which steps [B, T] belong to episodes in which the policy never said NaN."""
+    if SPOILED not in batch.keys(True, True):
+        return torch.ones(batch.shape, dtype=torch.bool, device=batch.device)
+    return ~_episodes_with(batch[SPOILED].squeeze(-1), batch["next", "done"].squeeze(-1))
+
+
+def sound(batch: TensorDict) -> Tensor:
+    """Which steps [B, T] may be learned from."""
+    return judged(batch) & finite(batch)
+
+
+def _episodes_with(bad: Tensor, done: Tensor) -> Tensor:
+    """Spreads a flag [B, T] to all steps of the episode it is raised in."""
+    number = torch.cat([torch.zeros_like(done[:, :1]), done[:, :-1]], 1).long().cumsum(1)
+    hit = torch.zeros(bad.shape, dtype=torch.long, device=bad.device).scatter_add(1, number, bad.long())
+    return hit.gather(1, number) > 0
 
 
 def transitions(batch: TensorDict, keep: Tensor, keys: Iterable[NestedKey], **extra: Tensor) -> TensorDict:

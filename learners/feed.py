@@ -71,10 +71,18 @@ class Feed:
         return result
 
     def _given_up(self, result: Result) -> None:
+        self.fleet.books.drop(result.failure.split(":")[0], self.fleet.episodes)
+        self.check_losses(result.failure)
+
+    def check_losses(self, last: str) -> None:
+        """Stop where too many episodes are lost.
+
+        Raises:
+            FleetError: with the books, and the `last` cause.
+        """
         books = self.fleet.books
-        books.drop(result.failure.split(":")[0], self.fleet.episodes)
-        if sum(books.dropped.values()) > self.max_dropped * max(books.asked, 20 * self.fleet.episodes):
-            raise FleetError(f"{sum(books.dropped.values())} of {books.asked} episodes were lost ({books.dropped}), more than rl.max_dropped={self.max_dropped}; the last: {result.failure}")
+        if books.lost > self.max_dropped * max(books.asked, 20 * self.fleet.episodes):
+            raise FleetError(f"{books.lost} of {books.asked} episodes were lost ({books.dropped}), more than rl.max_dropped={self.max_dropped}; the last: {last}")
 
     def _join(self, results: list[Result], iteration: int, sync: dict[str, float]) -> tuple[TensorDict, dict[str, float]]:
         good = sorted((r for r in results if r.batch is not None), key=lambda r: r.job.number)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from actors.policies.vla import ChunkPolicy
 from envs.schema import CHUNK, SUCCESS
-from learners.algorithm import first_episode, judged, transitions
+from learners.algorithm import first_episode, sound, transitions
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class FilteredBC:
 
     def prepare(self, batch: TensorDict) -> tuple[TensorDict, dict[str, float]]:
         """The steps of this iteration's successful episodes."""
-        mine = first_episode(batch["next", "done"].squeeze(-1)) & judged(batch)
+        mine = first_episode(batch["next", "done"].squeeze(-1)) & sound(batch)
         won = (batch["next", SUCCESS].squeeze(-1) & mine).any(1)
         return transitions(batch, mine & won[:, None], self.policy.in_keys), {"episodes_kept": float(won.sum())}
 

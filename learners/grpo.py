@@ -18,7 +18,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from actors.policies.vla import ChunkPolicy
 from envs.schema import CHUNK, EPISODE, LOG_PROB
-from learners.algorithm import first_episode, judged, transitions
+from learners.algorithm import first_episode, sound, transitions
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class GRPO:
     def prepare(self, batch: TensorDict) -> tuple[TensorDict, dict[str, float]]:
         """Group-relative advantages of the first episode of every slot; what a slot does after that belongs to no group."""
         done = batch["next", "done"].squeeze(-1)
-        mine = first_episode(done) & judged(batch)
+        mine = first_episode(done) & sound(batch)
         reward = batch["next", "reward"].squeeze(-1) * mine
         size = self.config.group
         togo = reward.flip(1).cumsum(1).flip(1)

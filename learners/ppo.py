@@ -18,7 +18,7 @@ from torchrl.objectives.value import GAE
 
 from actors.policies.vla import SEEN, ChunkPolicy
 from envs.schema import CHUNK, LOG_PROB, STATE, STATE_DIM
-from learners.algorithm import judged, transitions
+from learners.algorithm import sound, transitions
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class PPO:
         value, target = batch["state_value"], batch["value_target"]
         explained = 1 - (target - value).var() / target.var().clamp(min=1e-8)
         extra = {"advantage": batch["advantage"], "value_target": target, "state_value": value}
-        data = transitions(batch, judged(batch), {*self.policy.in_keys, SEEN, STATE}, **extra)
+        data = transitions(batch, sound(batch), {*self.policy.in_keys, SEEN, STATE}, **extra)
         return data, {"explained_variance": float(explained.clamp(min=-10.0)), "advantage_std": float(batch["advantage"].std())}
 
     def loss(self, minibatch: TensorDict) -> tuple[Tensor, dict[str, float]]:

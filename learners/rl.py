@@ -125,8 +125,9 @@ def train_rl(
             spent["update"] += updated - collected
             done = batch["next", "done"]
             episodes += int(done.sum() + (~done[:, -1]).sum())
-            books.drop("judge", int(figures["dropped_by_judge"]))
-            books.learned += len(batch) - int(figures["dropped_by_judge"])
+            books.settle(len(batch), {"judge": int(figures["dropped_by_judge"]), "NaN actions": int(figures["dropped_nan"])})
+            if feed is not None:
+                feed.check_losses("judges that gave no verdict, or a policy that says NaN")
             figures |= supply | {"time/rollout": collected - began, "time/update": updated - collected}
             if feed is not None:
                 figures["time/actors_idle_share"] = max(0.0, 1 - supply["time/actors_busy"] / (feed.fleet.size * (updated - began)))

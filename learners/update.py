@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.schema import SUCCESS
-from learners.algorithm import Algorithm, Anchor, RLConfig, first_episode, judged
+from learners.algorithm import Algorithm, Anchor, RLConfig, finite, first_episode, judged
 from learners.fit import TrainingDiverged, step_generator
 from learners.parallel import Trainee, averaged, clip_gradients, my_share
 
@@ -30,7 +30,7 @@ def update(batch: TensorDict, algorithm: Algorithm, trainee: Trainee, optimiser:
     for _ in range(config.epochs):
         order = torch.randperm(len(data), generator=shuffle)
         for pick in order.split(config.minibatch):
-            if len(pick) < 16 and len(data) >= 16:
+            if not len(pick) or len(pick) < 16 <= len(data):  # nothing, or a rest too small for a step
                 continue
             optimiser.zero_grad(set_to_none=True)
             rows, parts, mine = [], pick.tensor_split(config.microbatches), my_share(config.microbatches)
@@ -66,14 +66,16 @@ def _loss(algorithm: Algorithm, minibatch: TensorDict, config: RLConfig, generat
 
 
 def outcome(batch: TensorDict) -> dict[str, float]:
-    """Success and return of the first episodes of a rollout [B, T] that no judge has spoiled."""
+    """Success and return of the first episodes of a rollout [B, T] that nothing has spoiled, and how many something has."""
     done, success = batch["next", "done"].squeeze(-1), batch["next", SUCCESS].squeeze(-1)
-    mine, kept = first_episode(done), judged(batch)[:, 0]
+    mine, said = first_episode(done), finite(batch)[:, 0]
+    kept = said & judged(batch)[:, 0]
     reward = (batch["next", "reward"].squeeze(-1) * mine).sum(1)[kept]
     there = bool(kept.any())
     return {
         "success": float((success & mine).any(1)[kept].float().mean()) if there else 0.0,
         "return": float(reward.mean()) if there else 0.0,
         "reward_std": float(reward.std(unbiased=False)) if there else 0.0,
-        "dropped_by_judge": float((~kept).sum()),
+        "dropped_nan": float((~said).sum()),
+        "dropped_by_judge": float((said & ~kept).sum()),
     }

@@ -11,7 +11,7 @@ from typing import Any
 
 from pipeline import work
 from pipeline.graph import Graph, Stage
-from pipeline.stage_workers import SHARED, learners_of, run_shared
+from pipeline.stage_workers import learners_of, run_stage
 
 Cfg = Mapping[str, Any]
 
@@ -19,15 +19,14 @@ Cfg = Mapping[str, Any]
 def build_loop(cfg: Cfg, root: Path) -> Graph:
     """The graph of an experiment; `cfg` is the resolved config as plain containers."""
     graph = Graph(root / "stages")
-    seed, learners = cfg["seed"], learners_of(cfg)
+    seed = cfg["seed"]
+    learners_of(cfg)  # what cannot be shared out is refused before anything starts
     world = {"task": cfg["task"], "seed": seed}
     learned = {**world, "simulator": cfg["simulator"], "microbatches": cfg["microbatches"]}
 
     def add(name: str, parents: tuple[str, ...], config: dict[str, Any], run: Any, **known: Any) -> str:
         def go(folder: Path, found: dict[str, Path]) -> Mapping[str, Any]:
-            if learners > 1 and run.__name__ in SHARED:
-                return run_shared(run.__name__, cfg, folder, found, known)
-            return run(cfg, folder, found, **known)
+            return run_stage(run.__name__, cfg, folder, found, known)
 
         return graph.add(Stage(name, parents, config, go))
 

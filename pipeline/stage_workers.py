@@ -1,6 +1,6 @@
-"""A stage in several processes: Ray Train starts the workers, all of them run the stage, the leading one writes.
+"""Stages elsewhere: those that learn in several processes, those that evaluate where launch.place.evaluator says.
 
-Which parts of a stage are shared out is told in learners/parallel.py. A worker that dies takes the others with it; Ray
+Ray Train starts the processes that learn; all of them run the stage, the leading one writes. Which parts of a stage are shared out is told in learners/parallel.py. A worker that dies takes the others with it; Ray
 Train starts all anew, and the stage goes on from its last checkpoint.
 """
 
@@ -16,6 +16,23 @@ from pipeline.artefact import write_text
 
 # Stages that are more than one worker's work; the others run in the driver.
 SHARED = ("imitation", "tokenizer", "vision", "state", "judge", "clone", "rl")
+# Stages that measure policies and worlds.
+EVALUATORS = ("gap", "evaluate_physics", "evaluate_imagined", "measure")
+
+
+def run_stage(function: str, cfg: Mapping[str, Any], folder: Path, found: Mapping[str, Path], known: Mapping[str, Any]) -> dict[str, Any]:
+    """Run a function of pipeline/work.py where the config wants it: in this process, on Ray's evaluator, or in launch.learners processes.
+
+    Raises:
+        ConfigError: if the processes cannot be placed, or failed.
+    """
+    from pipeline import work
+
+    if function in SHARED and learners_of(cfg) > 1:
+        return run_shared(function, cfg, folder, found, known)
+    if function in EVALUATORS and cfg["launch"]["backend"] == "ray":
+        return run_placed(function, cfg, folder, found, known)
+    return dict(getattr(work, function)(cfg, folder, found, **known))
 
 
 def learners_of(cfg: Mapping[str, Any]) -> int:
@@ -67,6 +84,30 @@ def run_shared(function: str, cfg: Mapping[str, Any], folder: Path, found: Mappi
     except Exception as error:
         raise ConfigError(f"the {launch['learners']} learners of {folder.name} failed: {_last(error)}; the same command goes on from the last checkpoint") from error
     return dict(json.loads(answer.read_text()))
+
+
+def run_placed(function: str, cfg: Mapping[str, Any], folder: Path, found: Mapping[str, Path], known: Mapping[str, Any]) -> dict[str, Any]:
+    """Run a function of pipeline/work.py as a Ray task with the evaluator's resources; a lost node only costs a second try.
+
+    Raises:
+        ConfigError: if the task cannot be placed.
+    """
+    import ray
+
+    from actors.cluster import Plan, connect
+
+    plan = Plan.of(cfg["launch"])
+    plan.check(connect(cfg["launch"]))
+    task = ray.remote(_measure).options(max_retries=int(cfg["launch"]["patience"]["retries"]), **plan.options("evaluator"))
+    paths = {name: str(path.resolve()) for name, path in found.items()}
+    answer: dict[str, Any] = ray.get(task.remote(function, dict(cfg), str(folder.resolve()), paths, dict(known)))
+    return answer
+
+
+def _measure(function: str, cfg: dict[str, Any], folder: str, found: dict[str, str], known: dict[str, Any]) -> dict[str, Any]:
+    from pipeline import work
+
+    return dict(getattr(work, function)(cfg, Path(folder), {name: Path(path) for name, path in found.items()}, **known))
 
 
 def work_loop(asked: dict[str, Any]) -> None:

@@ -69,11 +69,11 @@ class ChunkGaussian(Distribution):
             return self.rsample(sample_shape)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        normal = torch.distributions.Normal(self.loc, self.scale)
+        normal = torch.distributions.Normal(self.loc, self.scale, validate_args=False)
         return (normal.log_prob(self._encode(value)) * self.active).sum((-2, -1))
 
     def entropy(self) -> Tensor:
-        return (torch.distributions.Normal(self.loc, self.scale).entropy() * self.active).sum((-2, -1))
+        return (torch.distributions.Normal(self.loc, self.scale, validate_args=False).entropy() * self.active).sum((-2, -1))
 
     def held(self) -> ChunkGaussian:
         """The same with a spread that does not learn."""

@@ -49,7 +49,7 @@ class ChunkTokens(Distribution):
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
         with torch.no_grad():
-            share = self.log_share.exp()
+            share = self.log_share.exp().nan_to_num(1.0)  # NaN shows in the log-probability; drawing from it would raise for all rows
             drawn = torch.multinomial(share.flatten(0, -2), max(1, torch.Size(sample_shape).numel()), replacement=True)
             return self._decode(drawn.movedim(-1, 0).reshape(*sample_shape, *share.shape[:-1]))
 

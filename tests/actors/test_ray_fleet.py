@@ -127,11 +127,10 @@ def test_a_job_that_raises_is_given_up_and_counted(cluster: None, recipe: Recipe
         policy = build_policy(recipe.config, Path(recipe.policy))
         policy.freeze_perception()
         weights = trained_weights(policy)
-        bad = {name: value * float("nan") for name, value in weights.items()}
-        fleet.publish(0, bad)
+        fleet.publish(0, {name: value[..., :-1] for name, value in weights.items()})  # of another shape, so taking over raises
         fleet.submit(Job(0, tuple(range(4)), 0))
         result = fleet.take()
-        assert result is not None and result.batch is None and "NaN" in result.failure
+        assert result is not None and result.batch is None and result.failure.startswith("RuntimeError")
         fleet.publish(1, weights)
         fleet.submit(Job(1, tuple(range(4)), 0))
         result = fleet.take()

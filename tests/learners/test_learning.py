@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,9 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from actors.fleet import LocalFleet
+from actors.fleet import FleetError, LocalFleet
 from actors.policies.chunk_gaussian import ChunkGaussian, ChunkGaussianHead, knot_basis
+from actors.policies.chunk_tokens import ChunkTokenHead
 from actors.policies.vla import SEEN, ChunkPolicy
 from actors.rollouts import Host, seen_next
 from envs.episodes.clips import ClipStore
@@ -21,6 +23,7 @@ from envs.judges import LearnedJudge
 from envs.physics.bench import BenchConfig
 from envs.physics.env import PhysicsEnv
 from envs.schema import CHUNK, EPISODE, IMAGE, JUDGE_STATUS, LOG_PROB, STATE, SUCCESS, TOKENS, Status
+from envs.toy_tracking import ToyTrackingEnv
 from learners.alarms import Alarms
 from learners.algorithm import RLConfig, first_episode, judged
 from learners.filtered_bc import FilteredBC, FilteredBCConfig
@@ -104,6 +107,32 @@ def test_first_episode_and_judged_mask() -> None:
     status[0, 3] = Status.ERROR.value
     batch = TensorDict({"next": TensorDict({JUDGE_STATUS: status, "done": done.unsqueeze(-1)}, [2, 4])}, [2, 4])
     assert judged(batch).tolist() == [[True, True, False, False], [True] * 4]
+
+
+@pytest.mark.parametrize("head", [partial(ChunkTokenHead, chunk=4, bins=8, actions=2), partial(ChunkGaussianHead, chunk=4, actions=2)])
+def test_episodes_with_nan_are_dropped_and_counted_until_they_are_too_many(tmp_path: Path, head: Any) -> None:
+    torch.manual_seed(0)
+    policy = ChunkPolicy(1, head, width=16, points=4, states=4, channels=16)
+    share = 0.0
+
+    def spoil(module: nn.Module, given: Any, said: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
+        first = said[0].clone()
+        if not torch.is_grad_enabled():  # while acting, not while learning
+            first[: int(share * len(first))] = float("nan")
+        return (first, *said[1:])
+
+    policy.head.register_forward_hook(spoil)
+    config = RLConfig(iterations=1, envs=8, minibatch=16, epochs=1, max_dropped=0.4)
+    for share, dropped in ((0.25, 2), (1.0, 8)):
+        fleet = LocalFleet(Host(ToyTrackingEnv(8, starts=4), policy, bootstrap=False))
+        folder = tmp_path / str(share)
+        if dropped == 2:
+            stats = train_rl(fleet, policy, GRPO(policy, GRPOConfig(group=4)), config, folder, starts=4)
+            assert stats["books"]["dropped"] == {"NaN actions": 2} and stats["books"]["learned"] == 6
+            assert all(bool(p.isfinite().all()) for p in policy.parameters())
+        else:
+            with pytest.raises(FleetError, match="NaN"):
+                train_rl(fleet, policy, GRPO(policy, GRPOConfig(group=4)), RLConfig(**{**asdict(config), "max_dropped": 0.04}), folder, starts=4)
 
 
 def rollout(rewards: list[list[float]], policy: ChunkPolicy) -> TensorDict:
