@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import os
 import random
 import signal
@@ -56,9 +57,13 @@ def run_chaos(cfg: Mapping[str, Any], words: list[str], folder: Path) -> dict[st
             lives += 1
             with (folder / "learner.log").open("a") as log:
                 learner = subprocess.Popen([sys.executable, "-m", LEARNER, str(folder), str(lives), *words], stdout=log, stderr=log, start_new_session=True)
-            stop = min(end, time.monotonic() + section["learner_every"] * chance.uniform(0.7, 1.3))
-            while time.monotonic() < stop and learner.poll() is None:
+            # One learner in four may be killed before it has learned anything; the others live on after their first iteration.
+            begun, life = len(_rows(folder)), section["learner_every"] * chance.uniform(0.7, 1.3)
+            stop = time.monotonic() + life if chance.random() < 0.25 else math.inf
+            while time.monotonic() < min(stop, end) and learner.poll() is None:
                 time.sleep(0.2)
+                if math.isinf(stop) and len(_rows(folder)) > begun:
+                    stop = time.monotonic() + life
                 bar.n = section["seconds"] - max(0.0, end - time.monotonic())
                 bar.set_postfix_str(f"{len(_rows(folder))} iterations, learner killed {kills} times")
             if learner.poll() is not None:
