@@ -73,7 +73,7 @@ class Patience:
         job: for a rollout.
         start: for a host to be built.
         retries: times a job that raised is tried again.
-        rebuilds: times in a row that building may fail before the run stops.
+        rebuilds: times in a row and per host that building may raise before the run stops; being killed meanwhile counts a tenth.
     """
 
     job: float = 300.0
@@ -103,7 +103,7 @@ class RayFleet:
         self._done: deque[Result] = deque()
         self._tries: dict[int, int] = {}
         self._newest: tuple[int, Any] = (-1, None)
-        self._failed_builds = 0
+        self._failed_builds = 0.0
         self._count = 0
         self._error: FleetError | None = None
         self._closing = False
@@ -235,7 +235,7 @@ class RayFleet:
             self._died(member, error)
         else:
             if not member.built:
-                member.pid, self._failed_builds = value, 0
+                member.pid, self._failed_builds = value, 0.0
                 if self._lost_at:
                     self.recoveries.append(time.monotonic() - self._lost_at.popleft())
                 return
@@ -260,9 +260,10 @@ class RayFleet:
 
     def _died(self, member: _Member, error: Exception) -> None:
         if not member.built:
-            self._failed_builds += 1
+            # Our own code that raises will raise again; a process that was killed while it began had bad luck.
+            self._failed_builds += 1.0 if "creation task" in str(error) else 0.1
             if self._failed_builds >= self.patience.rebuilds * max(1, len(self._members)):
-                raise FleetError(f"hosts cannot be built, {self._failed_builds} times in a row; the last time: {_root(error)}")
+                raise FleetError(f"hosts cannot be built, time after time; the last time: {_root(error)}")
         else:
             self._lost_at.append(time.monotonic())
         doing = f"ran job {member.job.number}" if member.job else "was being built" if not member.built else "was idle"

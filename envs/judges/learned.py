@@ -39,7 +39,7 @@ class LearnedJudge(Judge):
         self.main = SpatialEncoder(points, width, pictures=2)
         self.sides = nn.ModuleList(PatchEncoder(16, 8) for _ in range(views - 1))
         self.words = WordEncoder(16)
-        self.sharpness = nn.Parameter(torch.tensor(2.0))
+        self.sharpness = nn.Parameter(torch.tensor([2.0]))  # FSDP2 takes no scalars
         apart = 3 * (aims * (aims - 1) // 2)
         self.head = nn.Sequential(nn.Linear(self.main.out_features + 16 * views + apart, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU(), nn.Linear(128, 2))
 

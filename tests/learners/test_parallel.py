@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,14 @@ import torch.distributed as dist
 import torch.multiprocessing as mp
 from torch import Tensor, nn
 
+from actors.factory import build_judge, build_policy, build_simulator, build_state_decoder
+from envs.episodes.clips import ClipStore
 from learners.fit import FitConfig, fit
+from learners.stages.imitation import train_imitation
+from learners.stages.judge import train_judge
+from learners.stages.state import train_state
+from learners.stages.vision import VisionConfig, train_vision
+from pipeline.config import load_config
 
 STEPS = 8
 
@@ -64,31 +71,52 @@ def train(folder: Path, stop_after: int | None = None) -> list[float]:
     return [row["toy/loss"] for row in rows] + [float(p.detach().abs().sum()) for p in net.parameters()]
 
 
-def worker(rank: int, rendezvous: str, folder: str, stop_after: int | None) -> None:
-    os.environ |= {"RANK": str(rank), "WORLD_SIZE": "2"}
+def stages(folder: Path, dataset: Path) -> list[float]:
+    """Losses of the first steps of every supervised stage, with the diffusion transformer as the simulator."""
+    cfg = load_config(["experiment=smoke", "simulator=dit_small", "launch.device=cpu"])
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    store = ClipStore([dataset])
+    every, options = torch.arange(len(store)), FitConfig(3, 4, microbatches=2, lr=1e-3, warmup=1, bf16=False)
+    policy, simulator = build_policy(cfg), build_simulator(cfg)
+    decoder, judge = build_state_decoder(cfg, simulator), build_judge(cfg)
+    train_imitation(policy, store, every, options, folder / "imitation")
+    train_vision(simulator, store, every, VisionConfig(alone=1.0), options, folder / "vision")
+    train_state(decoder, simulator, store, every, options, folder / "state")
+    train_judge(judge, store, every, options, folder / "judge")
+    return [json.loads(line)[f"{name}/loss"] for name in ("imitation", "vision", "state", "judge") for line in (folder / name / "metrics.jsonl").read_text().splitlines()]
+
+
+def worker(rank: int, rendezvous: str, folder: str, work: Callable[..., list[float]], given: tuple[Any, ...]) -> None:
     dist.init_process_group("gloo", init_method=f"file://{rendezvous}", rank=rank, world_size=2)
-    values = train(Path(folder), stop_after)
+    values = work(Path(folder), *given)
     if values:
         (Path(folder) / f"values-{rank}.json").write_text(json.dumps(values))
     dist.destroy_process_group()
 
 
-def two(folder: Path, stop_after: int | None = None) -> list[list[float]]:
+def two(work: Callable[..., list[float]], folder: Path, *given: Any) -> list[list[float]]:
+    """What two workers say."""
     folder.mkdir(exist_ok=True)
     rendezvous = folder / "rendezvous"
     rendezvous.unlink(missing_ok=True)
-    mp.spawn(worker, (str(rendezvous), str(folder), stop_after), nprocs=2)
+    mp.spawn(worker, (str(rendezvous), str(folder), work, given), nprocs=2)
     return [json.loads(path.read_text()) for path in sorted(folder.glob("values-*.json"))]
 
 
 def test_two_workers_follow_one_and_either_goes_on_from_the_others_checkpoint(tmp_path: Path) -> None:
     alone = train(tmp_path / "alone")
-    leader, follower = two(tmp_path / "two")
+    leader, follower = two(train, tmp_path / "two")
     assert leader == follower == pytest.approx(alone, rel=1e-4)
-    assert two(tmp_path / "from-two", stop_after=5) == []
+    assert two(train, tmp_path / "from-two", 5) == []
     assert train(tmp_path / "from-two") == pytest.approx(alone, rel=1e-4)
     assert train(tmp_path / "from-one", stop_after=5) == []
-    assert two(tmp_path / "from-one")[1] == pytest.approx(alone, rel=1e-4)
+    assert two(train, tmp_path / "from-one")[1] == pytest.approx(alone, rel=1e-4)
+
+
+def test_two_workers_follow_one_in_every_supervised_stage(tmp_path: Path, dataset: Path) -> None:
+    alone = stages(tmp_path / "alone", dataset)
+    assert len(alone) == 12 and two(stages, tmp_path / "two", dataset)[0] == pytest.approx(alone, rel=1e-3)
 
 
 def test_microbatches_that_cannot_be_shared_out_are_refused() -> None:

@@ -1,4 +1,4 @@
-"""Stages in two processes under Ray Train write what one process writes."""
+"""The RL stage in two processes under Ray Train, fed by a Ray actor, writes what one process writes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pipeline import work
 from pipeline.config import load_config
 from pipeline.demo_world import demo_recipe
 from pipeline.loop import build_loop
-from pipeline.stage_workers import run_shared
+from pipeline.stage_workers import run_stage
 
 WORDS = ["experiment=smoke", "launch=ray", "microbatches=2", "launch.cpus=4", "launch.object_store_mb=200", "launch.learners=2", "rl.shards=1", "imitation.demos=3"]
 
@@ -33,22 +33,21 @@ def losses(folder: Path, name: str) -> list[float]:
 
 
 def test_two_learners_write_what_one_writes(cluster: None, tmp_path: Path) -> None:
-    cfg: dict[str, Any] = load_config([*WORDS, "rl.epochs=1", "rl.anchor=0.0", "launch.actors=1"])
+    cfg: dict[str, Any] = load_config([*WORDS, "rl.epochs=1", "launch.actors=1"])
     recipe = demo_recipe(cfg, tmp_path / "world", cfg["rl"]["envs"])
     found = {name: Path(path).parent for name, path in (("policy", recipe.policy), ("vision", recipe.simulator), ("state", recipe.decoder), ("judge", recipe.judge))}
     found["data"] = Path(recipe.data[0]).parent
-    names = {"data": ("data",), "vision": "vision", "state": "state", "judge": "judge", "policy": "policy", "iterations": 1, "number": 1}
-    for function, known, figure, parents in (("imitation", {}, "imitation/loss", {"data": found["data"]}), ("rl", names, "rl/loss", found)):
-        alone, both = tmp_path / f"{function}-alone", tmp_path / f"{function}-both"
-        for folder in (alone, both):
-            folder.mkdir()
-        one = getattr(work, function)(load_config([*WORDS, "rl.epochs=1", "rl.anchor=0.0", "launch.actors=1", "launch.learners=1"]), alone, parents, **known)
-        two = run_shared(function, cfg, both, parents, known)
-        assert two.keys() == one.keys()
-        assert losses(both, figure) == pytest.approx(losses(alone, figure), rel=1e-3, abs=1e-5)
-        weights = load_file(alone / "weights.safetensors")
-        for name, value in load_file(both / "weights.safetensors").items():
-            torch.testing.assert_close(value, weights[name], rtol=1e-3, atol=2e-4)
+    names: dict[str, Any] = {"data": ("data",), "vision": "vision", "state": "state", "judge": "judge", "policy": "policy", "iterations": 1, "number": 1}
+    alone, both = tmp_path / "alone", tmp_path / "both"
+    for folder in (alone, both):
+        folder.mkdir()
+    one = work.rl(load_config([*WORDS, "rl.epochs=1", "launch.actors=1", "launch.learners=1"]), alone, found, **names)
+    two = run_stage("rl", cfg, both, found, names)
+    assert two.keys() == one.keys()
+    assert losses(both, "rl/loss") == pytest.approx(losses(alone, "rl/loss"), rel=1e-3, abs=1e-5)
+    weights = load_file(alone / "weights.safetensors")
+    for name, value in load_file(both / "weights.safetensors").items():
+        torch.testing.assert_close(value, weights[name], rtol=1e-3, atol=2e-4)
 
 
 def test_microbatches_must_fit_the_learners(tmp_path: Path) -> None:
