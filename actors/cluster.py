@@ -147,10 +147,19 @@ def _compare(nodes: int) -> None:
     mine = versions()
     probe = ray.remote(versions).options(num_cpus=0, scheduling_strategy="SPREAD")
     for theirs in ray.get([probe.remote() for _ in range(2 * nodes)], timeout=120):
-        wrong = {key: (theirs.get(key), value) for key, value in mine.items() if theirs.get(key) != value}
-        if wrong:
-            says = ", ".join(f"{key} {other} instead of {own}" for key, (other, own) in wrong.items())
-            raise ConfigError(f"a node of the cluster has {says}; install the versions of constraints.txt on every node")
+        check_versions(mine, theirs)
+
+
+def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str]) -> None:
+    """Refuse a node whose versions differ.
+
+    Raises:
+        ConfigError: naming what differs.
+    """
+    wrong = {key: (theirs.get(key), value) for key, value in mine.items() if theirs.get(key) != value}
+    if wrong:
+        says = ", ".join(f"{key} {other} instead of {own}" for key, (other, own) in wrong.items())
+        raise ConfigError(f"a node of the cluster has {says}; install the versions of constraints.txt on every node")
 
 
 def threads_of(cpus: float) -> int:

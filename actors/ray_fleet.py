@@ -73,11 +73,13 @@ class Patience:
         job: for a rollout.
         start: for a host to be built.
         retries: times a job that raised is tried again.
+        stage: for a whole stage that runs elsewhere.
         rebuilds: times in a row and per host that building may raise before the run stops; being killed meanwhile counts a tenth.
     """
 
     job: float = 300.0
     start: float = 180.0
+    stage: float = 14400.0
     retries: int = 1
     rebuilds: int = 3
 
@@ -108,6 +110,7 @@ class RayFleet:
         self._error: FleetError | None = None
         self._closing = False
         self._changed = threading.Condition()
+        self.finished = 0  # jobs that came through
         self.recoveries: list[float] = []  # seconds from a death being seen to its replacement being ready
         self._lost_at: deque[float] = deque()
         self._members = [self._build() for _ in range(actors)]
@@ -243,6 +246,7 @@ class RayFleet:
             assert member.job is not None
             batch = unpack(arrays)
             self._done.append(Result(member.job, member.version, batch, seconds, loaded, forward, size_of(arrays)))
+            self.finished += 1
             self._tries.pop(member.job.number, None)
             member.job = None
 

@@ -53,31 +53,41 @@ def run_chaos(cfg: Mapping[str, Any], words: list[str], folder: Path) -> dict[st
     end = time.monotonic() + section["seconds"]
     kills, lives = 0, 0
     with tqdm(total=section["seconds"], desc="chaos", unit="s", dynamic_ncols=True, bar_format="{l_bar}{bar}| {n:.0f}/{total:.0f} s {postfix}") as bar:
-        while time.monotonic() < end:
+        while True:
             lives += 1
             with (folder / "learner.log").open("a") as log:
                 learner = subprocess.Popen([sys.executable, "-m", LEARNER, str(folder), str(lives), *words], stdout=log, stderr=log, start_new_session=True)
             # One learner in four may be killed before it has learned anything; the others live on after their first iteration.
             begun, life = len(_rows(folder)), section["learner_every"] * chance.uniform(0.7, 1.3)
             stop = time.monotonic() + life if chance.random() < 0.25 else math.inf
-            while time.monotonic() < min(stop, end) and learner.poll() is None:
+            enough = False
+            while time.monotonic() < stop and not enough and learner.poll() is None:
                 time.sleep(0.2)
-                if math.isinf(stop) and len(_rows(folder)) > begun:
-                    stop = time.monotonic() + life
-                bar.n = section["seconds"] - max(0.0, end - time.monotonic())
-                bar.set_postfix_str(f"{len(_rows(folder))} iterations, learner killed {kills} times")
+                now, learned = time.monotonic(), len(_rows(folder))
+                if math.isinf(stop) and learned > begun:
+                    stop = now + life
+                enough = now >= end and kills > 0 and learned > begun
+                bar.n = min(section["seconds"], section["seconds"] - end + now)
+                bar.set_postfix_str(f"{learned} iterations, learner killed {kills} times")
+                if now > end + 600:
+                    os.killpg(learner.pid, signal.SIGKILL)
+                    raise ChaosFailure(f"nothing was learned for ten minutes after the end; see {folder}/learner.log")
             if learner.poll() is not None:
                 raise ChaosFailure(f"the learner left by itself with {learner.returncode}; see {folder}/learner.log")
-            if time.monotonic() < end:
+            if enough:
+                learner.send_signal(signal.SIGTERM)  # the last one finishes its iteration and writes its checkpoint
+            else:
                 os.kill(learner.pid, signal.SIGKILL)
                 kills += 1
-            else:
-                learner.send_signal(signal.SIGTERM)  # the last one finishes its iteration and writes its checkpoint
             try:
                 learner.wait(timeout=120)
             except subprocess.TimeoutExpired as error:
                 os.killpg(learner.pid, signal.SIGKILL)
                 raise ChaosFailure(f"the learner did not leave within two minutes of SIGTERM; see {folder}/learner.log") from error
+            if enough:
+                if learner.returncode != 143:
+                    raise ChaosFailure(f"after SIGTERM the learner left with {learner.returncode}, not 143; see {folder}/learner.log")
+                break
     report = _check(folder, before)
     report |= {"seconds": section["seconds"], "learner_kills": kills}
     (folder / "chaos.json").write_text(json.dumps(report, indent=1))

@@ -26,11 +26,19 @@ from pipeline.work import rl_options
 
 
 def plague(fleet: RayFleet, section: dict[str, Any], seed: int, events: Path) -> None:
-    """Kill parts of the fleet until the process ends; every event is a row of `events`."""
+    """Kill parts of the fleet until the process ends; every event is a row of `events`.
+
+    The schedule is in finished jobs, so that a slow machine is not killed faster than it can rebuild; now and then
+    two events come at once.
+    """
     chance = random.Random(seed)
     began = time.monotonic()
     while True:
-        time.sleep(section["every"] * chance.uniform(0.5, 1.5))
+        if chance.random() > 0.2:
+            enough = fleet.finished + chance.randint(1, 2 * section["every"] - 1)
+            while fleet.finished < enough:
+                time.sleep(0.05)
+        time.sleep(chance.uniform(0.0, 1.0))  # not always right after a job
         kind = chance.choices(["ray.kill", "SIGKILL", "judge", "resize"], [4, 4, 1, 2])[0]
         with contextlib.suppress(Exception):  # what it wanted to kill may have died just now
             if kind == "ray.kill":

@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 from actors.factory import ConfigError
 from pipeline.artefact import write_text
 
@@ -100,7 +102,15 @@ def run_placed(function: str, cfg: Mapping[str, Any], folder: Path, found: Mappi
     plan.check(connect(cfg["launch"]))
     task = ray.remote(_measure).options(max_retries=int(cfg["launch"]["patience"]["retries"]), **plan.options("evaluator"))
     paths = {name: str(path.resolve()) for name, path in found.items()}
-    answer: dict[str, Any] = ray.get(task.remote(function, dict(cfg), str(folder.resolve()), paths, dict(known)))
+    ref = task.remote(function, dict(cfg), str(folder.resolve()), paths, dict(known))
+    deadline, waited = float(cfg["launch"]["patience"]["stage"]), 0.0
+    while not ray.wait([ref], timeout=60)[0]:
+        waited += 60
+        tqdm.write(f"the driver waits for the evaluator ({folder.name}), {waited:.0f} s")
+        if waited >= deadline:
+            ray.cancel(ref, force=True)
+            raise ConfigError(f"{folder.name} took over launch.patience.stage={deadline:.0f} s on the evaluator; raise it, or see whether launch.place.evaluator can be placed")
+    answer: dict[str, Any] = ray.get(ref)
     return answer
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +12,7 @@ import pytest
 import ray
 from ray.cluster_utils import Cluster
 
-from actors.cluster import _advice, connect
+from actors.cluster import _advice, check_versions, connect, versions
 from actors.factory import ConfigError, build_policy
 from actors.launch import build_fleet
 from actors.ray_fleet import RayFleet
@@ -44,11 +47,26 @@ def test_a_lost_node_costs_no_job(recipe: Recipe) -> None:
         cluster.shutdown()
 
 
-def test_unreachable_cluster_and_wrong_token_are_named() -> None:
+def test_a_wrong_token_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", "a" * 64)
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    try:
+        script = f"from actors.cluster import connect; connect({{'address': '{cluster.address}'}})"
+        stranger = subprocess.run([sys.executable, "-c", script], env={**os.environ, "RAY_AUTH_TOKEN": "b" * 64}, capture_output=True, text=True, timeout=240)
+        assert "refused our token" in stranger.stderr and "auth_token" in stranger.stderr
+    finally:
+        cluster.shutdown()
+
+
+def test_unreachable_clusters_and_other_versions_are_named() -> None:
     cfg: dict[str, Any] = load_config(["experiment=smoke", "launch=ray", "launch.address=127.0.0.1:1"])
     with pytest.raises(ConfigError, match=r"launch\.address=127\.0\.0\.1:1 cannot be reached"):
         connect(cfg["launch"])
-    assert "auth_token" in _advice("head:6379", RuntimeError("Unauthenticated: invalid token"))
+    mine = versions()
+    check_versions(mine, dict(mine))
+    with pytest.raises(ConfigError, match=r"torch 1\.0 instead of .*constraints\.txt"):
+        check_versions(mine, mine | {"torch": "1.0"})
     assert "constraints.txt" in _advice("head:6379", RuntimeError("Version mismatch: the cluster was started with Ray 2.50"))
 
 
