@@ -15,6 +15,7 @@ from actors.fleet import FleetError
 from envs.episodes.episode import EpisodeError
 from envs.physics.pool import PoolError
 from envs.physics.render import MissingGL
+from envs.simulators.gesim_fixture import FixtureError
 from learners.fit import TrainingDiverged
 from pipeline import work
 from pipeline.config import load_config
@@ -142,6 +143,20 @@ def bench(words: list[str]) -> None:
     run_bench(words)
 
 
+def verify(words: list[str]) -> None:
+    """compare our network with a public one's outputs: worldloop verify gesim FIXTURE.safetensors"""
+    from envs.simulators.gesim_fixture import verify as errors_of
+
+    if len(words) != 2 or words[0] != "gesim":
+        raise ConfigError("say what and which: worldloop verify gesim FIXTURE.safetensors")
+    errors = errors_of(Path(words[1]))
+    for name, error in errors.items():
+        print(f"{name:<14} max abs error {error:.2e}")
+    if max(errors.values()) > 1e-5:
+        print("more than 1e-5: this is not the same network", file=sys.stderr)
+        sys.exit(1)
+
+
 def doctor(words: list[str]) -> None:
     """say what this machine has and what is missing"""
     from pipeline.doctor import examine
@@ -158,7 +173,7 @@ def controls(words: list[str]) -> None:
     run_controls(cfg, _root(cfg))
 
 
-COMMANDS: dict[str, Callable[[list[str]], None]] = {f.__name__: f for f in (run, rl, stage, stages, evaluate, controls, bench, submit, chaos, config, doctor)}
+COMMANDS: dict[str, Callable[[list[str]], None]] = {f.__name__: f for f in (run, rl, stage, stages, evaluate, controls, bench, verify, submit, chaos, config, doctor)}
 
 
 def _help() -> str:
@@ -177,7 +192,7 @@ def main() -> None:
         sys.exit(2)
     try:
         COMMANDS[words[0]](words[1:])
-    except (ConfigError, EpisodeError, FleetError, MissingGL, PoolError, TrainingDiverged, OSError) as error:
+    except (ConfigError, EpisodeError, FixtureError, FleetError, MissingGL, PoolError, TrainingDiverged, OSError) as error:
         print(f"worldloop {words[0]}: {error}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -32,6 +31,7 @@ class DiTShape:
         rope_scale: extrapolation of the three position axes.
         max_size: largest positions of the three axes, before patching.
         views: number of view embeddings.
+        concat_padding_mask: whether the network adds its own channel of zeros.
         pose_in_channels, pose_num_attention_heads, pose_attention_head_dim: of the state expert.
     """
 
@@ -47,6 +47,7 @@ class DiTShape:
     rope_scale: tuple[float, float, float] = (1.0, 3.0, 3.0)
     max_size: tuple[int, int, int] = (128, 240, 240)
     views: int = 3
+    concat_padding_mask: bool = True
     pose_in_channels: int = 16
     pose_num_attention_heads: int = 16
     pose_attention_head_dim: int = 32
@@ -91,14 +92,6 @@ def rotate(x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
     return (x.float() * cos + torch.cat((-second, first), -1).float() * sin).to(x.dtype)
 
 
-def rotate_pairs(x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
-    """Apply rotary positions to x [..., L, size], pairing neighbouring channels."""
-    cos, sin = rope
-    even, odd = x.unflatten(-1, (-1, 2)).unbind(-1)
-    turned = torch.stack((-odd, even), -1).flatten(-2)
-    return (x.float() * cos + turned.float() * sin).to(x.dtype)
-
-
 class RMSNorm(nn.Module):
     """Root-mean-square norm with a weight (Zhang & Sennrich 2019), computed in float32."""
 
@@ -124,22 +117,22 @@ class Attention(nn.Module):
         bias: on all projections.
     """
 
-    def __init__(self, width: int, heads: int, head_dim: int, context: int | None = None, bias: bool = False, eps: float = 1e-6):
+    def __init__(self, width: int, heads: int, head_dim: int, context: int | None = None, bias: bool = False):
         super().__init__()
         inner = heads * head_dim
         self.heads = heads
         self.to_q = nn.Linear(width, inner, bias=bias)
         self.to_k = nn.Linear(context or width, inner, bias=bias)
         self.to_v = nn.Linear(context or width, inner, bias=bias)
-        self.norm_q, self.norm_k = RMSNorm(head_dim, eps), RMSNorm(head_dim, eps)
+        self.norm_q, self.norm_k = RMSNorm(head_dim, 1e-5), RMSNorm(head_dim, 1e-5)
         self.to_out = nn.ModuleList([nn.Linear(inner, width, bias=bias)])
 
-    def forward(self, x: Tensor, context: Tensor | None = None, rope: tuple[Tensor, Tensor] | None = None, turn: Any = rotate) -> Tensor:
+    def forward(self, x: Tensor, context: Tensor | None = None, rope: tuple[Tensor, Tensor] | None = None) -> Tensor:
         source = x if context is None else context
         q, k, v = (layer(y).unflatten(-1, (self.heads, -1)).transpose(1, 2) for layer, y in ((self.to_q, x), (self.to_k, source), (self.to_v, source)))
         q, k = self.norm_q(q), self.norm_k(k)
         if rope is not None:
-            q, k = turn(q, rope), turn(k, rope)
+            q, k = rotate(q, rope), rotate(k, rope)
         out = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
         return self.to_out[0](out.transpose(1, 2).flatten(2))
 
@@ -251,7 +244,7 @@ class StateBlock(nn.Module):
 
     def forward(self, x: Tensor, context: Tensor, temb: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
         shift1, scale1, gate1, shift2, scale2, gate2 = (self.scale_shift_table + temb.unflatten(-1, (6, -1))).unbind(-2)
-        x = x + gate1 * self.attn1(rms(x) * (1 + scale1) + shift1, rope=rope, turn=rotate_pairs)
+        x = x + gate1 * self.attn1(rms(x) * (1 + scale1) + shift1, rope=rope)
         x = x + self.attn2(x, context)
         return x + gate2 * self.ff(rms(x) * (1 + scale2) + shift2)
 
@@ -267,7 +260,7 @@ class MultiViewDiT(nn.Module):
         super().__init__()
         self.shape = shape
         width, patch = shape.width, math.prod(shape.patch_size)
-        self.patch_embed = nn.ModuleDict({"proj": nn.Linear((shape.in_channels + 1) * patch, width, bias=False)})
+        self.patch_embed = nn.ModuleDict({"proj": nn.Linear((shape.in_channels + shape.concat_padding_mask) * patch, width, bias=False)})
         self.time_embed = _VideoTime(width)
         self.view_embed = nn.Parameter(torch.randn(shape.views, width) * 0.02)
         self.view_ada = nn.Sequential(nn.SiLU(), nn.Linear(width, 3 * width))
@@ -297,7 +290,7 @@ class MultiViewDiT(nn.Module):
         """
         batch, _, frames, height, width = latents.shape
         pt, ph, pw = self.shape.patch_size
-        padding = latents.new_zeros(batch, 1, frames, height, width)
+        padding = latents.new_zeros(batch, int(self.shape.concat_padding_mask), frames, height, width)
         x = torch.cat((latents, padding), 1).reshape(batch, -1, frames // pt, pt, height // ph, ph, width // pw, pw)
         grid = (frames // pt, height // ph, width // pw)
         x = self.patch_embed["proj"](x.permute(0, 2, 4, 6, 1, 3, 5, 7).flatten(4).flatten(1, 3))
@@ -318,30 +311,35 @@ class MultiViewDiT(nn.Module):
         video = x.permute(0, 7, 1, 6, 2, 4, 3, 5).flatten(6, 7).flatten(4, 5).flatten(2, 3)
         return video, self.video_buffer_norm(fused)
 
-    def decode_states(self, states: Tensor, timestep: Tensor, features: Tensor, views: int) -> Tensor:
+    def decode_states(self, states: Tensor, timestep: Tensor, features: Tensor, views: int, mask: Tensor | None = None) -> Tensor:
         """One denoising step of the joint states.
 
         Args:
             states: [B, N, 16] history and future tokens; timestep: [B, N] noise level of each.
             features: [B * V, L, width] from `forward`.
+            mask: [B, N, 16] of the numbers that the robot has, 1, and has not, 0; the latter are neither seen nor moved.
 
         Returns:
             velocity [B, N, 16].
         """
         batch, count = states.shape[:2]
         context = features.unflatten(0, (batch, views)).flatten(1, 2)
-        x = self.pose_proj_in(states)
+        x = self.pose_proj_in(states if mask is None else states * mask)
         temb, embedded = (part.unflatten(0, (batch, count)) for part in self.pose_time_embed(timestep.reshape(-1)))
         rope = state_rope(count, self.shape.pose_attention_head_dim, states.device)
         for block in self.pose_blocks:
             x = block(x, context, temb, rope)
         shift, scale = (self.pose_scale_shift_table + embedded[:, :, None]).unbind(2)
         x = F.layer_norm(x, (x.shape[-1],), eps=1e-6) * (1 + scale) + shift
-        return self.pose_proj_out(x)
+        out = self.pose_proj_out(x)
+        return out if mask is None else out * mask
 
 
 def state_rope(count: int, size: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Cosines and sines [count, size] of one-axis rotary positions over a base length of 57 tokens."""
+    """Cosines and sines [count, size] of one-axis rotary positions over a base length of 57 tokens.
+
+    Angles are laid out for neighbouring channels, while `rotate` pairs halves; the released weights were trained so.
+    """
     place = torch.arange(count, device=device, dtype=torch.float32) / _STATE_ROPE_LENGTH
     rates = 10000.0 ** torch.linspace(0.0, 1.0, size // 2, device=device) * math.pi / 2
     angles = ((place * 2 - 1)[:, None] * rates).repeat_interleave(2, -1)
