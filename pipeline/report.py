@@ -110,6 +110,7 @@ def build_report(cfg: Mapping[str, Any], found: Found, result: Mapping[str, Any]
         "<h2>How far to trust the simulator</h2><p class=dim>Held-out episodes rolled out from their first frame under their true actions; 'stick' is the error of the colour locator itself on true video.</p>" + _rollout_table(result),
         "<h2>How far to trust the judge</h2>" + _judge_table(result),
         "<h2>Where the time went</h2>" + _time_table(result),
+        "<h2>Hosts and learner</h2><p class=dim>While learning in imagination, means over the iterations of a round.</p>" + _hosts_table(found, rounds),
         f"<h2>Config</h2><details><summary class=dim>resolved config</summary><pre>{html.escape(json.dumps(cfg, indent=1, default=str))}</pre></details>",
     ]
     page = f"<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'><title>{html.escape(str(result['name']))} · Worldloop</title><style>{_STYLE}</style><main>{''.join(parts)}</main></html>"
@@ -188,6 +189,23 @@ def _time_table(result: Mapping[str, Any]) -> str:
     total = sum(result["stage_seconds"].values())
     rows = [[name, f"{seconds:.1f} s", f"{100 * seconds / max(total, 1e-9):.1f}%"] for name, seconds in result["stage_seconds"].items()]
     return _table(["stage", "time", "share"], [*rows, ["<b>total</b>", f"<b>{total:.0f} s</b>", ""]])
+
+
+def _hosts_table(found: Found, rounds: int) -> str:
+    rows = []
+    for number in range(1, rounds + 1):
+        metrics = read_metrics(found[f"rl-{number}"])
+        mean = {key.removeprefix("rl/"): sum(row[key] for row in metrics) / len(metrics) for key in metrics[0]} if metrics else {}
+        books = _result(found, f"rl-{number}").get("books", {})
+        if not mean or not books:
+            continue
+        dropped = ", ".join(f"{count} {html.escape(reason)}" for reason, count in books["dropped"].items()) or "none"
+        shares = (mean["time/actors_idle_share"], mean["time/forward_share"])
+        rows.append(
+            [f"round {number}", str(books["asked"]), str(books["learned"]), dropped, f"{mean['time/rollout']:.1f} s", f"{mean['time/update']:.1f} s", *(f"{100 * share:.0f}%" for share in shares)]
+            + [f"{mean['time/sync_ms']:.1f} ms", f"{mean['wire_bytes'] / 2**20:.1f} MiB", f"{mean['policy_lag']:.1f}"]
+        )
+    return _table(["", "episodes asked", "learned from", "dropped", "rollout", "update", "hosts idle", "in networks", "weights sent", "on the wire", "policy lag"], rows)
 
 
 def read_metrics(folder: Path) -> list[dict[str, float]]:
