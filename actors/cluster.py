@@ -109,8 +109,8 @@ def connect(launch: Mapping[str, Any]) -> list[Mapping[str, float]]:
         ConfigError: if the cluster cannot be reached, refuses the token, or has other versions.
     """
     if not ray.is_initialized():
+        _knock(str(launch["address"]))
         try:
-            _knock(str(launch["address"]))
             if launch["address"] == "local":
                 cpus = launch["cpus"] or None
                 store = int(launch["object_store_mb"]) * 2**20
@@ -130,16 +130,23 @@ def _knock(address: str) -> None:
     """Fail in seconds where nobody listens; Ray itself tries for minutes."""
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     if colon and port.isdigit():
-        socket.create_connection((host, int(port)), timeout=5).close()
+        try:
+            socket.create_connection((host, int(port)), timeout=5).close()
+        except OSError as error:
+            raise ConfigError(f"launch.address={address} cannot be reached ({error}); is `ray start --head` running there, and the port open?") from error
 
 
 def _advice(address: str, error: Exception) -> str:
-    text = str(error)
-    if "token" in text.lower() or "unauthenticated" in text.lower():
-        return f"launch.address={address}: the cluster refused our token; copy ~/.ray/auth_token of the head node to this machine, or set RAY_AUTH_MODE=disabled everywhere on a network you trust ({text.splitlines()[0]})"
-    if "version" in text.lower():
-        return f"launch.address={address}: {text.splitlines()[0]}; install the versions of constraints.txt on every node"
-    return f"launch.address={address} cannot be reached; is `ray start --head` running there, and the port open? ({type(error).__name__}: {text.splitlines()[0] if text else ''})"
+    said = str(error).splitlines()[0] if str(error) else ""
+    if "version" in said.lower():
+        return f"launch.address={address}: {said}; install the versions of constraints.txt on every node"
+    if isinstance(error, ConnectionError) or "token" in said.lower() or "unauthenticated" in said.lower():
+        # Ray logs InvalidAuthToken and then only says that it could not connect.
+        return (
+            f"launch.address={address} listens, but does not let us in; most often it refused our token: copy ~/.ray/auth_token of the head node to this machine, "
+            f"or set RAY_AUTH_MODE=disabled everywhere on a network you trust ({type(error).__name__}: {said})"
+        )
+    return f"launch.address={address}: {type(error).__name__}: {said}; see /tmp/ray/session_latest/logs"
 
 
 def _compare(nodes: int) -> None:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
+import socket
 import subprocess
 import sys
+import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -47,16 +52,25 @@ def test_a_lost_node_costs_no_job(recipe: Recipe) -> None:
         cluster.shutdown()
 
 
-def test_a_wrong_token_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("RAY_AUTH_MODE", "token")
-    monkeypatch.setenv("RAY_AUTH_TOKEN", "a" * 64)
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+def test_a_wrong_token_is_named() -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    mine, wrong = ({**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": letter * 64} for letter in "ab")
+    command = [str(Path(sys.executable).with_name("ray")), "start", "--head", "--block", f"--port={port}", "--num-cpus=1", "--include-dashboard=false", "--node-ip-address=127.0.0.1", "--disable-usage-stats"]
+    head = subprocess.Popen(command, env=mine, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
-        script = f"from actors.cluster import connect; connect({{'address': '{cluster.address}'}})"
-        stranger = subprocess.run([sys.executable, "-c", script], env={**os.environ, "RAY_AUTH_TOKEN": "b" * 64}, capture_output=True, text=True, timeout=240)
-        assert "refused our token" in stranger.stderr and "auth_token" in stranger.stderr
+        for _ in range(120):
+            time.sleep(0.5)
+            with contextlib.suppress(OSError):
+                socket.create_connection(("127.0.0.1", port), timeout=1).close()
+                break
+        script = f"from actors.cluster import connect; connect({{'address': '127.0.0.1:{port}'}})"
+        stranger = subprocess.run([sys.executable, "-c", script], env=wrong, capture_output=True, text=True, timeout=240)
+        assert "refused our token" in stranger.stderr and "auth_token" in stranger.stderr, stranger.stderr[-2000:]
     finally:
-        cluster.shutdown()
+        os.killpg(head.pid, signal.SIGKILL)
+        head.wait()
 
 
 def test_unreachable_clusters_and_other_versions_are_named() -> None:

@@ -19,7 +19,7 @@ from pipeline.demo_world import demo_recipe
 from pipeline.loop import build_loop
 from pipeline.stage_workers import run_stage
 
-WORDS = ["experiment=smoke", "launch=ray", "microbatches=2", "launch.cpus=4", "launch.object_store_mb=200", "launch.learners=2", "rl.shards=1", "imitation.demos=3"]
+WORDS = ["experiment=smoke", "launch=ray", "microbatches=2", "launch.cpus=4", "launch.object_store_mb=200", "launch.learners=2", "rl.shards=1", "imitation.demos=3", "evaluate.episodes=4", "evaluate.envs=4"]
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def losses(folder: Path, name: str) -> list[float]:
     return [json.loads(line)[name] for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
-def test_two_learners_write_what_one_writes(cluster: None, tmp_path: Path) -> None:
+def test_two_learners_and_an_evaluator_do_what_one_process_does(cluster: None, tmp_path: Path) -> None:
     cfg: dict[str, Any] = load_config([*WORDS, "rl.epochs=1", "launch.actors=1"])
     recipe = demo_recipe(cfg, tmp_path / "world", cfg["rl"]["envs"])
     found = {name: Path(path).parent for name, path in (("policy", recipe.policy), ("vision", recipe.simulator), ("state", recipe.decoder), ("judge", recipe.judge))}
@@ -48,6 +48,11 @@ def test_two_learners_write_what_one_writes(cluster: None, tmp_path: Path) -> No
     weights = load_file(alone / "weights.safetensors")
     for name, value in load_file(both / "weights.safetensors").items():
         torch.testing.assert_close(value, weights[name], rtol=1e-3, atol=2e-4)
+    here, there = tmp_path / "here", tmp_path / "there"
+    here.mkdir(), there.mkdir()
+    said = run_stage("evaluate_physics", cfg, there, {"policy": found["policy"]}, {"policy": "policy"})
+    assert said["successes"] == work.evaluate_physics(cfg, here, {"policy": found["policy"]}, policy="policy")["successes"]
+    assert (there / "outcomes.pt").exists()
 
 
 def test_microbatches_must_fit_the_learners(tmp_path: Path) -> None:
