@@ -97,6 +97,7 @@ class Host:
         self._judging = next((t for t in transforms if isinstance(t, JudgeReward)), None)
         self.meter = Meter()
         self.meter.watch(policy, "forward")
+        self.meter.watch(policy.perception, "forward")  # calls within calls count once
         for transform in transforms:  # none in physics
             if isinstance(transform, StateExpertTransform):
                 self.meter.watch(transform.decoder, "decode")
@@ -104,6 +105,8 @@ class Host:
                 self.meter.watch(transform.judge, "score")
         if self._judging is not None:
             self.meter.watch(self.base.simulator, "predict")
+            self.meter.watch(self.base.simulator.places, "find")
+            self.meter.watch(self.base.simulator.places, "push")
         self._collect()
         seen = {key for key in policy.trained.in_keys if isinstance(key, tuple)}
         self._keys: list[NestedKey] = [*sorted(seen | {STATE, SEEN}), CHUNK, LOG_PROB, SPOILED, EPISODE]

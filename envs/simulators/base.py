@@ -181,7 +181,7 @@ class Simulator(nn.Module):
             [batch],
         )
         frames, features = self.predict(inputs)
-        pictures = (frames.clamp(0, 1) * 255).round().to(torch.uint8)
+        pictures = frames.clamp(0, 1).mul_(255).round_().to(torch.uint8)  # in place: these are the rollout's largest tensors
         need = int(length.max()) + count
         if need > history.shape[1]:  # room for twice as many chunks, so that long rollouts copy seldom
             room = max(need, 2 * history.shape[1]) - history.shape[1]
