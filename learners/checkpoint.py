@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,9 @@ class Checkpoints:
             shutil.rmtree(part, ignore_errors=True)
         _wait()
         try:
-            dcp.save(dict(tensors), checkpoint_id=part, no_dist=workers() == 1)
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", message="torch.distributed is disabled")  # as it is meant to be
+                dcp.save(dict(tensors), checkpoint_id=part, no_dist=workers() == 1)
             if leads():
                 (part / "facts.json").write_text(json.dumps(dict(facts)))
         except (OSError, RuntimeError, CheckpointException) as error:
@@ -83,7 +86,9 @@ class Checkpoints:
         if path is None:
             return None
         try:
-            dcp.load(dict(tensors), checkpoint_id=path, no_dist=workers() == 1)
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", message="torch.distributed is disabled")
+                dcp.load(dict(tensors), checkpoint_id=path, no_dist=workers() == 1)
         except (CheckpointException, RuntimeError, ValueError, KeyError) as error:
             last = str(error).strip().splitlines()[-1]
             raise RuntimeError(f"{path} belongs to another architecture: {last}. Remove the folder or restore the config.") from error
