@@ -184,8 +184,10 @@ class Simulator(nn.Module):
         pictures = frames.clamp(0, 1).mul_(255).round_().to(torch.uint8)  # in place: these are the rollout's largest tensors
         need = int(length.max()) + count
         if need > history.shape[1]:  # room for twice as many chunks, so that long rollouts copy seldom
-            room = max(need, 2 * history.shape[1]) - history.shape[1]
-            history = torch.cat([history, torch.zeros_like(history[:, :1]).expand(batch, room).clone()], 1)
+            grown = history.new_empty(batch, max(need, 2 * history.shape[1]))  # rows past a session's length are never read
+            for name, value in history.items():
+                grown[name][:, : history.shape[1]] = value
+            history = grown
         at = length[:, None] + torch.arange(count, device=length.device)
         new = {"frames": pictures, "pose_map": pose_map, "c2w": c2w, "commands": commands, "states": now["states"][:, None].expand(-1, count, -1), "places": ahead}
         for name, value in new.items():
