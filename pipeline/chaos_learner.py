@@ -43,8 +43,8 @@ def plague(fleet: RayFleet, section: dict[str, Any], seed: int, events: Path) ->
         with contextlib.suppress(Exception):  # what it wanted to kill may have died just now
             if kind == "ray.kill":
                 fleet.kill(chance.randrange(fleet.size))
-            elif kind == "SIGKILL" and fleet.processes:
-                os.kill(chance.choice(fleet.processes), signal.SIGKILL)
+            elif kind == "SIGKILL":
+                os.kill(chance.choice(fleet.processes), signal.SIGKILL)  # raises, and is not written down, while no host is built
             elif kind == "judge":
                 fleet.kill_attached()
             else:
