@@ -66,7 +66,7 @@ class Plan:
             ConfigError: naming the role, what it needs and what there is.
         """
         free = [dict(node) for node in nodes]
-        # The largest first, as a packer would; a fit found this way is one that Ray finds too.
+        # The largest first, as a packer would.
         wanted = sorted(((role, k) for role in ROLES for k in range(self.counts[role])), key=lambda item: (-self.gpus[item[0]], -self.cpus[item[0]]))
         for role, number in wanted:
             need = {"CPU": self.cpus[role], "GPU": self.gpus[role]}
