@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import socket
 from collections.abc import Mapping
@@ -15,6 +14,7 @@ import torch
 
 from actors.factory import ConfigError
 from actors.reaper import reap_after_me
+from envs.physics.pool import available_cores
 
 ROLES = ("learner", "actors", "judge", "evaluator")
 
@@ -171,4 +171,4 @@ def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str]) -> None:
 
 def threads_of(cpus: float) -> int:
     """Threads of a process with that share of CPUs; one at least."""
-    return max(1, int(cpus)) if cpus else max(1, (os.cpu_count() or 1))
+    return max(1, int(cpus)) if cpus else available_cores()
