@@ -72,11 +72,6 @@ class Books:
         """Episodes dropped because something failed; not those that came too late or were not needed any more."""
         return sum(count for reason, count in self.dropped.items() if reason not in HARMLESS)
 
-    @property
-    def balanced(self) -> bool:
-        """Whether every episode asked for is accounted for."""
-        return self.asked == self.learned + sum(self.dropped.values())
-
 
 class Fleet(Protocol):
     """Runs jobs with the newest published weights."""
@@ -93,8 +88,8 @@ class Fleet(Protocol):
         """Queue a job."""
         ...
 
-    def take(self, wait: bool = True) -> Result | None:
-        """A finished job; without `wait` only if there is one already.
+    def take(self) -> Result:
+        """A finished job; waits for one.
 
         Raises:
             FleetError: if nobody is left to wait for.
@@ -129,14 +124,10 @@ class LocalFleet:
         """See Fleet.submit."""
         self._queue.append(job)
 
-    def take(self, wait: bool = True) -> Result | None:
+    def take(self) -> Result:
         """See Fleet.take."""
         if not self._queue:
-            if wait:
-                raise FleetError("nothing was submitted, so there is nothing to wait for")
-            return None
-        if not wait:
-            return None  # running it would make the caller wait
+            raise FleetError("nothing was submitted, so there is nothing to wait for")
         watch = Stopwatch()
         job, (version, weights) = self._queue.popleft(), self._newest
         if self.host.version != version:

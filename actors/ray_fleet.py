@@ -137,14 +137,12 @@ class RayFleet:
             self._queue.append(job)
             self._changed.notify_all()
 
-    def take(self, wait: bool = True) -> Result | None:
+    def take(self) -> Result:
         """See Fleet.take."""
         with self._changed:
             while not self._done:
                 if self._error is not None:
                     raise self._error
-                if not wait:
-                    return None
                 if not self._queue and not any(m.job for m in self._members):
                     raise FleetError("nothing was submitted, so there is nothing to wait for")
                 self._changed.wait(1.0)

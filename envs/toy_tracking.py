@@ -37,6 +37,7 @@ class ToyTrackingEnv(ChunkedEnv):
     ):
         super().__init__(batch, chunk, chunk * decisions, 1, (size, size), ActionMode.ABSOLUTE, seed=seed, states=2 * actions, actions=actions)
         self.toy = ToyVLAEnv(actions, 2 * actions, (3, size, size), success_steps=success_steps, success_tol=tolerance, batch_size=torch.Size([batch]), seed=seed)
+        self._state = torch.zeros(batch, 2 * actions)
         self.targets = torch.rand(starts, actions, generator=torch.Generator().manual_seed(targets)) - 0.5
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
@@ -45,8 +46,8 @@ class ToyTrackingEnv(ChunkedEnv):
         self.toy.reset(TensorDict({"_reset": mask[:, None]}, self.batch_size))
         target = self.toy.get_buffer("_target")
         target[mask] = self.targets[seeds[mask] % len(self.targets)]
-        self._steps[mask], self._over[mask] = 0, False
-        self._state = torch.where(mask[:, None], torch.cat((torch.zeros_like(target), target), -1), getattr(self, "_state", torch.zeros(1)))
+        self._steps[mask] = 0
+        self._state = torch.where(mask[:, None], torch.cat((torch.zeros_like(target), target), -1), self._state)
         image = torch.randint(0, 256, self.observation_spec[IMAGE].shape, dtype=torch.uint8, generator=self._stream)
         return self._observed(image, torch.zeros(*self.batch_size, 1, dtype=torch.bool))
 

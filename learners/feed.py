@@ -66,7 +66,6 @@ class Feed:
     def _take(self) -> Result:
         watch = Stopwatch()
         result = self.fleet.take()
-        assert result is not None
         self.idle += watch.read()
         return result
 

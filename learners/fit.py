@@ -23,7 +23,6 @@ from envs.precision import mixed_precision
 from learners.checkpoint import Checkpoints, adam_moments, buffers_of, truncate_log
 from learners.parallel import Trainee, averaged, clip_gradients, leads, local, my_share, twin
 
-Loss = Callable[[int, torch.Generator], tuple[Tensor, dict[str, Any]]]
 Batch = Callable[[int, torch.Generator], Any]
 
 

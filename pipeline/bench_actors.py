@@ -58,7 +58,7 @@ def _measure(name: str, fleet: Fleet, recipe: Recipe) -> float:
         for _ in range(jobs):
             fleet.submit(Job(number, tuple(range(_EPISODES)), number))
             number += 1
-        results = [result for result in (fleet.take() for _ in range(jobs)) if result is not None and result.batch is not None]
+        results = [result for result in (fleet.take() for _ in range(jobs)) if result.batch is not None]
         return results, time.perf_counter() - began
 
     while isinstance(fleet, RayFleet) and len(fleet.processes) < fleet.size:

@@ -30,7 +30,7 @@ def entrypoint(words: Sequence[str]) -> str:
     return shlex.join(["python", "-m", "pipeline", *words, *([] if address else ["launch.address=auto"])])
 
 
-def submit(address: str, words: Sequence[str], follow: bool = True) -> str:
+def submit(address: str, words: Sequence[str]) -> str:
     """Submit, print the job's log as it grows, and return the job's id.
 
     Args:
@@ -48,7 +48,7 @@ def submit(address: str, words: Sequence[str], follow: bool = True) -> str:
         raise ConfigError(f"{address} takes no jobs: {str(error).splitlines()[0]}. Is the dashboard on (ray start --head --dashboard-host ...), and is ~/.ray/auth_token the head node's?") from error
     tqdm.write(f"job {job}: {command}\nstop it with: ray job stop {job} --address {address}")
     shown = 0
-    while follow:
+    while True:
         log = client.get_job_logs(job)
         tqdm.write(log[shown:], end="")
         shown = len(log)
