@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import pytest
-import torch
 
-from actors.factory import build_judge, build_policy, build_simulator, build_state_decoder
 from actors.recipe import Recipe
-from pipeline.artefact import save_weights
 from pipeline.config import load_config
+from pipeline.demo_world import demo_recipe
 
 
 @pytest.fixture(scope="session")
@@ -21,15 +19,6 @@ def cfg() -> dict[str, Any]:
 
 
 @pytest.fixture(scope="session")
-def recipe(cfg: dict[str, Any], dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Recipe:
+def recipe(cfg: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Recipe:
     """An imagined world of untrained networks: what it shows is poor, but it shows the same to everybody."""
-    torch.manual_seed(0)
-    root = tmp_path_factory.mktemp("weights")
-    simulator = build_simulator(cfg)
-    parts = {"policy": build_policy(cfg), "simulator": simulator, "decoder": build_state_decoder(cfg, simulator), "judge": build_judge(cfg)}
-    paths = {}
-    for name, module in parts.items():
-        (root / name).mkdir()
-        save_weights(module, root / name)
-        paths[name] = str(root / name / "weights.safetensors")
-    return Recipe(cfg, 4, paths["policy"], paths["simulator"], paths["decoder"], paths["judge"], (str(dataset),), freeze_perception=True, threads=1)
+    return replace(demo_recipe(cfg, tmp_path_factory.mktemp("world"), 4, starts=8), threads=1)
