@@ -15,6 +15,8 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV) || { echo "python venv is missing: sudo apt-get install -y python3-venv"; exit 1; }
 	$(BIN)/python -m pip install --upgrade pip --quiet
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[dev]"
+	# openpi's client asks for an old numpy, which nothing in it needs; its real needs are ours.
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps openpi-client==0.1.2
 	touch $@
 
 # OpenGL in software, for rendering without a screen. Installed where we may, else the line to type is printed.

@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from tqdm import tqdm
 
+from actors.policies.openpi import OpenPIPolicy
 from envs.schema import JUDGE_STATUS, PROGRESS, SUCCESS, Status
 
 
@@ -53,6 +54,8 @@ def evaluate(env: EnvBase, policy: TensorDictModuleBase, seeds: list[int], stoch
             part = seeds[begin : begin + width]
             base.schedule([*part, *[part[-1]] * (width - len(part))])
             now = env.reset()
+            if isinstance(policy, OpenPIPolicy):
+                policy.instructions = base.instructions  # it reads words, of which the rollout carries tokens only
             over = torch.zeros(width, dtype=torch.bool)
             won = torch.zeros(width, dtype=torch.bool)
             fine = torch.ones(width, dtype=torch.bool)

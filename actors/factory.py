@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -18,8 +18,13 @@ from torchrl.envs import TransformedEnv
 from actors.policies.chunk_gaussian import ChunkGaussianHead
 from actors.policies.chunk_tokens import ChunkTokenHead
 from actors.policies.heads import Head
+from actors.policies.openpi import OpenPIPolicy
 from actors.policies.vla import ChunkPolicy
+from envs.conditioning import PoseMapStyle
+from envs.episodes.clips import ClipStore
 from envs.judges import Judge, LearnedJudge
+from envs.kinematics import Kinematics, KinematicsError, Robot
+from envs.layouts import CommandLayout
 from envs.physics.bench import BenchConfig, frames_held
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import available_cores
@@ -100,7 +105,29 @@ def bench_config(cfg: Mapping[str, Any]) -> BenchConfig:
 def world_shape(cfg: Mapping[str, Any]) -> WorldShape:
     """What every simulator of this config shows."""
     task = cfg["task"]
-    return WorldShape(len(task["views"]), tuple(task["size"]), task["chunk"], cfg["simulator"]["memory"], task["control_hz"], cfg["simulator"]["objects"])
+    return WorldShape(len(task["views"]), tuple(task["size"]), task["chunk"], cfg["simulator"]["memory"], task["control_hz"], cfg["simulator"]["objects"], CommandLayout(cfg["simulator"]["layout"]))
+
+
+def pose_style(cfg: Mapping[str, Any]) -> PoseMapStyle:
+    """How this config's pose maps are drawn."""
+    return options(PoseMapStyle, cfg["simulator"]["pose_map"], "simulator.pose_map")
+
+
+def build_kinematics(cfg: Mapping[str, Any]) -> Kinematics | None:
+    """Forward kinematics of the robot, if simulator.kinematics says which."""
+    robot = cfg["simulator"]["kinematics"]
+    if robot is None:
+        return None
+    nested = {name: tuple(tuple(arm) for arm in value) if name == "joints" else value for name, value in robot.items()}
+    try:
+        return Kinematics(options(Robot, nested, "simulator.kinematics"))
+    except KinematicsError as error:
+        raise ConfigError(str(error)) from error
+
+
+def open_clips(cfg: Mapping[str, Any], folders: Iterable[Path]) -> ClipStore:
+    """Data sets as one store, with the commands and pose maps that the simulator takes."""
+    return ClipStore(list(folders), CommandLayout(cfg["simulator"]["layout"]), pose_style(cfg))
 
 
 def build_simulator(cfg: Mapping[str, Any], weights: Path | None = None) -> Simulator:
@@ -114,21 +141,45 @@ def build_simulator(cfg: Mapping[str, Any], weights: Path | None = None) -> Simu
         from envs.simulators.dit_world import DiTConfig, DiTSimulator
 
         model = DiTSimulator(shape, options(DiTConfig, section, "simulator.model"))
+    elif engine == "gesim":
+        from envs.simulators.gesim import GESimConfig, GESimulator
+
+        try:
+            model = GESimulator.build(shape, options(GESimConfig, section, "simulator.model"), cfg["simulator"]["checkpoint"])
+        except ValueError as error:
+            raise ConfigError(f"simulator.model: {error}") from error
+    elif engine == "remote":
+        from envs.simulators.remote import RemoteConfig, RemoteSimulator
+
+        return RemoteSimulator(shape, options(RemoteConfig, section, "simulator.model"))
     else:
-        raise ConfigError(f"simulator.engine={engine!r} is unknown; choose unet or dit")
+        raise ConfigError(f"simulator.engine={engine!r} is unknown; choose unet, dit, gesim or remote")
     return load(model, weights).to(device_of(cfg))
 
 
 def build_state_decoder(cfg: Mapping[str, Any], simulator: Simulator, weights: Path | None = None) -> StateDecoder:
     """What decodes joint states from that simulator's features."""
-    shape = simulator.shape
-    if cfg["simulator"]["engine"] == "unet":
+    shape, engine = simulator.shape, cfg["simulator"]["engine"]
+    if engine == "unet":
         decoder: StateDecoder = StateHead(simulator.feature_shape[0], shape.chunk, shape.memory)
-    else:
-        from envs.simulators.state_flow import StateExpert, StateExpertConfig
+    elif engine == "remote":
+        from envs.simulators.remote import GivenStates
 
-        decoder = StateExpert(simulator.feature_shape, shape.chunk, shape.memory, options(StateExpertConfig, cfg["simulator"]["state"], "simulator.state"))
-    return load(decoder, weights).to(device_of(cfg))
+        return GivenStates(shape.chunk)
+    elif engine == "gesim":
+        from envs.simulators.gesim import GESimulator
+
+        assert isinstance(simulator, GESimulator)
+        decoder = simulator.state_expert()
+    else:
+        from envs.simulators.dit_world import DiTSimulator
+        from envs.simulators.state_flow import StateExpertConfig, untrained_expert
+
+        assert isinstance(simulator, DiTSimulator)
+        decoder = untrained_expert(simulator, options(StateExpertConfig, cfg["simulator"]["state"], "simulator.state"))
+    decoder = load(decoder, weights).to(device_of(cfg))
+    decoder.attach(simulator)
+    return decoder
 
 
 def build_judge(cfg: Mapping[str, Any], weights: Path | None = None) -> LearnedJudge:
@@ -151,6 +202,13 @@ def build_policy(cfg: Mapping[str, Any], weights: Path | None = None) -> ChunkPo
     return load(ChunkPolicy(len(cfg["task"]["views"]), head, section["width"], section["points"]), weights)
 
 
+def build_openpi(cfg: Mapping[str, Any], url: str) -> OpenPIPolicy:
+    """An openpi server as a policy for the worlds of this config; the bench's own kinematics stand in where none are named."""
+    layout = CommandLayout(cfg["simulator"]["layout"])
+    kinematics = build_kinematics(cfg) or (Kinematics() if layout is CommandLayout.EEF else None)
+    return OpenPIPolicy(url, tuple(cfg["task"]["views"]), cfg["task"]["chunk"], layout, ActionMode(cfg["task"]["mode"]), kinematics)
+
+
 def build_physics(cfg: Mapping[str, Any], batch: int, record: bool = False, seed: int = 0) -> PhysicsEnv:
     """The true world."""
     task = cfg["task"]
@@ -165,7 +223,7 @@ def build_world(cfg: Mapping[str, Any], simulator: Simulator, decoder: StateDeco
     simulator.eval(), decoder.eval(), judge.eval()
     base = WorldEnv(simulator, starts, batch, task["horizon"], ActionMode(task["mode"]), cfg["simulator"]["shared_noise"], cfg["simulator"]["bf16"], seed)
     rewards = options(Rewards, cfg["judge"]["rewards"], "judge.rewards")
-    return TransformedEnv(base, world_transforms(decoder, judge, rewards, tuple(task["views"]), later))
+    return TransformedEnv(base, world_transforms(decoder, judge, rewards, tuple(task["views"]), later, pose_style(cfg), build_kinematics(cfg)))
 
 
 def load(module: T, weights: Path | None) -> T:

@@ -7,9 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from actors.factory import ConfigError, build_judge, build_physics, build_policy, build_simulator, build_state_decoder, build_world, options, prepare_process
+from actors.factory import ConfigError, build_judge, build_physics, build_policy, build_simulator, build_state_decoder, build_world, open_clips, options, prepare_process
 from actors.rollouts import Host
-from envs.episodes.clips import ClipStore
 from envs.judges import Judge
 from envs.world import Starts
 
@@ -74,7 +73,7 @@ def build_host(recipe: Recipe) -> Host:
         referee: Judge = JudgeClient(recipe.service, options(ServiceConfig, cfg["launch"]["service"], "launch.service"))
     else:
         referee = build_judge(cfg, Path(recipe.judge))
-    starts = Starts.of(ClipStore([Path(folder) for folder in recipe.data]))
+    starts = Starts.of(open_clips(cfg, [Path(folder) for folder in recipe.data]))
     return Host(build_world(cfg, simulator, decoder, referee, starts, recipe.episodes, recipe.later), policy, recipe.bootstrap)
 
 

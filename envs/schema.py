@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 from torchrl.data.vla import ACTION_CHUNK_KEY, IMAGE_KEY, STATE_KEY
 
+from envs.layouts import CommandLayout
+
 ACTION_DIM = 14  # [x, y, z, roll, pitch, yaw, gripper] of the left, then the right arm; metres, radians, 0 open..1 closed
 STATE_DIM = 16  # [left joints 7, left gripper, right joints 7, right gripper]; radians, 0 open..1 closed
 
@@ -66,14 +68,14 @@ def to_relative(commands: Tensor, command: Tensor) -> Tensor:
     return commands - command.unsqueeze(-2)
 
 
-def check_chunk(chunk: Tensor) -> None:
+def check_chunk(chunk: Tensor, layout: CommandLayout = CommandLayout.EEF) -> None:
     """Refuse chunks of the wrong width or with NaN.
 
     Raises:
         ValueError: naming what is wrong.
     """
-    if chunk.shape[-1] != ACTION_DIM:
-        raise ValueError(f"an action chunk is [..., K, {ACTION_DIM}] = [x,y,z,roll,pitch,yaw,g]x2, got {tuple(chunk.shape)}")
+    if chunk.shape[-1] != layout.size:
+        raise ValueError(f"an action chunk is [..., K, {layout.size}] = {'[x,y,z,roll,pitch,yaw,g]x2' if layout is CommandLayout.EEF else '[L7,Lg,R7,Rg]'}, got {tuple(chunk.shape)}")
     if not torch.isfinite(chunk).all():
         bad = int((~torch.isfinite(chunk)).sum())
         raise ValueError(f"an action chunk holds {bad} values that are NaN or infinite; the policy has diverged")

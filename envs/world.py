@@ -17,7 +17,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from envs.chunked import ChunkedEnv
 from envs.episodes.clips import ClipStore
 from envs.precision import mixed_precision
-from envs.schema import ACTION_DIM, C2W, CHUNK_C2W, COMMAND, COMMANDS, FEATURES, FRAMES, IMAGE, INTRINSIC, POSE_MAP, PROGRESS, STATE, SUCCESS, ActionMode
+from envs.schema import C2W, CHUNK_C2W, COMMAND, COMMANDS, FEATURES, FRAMES, IMAGE, INTRINSIC, POSE_MAP, PROGRESS, STATE, SUCCESS, ActionMode
 from envs.simulators.base import Simulator
 
 
@@ -25,7 +25,7 @@ from envs.simulators.base import Simulator
 class Starts:
     """First frames of recorded episodes, from which imagined ones begin; N rows.
 
-    image and pose_map uint8 [N, V, 3, H, W], state [N, 16], command [N, 14], intrinsic [N, V, 3, 3], c2w [N, V, 4, 4].
+    image and pose_map uint8 [N, V, 3, H, W], state [N, 16], command [N, A], intrinsic [N, V, 3, 3], c2w [N, V, 4, 4].
     """
 
     image: Tensor
@@ -93,7 +93,7 @@ class WorldEnv(ChunkedEnv):
         if tuple(starts.image.shape[1:]) != (shape.views, 3, *shape.size):
             raise ValueError(f"starts show {tuple(starts.image.shape[1:])}, the simulator {(shape.views, 3, *shape.size)}; train it on these views")
         device = next(simulator.parameters()).device
-        super().__init__(batch, shape.chunk, horizon, shape.views, shape.size, mode, device, seed)
+        super().__init__(batch, shape.chunk, horizon, shape.views, shape.size, mode, device, seed, actions=shape.layout.size)
         self.simulator, self.starts, self.shared_noise, self.bf16 = simulator, starts, shared_noise, bf16
         self.session: TensorDict | None = None
         pictures = (batch, shape.chunk, shape.views, 3, *shape.size)
@@ -102,7 +102,7 @@ class WorldEnv(ChunkedEnv):
         )
         self.action_spec = Composite(
             {
-                COMMANDS: Unbounded((batch, shape.chunk, ACTION_DIM)),
+                COMMANDS: Unbounded((batch, shape.chunk, shape.layout.size)),
                 POSE_MAP: Bounded(0, 255, pictures, dtype=torch.uint8),
                 CHUNK_C2W: Unbounded((batch, shape.chunk, shape.views, 4, 4)),
             },
@@ -117,6 +117,8 @@ class WorldEnv(ChunkedEnv):
         names = {"frames": "image", "intrinsic": "intrinsic", "c2w": "c2w", "command": "command", "state": "state", "pose_map": "pose_map"}
         begin = {key: getattr(self.starts, name)[start].to(self.device) for key, name in names.items()}
         noise = start if self.shared_noise else seeds
+        if self.session is not None:
+            self.simulator.release(self.session, mask)
         fresh = self.simulator.reset(**begin, seed=noise.to(self.device))
         if self.session is None or mask.all():
             self.session = fresh

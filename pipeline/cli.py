@@ -10,12 +10,16 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from actors.factory import ConfigError, build_physics, build_policy, prepare_process
+from actors.factory import ConfigError, build_openpi, build_physics, build_policy, prepare_process
 from actors.fleet import FleetError
+from actors.policies.openpi import PolicyServerError
+from envs.conditioning import PoseMapStyle
 from envs.episodes.episode import EpisodeError
+from envs.episodes.foreign import Cut
 from envs.physics.pool import PoolError
 from envs.physics.render import MissingGL
 from envs.simulators.gesim_fixture import FixtureError
+from envs.simulators.remote import RemoteError
 from learners.fit import TrainingDiverged
 from pipeline import work
 from pipeline.config import load_config
@@ -75,15 +79,15 @@ def stages(words: list[str]) -> None:
 
 
 def evaluate(words: list[str]) -> None:
-    """success of a policy: worldloop evaluate policy=<folder|stage> world=physics|imagined experiment=..."""
+    """success of a policy: worldloop evaluate policy=<folder|stage|openpi url=ws://...> world=physics|imagined experiment=..."""
     from actors.evaluate import evaluate as episodes
 
-    own = {word.split("=", 1)[0]: word.split("=", 1)[1] for word in words if word.startswith(("policy=", "world="))}
+    own = {word.split("=", 1)[0]: word.split("=", 1)[1] for word in words if word.startswith(("policy=", "world=", "url="))}
     cfg = load_config([word for word in words if word.split("=")[0] not in own])
     graph = build_loop(cfg, _root(cfg))
     name = own.get("policy", "imitation")
     folder = graph.folder(name) if name in graph.stages else Path(name)
-    policy = build_policy(cfg, folder / "weights.safetensors")
+    policy: Any = build_openpi(cfg, own.get("url", "")) if name == "openpi" else build_policy(cfg, folder / "weights.safetensors")
     prepare_process(cfg["seed"])
     world = own.get("world", "physics")
     if world == "physics":
@@ -93,7 +97,7 @@ def evaluate(words: list[str]) -> None:
         last = cfg["rounds"]["count"]
         data = ("collect", *(f"deploy-{n}" for n in range(1, last + 1)))
         found = {stage: graph.folder(stage) for stage in graph.stages}
-        store = work.open_store(found, data)
+        store = work.open_store(cfg, found, data)
         seeds = list(range(min(cfg["evaluate"]["imagined"], len(store))))
         env = work.load_world(cfg, found, store, f"vision-{last}", f"state-{last}", f"judge-{last}", min(64, len(seeds)))
     else:
@@ -173,7 +177,47 @@ def controls(words: list[str]) -> None:
     run_controls(cfg, _root(cfg))
 
 
-COMMANDS: dict[str, Callable[[list[str]], None]] = {f.__name__: f for f in (run, rl, stage, stages, evaluate, controls, bench, verify, submit, chaos, config, doctor)}
+def serve(words: list[str]) -> None:
+    """serve a simulator to many sessions by GE-Sim's protocol: worldloop serve simulator=gesim simulator.checkpoint=<folder>"""
+    from actors.serve.app import serve as run_server
+    from pipeline.serving import build_session_host
+
+    cfg = load_config(words)
+    prepare_process(cfg["seed"])
+    host, config = build_session_host(cfg, _root(cfg))
+    print(f"{cfg['simulator']['engine']} at http://{config.host}:{config.port}, up to {config.sessions} sessions; look at it in a browser, end it with Ctrl-C", flush=True)
+    run_server(host, cfg["simulator"]["engine"], config)
+
+
+def _source_and_cut(words: list[str], count: int, usage: str) -> tuple[list[Path], Cut, dict[str, str]]:
+    paths = [Path(word) for word in words if "=" not in word]
+    own = {word.split("=", 1)[0]: word.split("=", 1)[1] for word in words if "=" in word}
+    if len(paths) != count or set(own) - {"frames", "size", "tool_offset"}:
+        raise ConfigError(usage)
+    try:
+        return paths, Cut(int(own.get("frames", 0)), tuple(int(n) for n in own.get("size", "").strip("[]").split(",") if n)), own
+    except ValueError as error:
+        raise ConfigError(f"{usage}: {error}") from error
+
+
+def convert(words: list[str]) -> None:
+    """GE-Sim, AgiBot or Bridge recordings to LeRobot v3.0, and LeRobot back to GE-Sim 2.0 bundles: worldloop convert SRC DST [frames=N] [size=[H,W]]"""
+    from pipeline.convert import convert as write
+
+    paths, cut, _ = _source_and_cut(words, 2, "say from where to where: worldloop convert SRC DST [frames=N] [size=[H,W]]")
+    print(f"{write(paths[0], paths[1], cut)} episodes in {paths[1]}")
+
+
+def inspect(words: list[str]) -> None:
+    """pictures of recordings with the commanded grippers drawn over them: worldloop inspect SRC DST [frames=N] [tool_offset=0.15]"""
+    from pipeline.convert import inspect as draw
+
+    paths, cut, own = _source_and_cut(words, 2, "say from where to where: worldloop inspect SRC DST [frames=N] [size=[H,W]] [tool_offset=0.15]")
+    for path in draw(paths[0], paths[1], cut, PoseMapStyle(tool_offset=float(own.get("tool_offset", 0.15)))):
+        print(path)
+
+
+COMMANDS: dict[str, Callable[[list[str]], None]] = {f.__name__: f for f in (run, rl, stage, stages, evaluate, controls, serve, convert, inspect, bench, verify, submit, chaos, config, doctor)}
 
 
 def _help() -> str:
@@ -192,7 +236,7 @@ def main() -> None:
         sys.exit(2)
     try:
         COMMANDS[words[0]](words[1:])
-    except (ConfigError, EpisodeError, FixtureError, FleetError, MissingGL, PoolError, TrainingDiverged, OSError) as error:
+    except (ConfigError, EpisodeError, FixtureError, FleetError, MissingGL, PolicyServerError, PoolError, RemoteError, TrainingDiverged, OSError) as error:
         print(f"worldloop {words[0]}: {error}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:

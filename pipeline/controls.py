@@ -46,9 +46,9 @@ def run_controls(cfg: Mapping[str, Any], root: Path) -> None:
     base = {"cfg": {key: cfg[key] for key in ("task", "policy", "imitation", "rl", "algorithm", "evaluate", "judge", "seed", "microbatches")}, "key": loop.key(f"rl-{rounds}")}
 
     def cloning(folder: Path, found: Mapping[str, Path]) -> dict[str, Any]:
-        from envs.episodes.clips import ClipStore
+        from actors.factory import open_clips
 
-        store = ClipStore([path / "dataset" for path in data])
+        store = open_clips(cfg, [path / "dataset" for path in data])
         demos = store.select(["expert"], succeeded=True)[: cfg["imitation"]["demos"]]
         mine = store.select(["policy-*"], succeeded=True)
         policy = build_policy(cfg)

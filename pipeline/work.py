@@ -23,6 +23,7 @@ from actors.factory import (
     build_simulator,
     build_state_decoder,
     build_world,
+    open_clips,
     options,
     prepare_process,
 )
@@ -101,7 +102,7 @@ def collect(cfg: Cfg, folder: Path, found: Found, part: str) -> dict[str, Any]:
                 bar.update(len(batch))
     finally:
         pool.close()
-    store = ClipStore([writer.root])
+    store = open_clips(cfg, [writer.root])
     return {"episodes": len(store), "frames": int(store.length.sum()), "successes": sum(row["success"] for row in store.episodes)}
 
 
@@ -135,9 +136,9 @@ def run_recorded(cfg: Cfg, policy: Any, seeds: list[int], stochastic: bool = Tru
     return [tracks[seed] for seed in seeds]
 
 
-def open_store(found: Found, data: Iterable[str]) -> ClipStore:
-    """The data sets of several stages as one store."""
-    return ClipStore([found[name] / "dataset" for name in data])
+def open_store(cfg: Cfg, found: Found, data: Iterable[str]) -> ClipStore:
+    """The data sets of several stages as one store, with the commands that the simulator takes."""
+    return open_clips(cfg, [found[name] / "dataset" for name in data])
 
 
 def split(store: ClipStore) -> tuple[Tensor, Tensor]:
@@ -150,7 +151,7 @@ def split(store: ClipStore) -> tuple[Tensor, Tensor]:
 # -- learning -----------------------------------------------------------------------------------------------------------
 def imitation(cfg: Cfg, folder: Path, found: Found) -> dict[str, Any]:
     """Behaviour cloning of the first few expert episodes."""
-    store = open_store(found, found)
+    store = open_store(cfg, found, found)
     experts = store.select(["expert"], succeeded=True)[: cfg["imitation"]["demos"]]
     if len(experts) < cfg["imitation"]["demos"]:
         raise ConfigError(f"imitation.demos={cfg['imitation']['demos']}, but the data hold {len(experts)} successful expert episodes; raise collect.episodes or collect.mix.expert")
@@ -169,7 +170,7 @@ def worked(cfg: Cfg, store: ClipStore) -> Tensor:
 
 def clone(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], policy: str, vision: str) -> dict[str, Any]:
     """The deployed policy, perception and all, learns from what worked in physics, and to see generated pictures as it sees true ones; RL then leaves its perception as it is."""
-    store = open_store(found, data)
+    store = open_store(cfg, found, data)
     prepare_process(cfg["seed"])
     actor = build_policy(cfg, found[policy] / "weights.safetensors")
     episodes = worked(cfg, store)
@@ -187,7 +188,7 @@ def tokenizer(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...]) -> di
     """The DiT's video autoencoder."""
     from learners.stages.tokenizer import train_tokenizer
 
-    store = open_store(found, data)
+    store = open_store(cfg, found, data)
     train, _ = split(store)
     prepare_process(cfg["seed"])
     simulator = build_simulator(cfg)
@@ -200,9 +201,9 @@ def vision(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], warm: tu
     """The simulator, from nothing in the first round and from its predecessor after that."""
     section = dict(cfg["vision"][steps])
     fit_section, places_section = section.pop("fit"), section.pop("places")
-    store = open_store(found, data)
+    store = open_store(cfg, found, data)
     train, kept = split(store)
-    newest = train[train >= len(store) - len(ClipStore([found[data[-1]] / "dataset"]))]
+    newest = train[train >= len(store) - len(open_store(cfg, found, data[-1:]))]
     prepare_process(cfg["seed"])
     simulator = build_simulator(cfg, found[warm[0]] / "weights.safetensors" if warm else None)
     train_places(simulator, store, train, kept, fit_options(cfg, places_section, f"vision.{steps}.places"), folder / "places")
@@ -213,12 +214,12 @@ def vision(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], warm: tu
 
 def state(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, warm: str, steps: str) -> dict[str, Any]:
     """The state decoder on the frozen simulator."""
-    store = open_store(found, data)
+    store = open_store(cfg, found, data)
     train, _ = split(store)
     prepare_process(cfg["seed"])
     simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
     decoder = build_state_decoder(cfg, simulator, found[warm] / "weights.safetensors" if warm else None)
-    if not warm:
+    if not warm and not decoder.normalised:
         rows = torch.cat([torch.arange(int(store.start[n]), int(store.start[n] + store.length[n])) for n in train.tolist()])
         decoder.normalise(store.arrays["states"][rows])
     stats = train_state(decoder, simulator, store, train, fit_options(cfg, cfg["state"][steps], f"state.{steps}"), folder)
@@ -230,7 +231,7 @@ def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
     """The judge on real and on generated frames, its threshold calibrated on real video of the policy that was deployed last."""
     section = dict(cfg["judge_fit"][steps])
     fit_section = section.pop("fit")
-    store = open_store(found, data)
+    store = open_store(cfg, found, data)
     train, _ = split(store)
     prepare_process(cfg["seed"])
     simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
@@ -251,7 +252,7 @@ def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
 def rl(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, state: str, judge: str, policy: str, iterations: int, number: int) -> dict[str, Any]:
     """Reinforcement learning inside the simulator."""
     prepare_process(cfg["seed"])
-    store = open_store(found, data)
+    store = open_store(cfg, found, data)
     actor = build_policy(cfg, found[policy] / "weights.safetensors")
     settings = rl_options(cfg, iterations=iterations, seed=cfg["seed"] * 100 + number)
     anchor = Cloning(actor, store, worked(cfg, store))
@@ -283,7 +284,7 @@ def load_world(cfg: Cfg, found: Found, store: ClipStore, vision: str, state: str
 # -- proof --------------------------------------------------------------------------------------------------------------
 def gap(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, state: str, judge: str, policy: str, number: int) -> dict[str, Any]:
     """How far imagination and truth lie apart for the policy just deployed: same starts, same stochastic policy."""
-    store = open_store(found, data)
+    store = open_store(cfg, found, data)
     mine = store.select([f"policy-{number}"])[: cfg["measure"]["starts"]]
     prepare_process(cfg["seed"])
     actor = build_policy(cfg, found[policy] / "weights.safetensors")
@@ -316,7 +317,7 @@ def evaluate_physics(cfg: Cfg, folder: Path, found: Found, policy: str) -> dict[
 
 def evaluate_imagined(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, state: str, judge: str, before: str, after: str) -> dict[str, Any]:
     """Deterministic success in imagination, from the starts of the data, for both policies in the last world."""
-    store = open_store(found, data)
+    store = open_store(cfg, found, data)
     count = min(cfg["evaluate"]["imagined"], len(store))
     world = load_world(cfg, found, store, vision, state, judge, min(64, count))
     out: dict[str, Any] = {}
@@ -332,8 +333,8 @@ def measure(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision:
     simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
     decoder = build_state_decoder(cfg, simulator, found[state] / "weights.safetensors")
     referee = build_judge(cfg, found[judge] / "weights.safetensors")
-    scripted = ClipStore([found[held_out] / "dataset"])
-    store = open_store(found, data)
+    scripted = open_store(cfg, found, [held_out])
+    store = open_store(cfg, found, data)
     groups = {name: (scripted, scripted.select([name])) for name in ("expert", "noisy", "random")}
     groups["on-policy"] = (store, split(store)[1])
     result: dict[str, Any] = {"rollout": {}, "judge": {}}
@@ -365,7 +366,7 @@ def videos(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: 
         data_folder = folder / f"dataset-{label}"
         shutil.rmtree(data_folder, ignore_errors=True)
         LeRobotWriter(data_folder, bench.views, bench.size, cfg["task"]["control_hz"]).write([Episode.from_track(t, f"policy-{label}", bench.views, cfg["task"]["control_hz"]) for t in tracks])
-        store = ClipStore([data_folder])
+        store = open_clips(cfg, [data_folder])
         made = replay(simulator, store, torch.arange(len(store)), bf16=cfg["simulator"]["bf16"])
         for number, row in enumerate(store.episodes):
             path = folder / "media" / f"{label}-{row['seed']}.mp4"

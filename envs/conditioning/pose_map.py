@@ -16,7 +16,7 @@ from torch import Tensor
 
 from envs.geometry import eef_transforms
 
-_CANVAS = 50
+CANVAS = 50  # of 255, where nothing is drawn
 _AXIS = 0.1  # m
 # RGB of the x, y and z axis lines of the left and of the right arm
 AXIS_RGB = (((0, 0, 255), (255, 255, 0), (0, 255, 255)), ((255, 0, 255), (255, 0, 0), (0, 255, 0)))
@@ -96,7 +96,7 @@ def render_pose_map(
     scale = size[0] / _REFERENCE_HEIGHT if style.scale is None else style.scale
     thickness = max(1, round(8 * scale))
     count = int(np.prod(lead)) * views * steps
-    canvas = np.full((count, 3, *size), _CANVAS, np.uint8)
+    canvas = np.full((count, 3, *size), CANVAS, np.uint8)
     lut = arm_shades().tolist()
     flat_pixels = pixels.reshape(count, 2, 4, 2).tolist()
     flat_radii, flat_shades = radii.reshape(count, 2).tolist(), shades.reshape(count, 2).tolist()

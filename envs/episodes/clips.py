@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.conditioning import render_pose_map
+from envs.conditioning import CANVAS, PoseMapStyle, render_pose_map
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.lerobot import LeRobotDataset
 from envs.geometry import follow_hands, hands_of
+from envs.layouts import CommandLayout
 
 
 @dataclass(frozen=True)
@@ -52,10 +53,18 @@ class ClipStore:
     """Episodes of several data sets as flat arrays; frames and pose maps stay on disk behind a memory map.
 
     Row i of every array is one video frame; `start[e] .. start[e] + length[e]` are the rows of episode e.
+
+    Args:
+        folders: LeRobot data sets with equal views, sizes and rates.
+        layout: which commands `commands` are.
+        style: how pose maps are drawn.
+
+    Raises:
+        EpisodeError: if the data sets differ, or have no commands of that layout.
     """
 
-    def __init__(self, folders: Sequence[Path]):
-        self.parts = [_open(Path(folder)) for folder in folders]
+    def __init__(self, folders: Sequence[Path], layout: CommandLayout = CommandLayout.EEF, style: PoseMapStyle | None = None):
+        self.parts = [_open(Path(folder), style or PoseMapStyle()) for folder in folders]
         first = self.parts[0]
         for part in self.parts[1:]:
             if part.info["views"] != first.info["views"] or part.info["size"] != first.info["size"]:
@@ -66,6 +75,11 @@ class ClipStore:
         join = {name: np.concatenate([part.arrays[name] for part in self.parts]) for name in first.arrays}
         self.arrays = {name: torch.from_numpy(value) for name, value in join.items()}
         self.episodes: list[dict[str, Any]] = [row for part in self.parts for row in part.info["episodes"]]
+        if layout is not CommandLayout.EEF:
+            other = sorted({row["recorded_layout"] for row in self.episodes} - {layout.value})
+            if other:
+                raise EpisodeError(f"simulator.layout={layout.value}, but the data have recorded actions of layout {other}; convert data that have joint commands, or use simulator.layout=eef")
+            self.arrays["commands"] = self.arrays["recorded"]
         self.length = torch.tensor([row["length"] for row in self.episodes])
         self.start = torch.cat([torch.zeros(1, dtype=torch.int64), self.length.cumsum(0)])[:-1]
         self.intrinsic = torch.tensor([row["intrinsic"] for row in self.episodes])
@@ -115,14 +129,14 @@ class ClipStore:
             TensorDict [B] with memory (index [L, M], frames, pose_map uint8 [L, M, V, 3, H, W], c2w [L, M, V, 4, 4]),
             future (frames, pose_map [L*K, V, 3, H, W], c2w, commands [L*K, 14], states [L*K, 16], objects [L*K, 2, 3], valid [L*K]),
             now (command [14], state [16], objects [2, 3]), history (states, commands [M, ...]), intrinsic [V, 3, 3], begin [].
-            Frames past the episode's end repeat its last and are not valid.
+            Frames past the episode's end repeat its last, and they and black frames are not valid.
         """
         total = spec.chunks * spec.chunk
         last = self.length[episode] - 1
         base = self.start[episode]
         ahead = begin[:, None] + spec.stride * torch.arange(1, total + 1)
-        valid = ahead <= last[:, None]
         rows = base[:, None] + torch.minimum(ahead, last[:, None])
+        valid = (ahead <= last[:, None]) & self.arrays["seen"][rows]
         past = begin[:, None] // spec.stride + spec.chunk * torch.arange(spec.chunks)  # frames before each chunk, in strides
         index = memory_indices(past + 1, spec.memory)  # [B, L, M], in strides from `begin % stride`
         at = (begin % spec.stride)[:, None, None] + index * spec.stride
@@ -221,25 +235,26 @@ class _Part:
     arrays: dict[str, NDArray[Any]]
 
 
-_NUMERIC = ("commands", "achieved", "states", "c2w", "success", "progress", "objects")
+_CACHE_FORM = b"2"  # changes when what a cache holds does
+_NUMERIC = ("commands", "achieved", "states", "c2w", "success", "progress", "objects", "seen", "recorded")
 
 
-def _open(folder: Path) -> _Part:
+def _open(folder: Path, style: PoseMapStyle) -> _Part:
     """Open the cache of a data set, making it first if it is missing or older than the data."""
     source = folder / "meta/info.json"
     if not source.exists():
         raise EpisodeError(f"{folder} is not a LeRobot data set: {source} is missing")
-    stamp = hashlib.sha256(source.read_bytes()).hexdigest()[:16]
+    stamp = hashlib.sha256(source.read_bytes() + _CACHE_FORM + repr(style).encode()).hexdigest()[:16]
     cache = folder / ".cache"
     marker = cache / "info.json"
     if not marker.exists() or json.loads(marker.read_text())["stamp"] != stamp:
-        _build(folder, cache, stamp)
+        _build(folder, cache, stamp, style)
     info = json.loads(marker.read_text())
     arrays = {name: np.load(cache / f"{name}.npy") for name in _NUMERIC}
     return _Part(folder, info, np.load(cache / "frames.npy", mmap_mode="r"), np.load(cache / "pose_maps.npy", mmap_mode="r"), arrays)
 
 
-def _build(folder: Path, cache: Path, stamp: str) -> None:
+def _build(folder: Path, cache: Path, stamp: str, style: PoseMapStyle) -> None:
     data = LeRobotDataset(folder)
     cache.mkdir(exist_ok=True)
     (cache / "info.json").unlink(missing_ok=True)
@@ -253,10 +268,16 @@ def _build(folder: Path, cache: Path, stamp: str) -> None:
         pictures["frames"][rows] = episode.frames
         # Wrist cameras are placed where the commands lead them, as they will be in imagination, where nobody can measure them.
         c2w = commanded_cameras(episode)
-        maps = render_pose_map(torch.from_numpy(episode.commands), c2w.transpose(0, 1), torch.from_numpy(episode.intrinsic), data.size)
-        pictures["pose_maps"][rows] = maps.transpose(0, 1).numpy()
-        for name in _NUMERIC:
-            columns[name].append(c2w.numpy() if name == "c2w" else getattr(episode, name))
+        pictures["pose_maps"][rows] = pose_maps_of(episode, c2w, style).transpose(0, 1).numpy()
+        numbers = {name: getattr(episode, name) for name in _NUMERIC} | {"c2w": c2w.numpy()}
+        if episode.recorded is None:
+            numbers["recorded"] = np.zeros((len(episode), 0), np.float32)
+        # Networks take no NaN: what is unknown of arms and cameras is nothing, and a camera at the world's origin.
+        for name in ("commands", "achieved", "states"):
+            numbers[name] = np.nan_to_num(numbers[name])
+        numbers["c2w"] = np.where(np.isnan(numbers["c2w"]), np.eye(4, dtype=np.float32), numbers["c2w"])
+        for name, values in numbers.items():
+            columns[name].append(values)
         episodes.append(
             {
                 "length": len(episode),
@@ -264,6 +285,7 @@ def _build(folder: Path, cache: Path, stamp: str) -> None:
                 "behaviour": episode.behaviour,
                 "seed": episode.seed,
                 "success": episode.succeeded,
+                "recorded_layout": episode.recorded_layout,
                 "intrinsic": episode.intrinsic.tolist(),
             }
         )
@@ -277,7 +299,20 @@ def _build(folder: Path, cache: Path, stamp: str) -> None:
     os.replace(temporary, cache / "info.json")
 
 
+def pose_maps_of(episode: Episode, c2w: Tensor, style: PoseMapStyle | None = None) -> Tensor:
+    """Pose maps uint8 [V, T, 3, H, W] of an episode's commands seen from c2w [T, V, 4, 4]; empty where a camera or the commands are unknown."""
+    length, views = c2w.shape[:2]
+    size = (episode.frames.shape[-2], episode.frames.shape[-1])
+    maps = torch.full((views, length, 3, *size), CANVAS, dtype=torch.uint8)
+    known = torch.isfinite(c2w).all((0, 2, 3)) if np.isfinite(episode.commands).all() else torch.zeros(views, dtype=torch.bool)
+    if known.any():
+        maps[known] = render_pose_map(torch.from_numpy(episode.commands), c2w[:, known].transpose(0, 1), torch.from_numpy(episode.intrinsic)[known], size, style=style)
+    return maps
+
+
 def commanded_cameras(episode: Episode) -> Tensor:
-    """Camera poses [T, V, 4, 4] if the arms had followed their commands exactly from the first frame on."""
+    """Camera poses [T, V, 4, 4] if the arms had followed their commands exactly from the first frame on; as recorded where commands are unknown, or cameras move by themselves."""
+    if not np.isfinite(episode.commands).all():
+        return torch.from_numpy(episode.c2w)
     commands = torch.from_numpy(episode.commands)
     return follow_hands(torch.from_numpy(episode.c2w[0]), commands[0], commands, hands_of(episode.views))

@@ -30,12 +30,17 @@ class Episode:
         success: bool [T], the task's condition has held long enough.
         progress: float32 [T] in 0..1.
         objects: float32 [T, N, 3] true positions in metres, NaN where nobody knows them; simulators learn contact from them and judges where to look; policies never see them.
-        instruction, seed, behaviour: words, the episode's seed, who acted ("expert", "noisy", "random", "policy-<n>").
+        instruction, seed, behaviour: words, the episode's seed, who acted ("expert", "noisy", "random", "policy-<n>", or a foreign source).
         views: names of the V cameras.
         fps: frames per second.
+        seen: bool [T], frames of which there is a picture; others are black. All by default.
+        recorded: float32 [T, A], actions as the source has them, if it has others than end-effector poses.
+        recorded_layout: what those are: "joints" for [L7, Lg, R7, Rg] (layouts.CommandLayout), else the source's own name.
+
+    What a source does not know is NaN throughout: states, commands, or the pose of a camera.
 
     Raises:
-        EpisodeError: if lengths disagree or numbers are not finite.
+        EpisodeError: if lengths disagree, or numbers are missing here and there.
     """
 
     frames: NDArray[np.uint8]
@@ -52,6 +57,9 @@ class Episode:
     behaviour: str
     views: tuple[str, ...]
     fps: float
+    seen: NDArray[np.bool_] = None  # type: ignore[assignment]
+    recorded: NDArray[np.float32] | None = None
+    recorded_layout: str = ""
 
     def __post_init__(self) -> None:
         length, views = self.frames.shape[:2]
@@ -62,8 +70,17 @@ class Episode:
             value = getattr(self, name)
             if value.shape != shape:
                 raise EpisodeError(f"episode {self.seed}: {name} has shape {value.shape}, expected {shape}")
-            if not np.isfinite(value).all():
-                raise EpisodeError(f"episode {self.seed}: {name} holds NaN or infinite values")
+            known = np.isfinite(value)
+            # A camera's 16 numbers are known together; of other fields all are, or none.
+            whole = known.all(axis=(0, 2, 3)) | np.isnan(value).all(axis=(0, 2, 3)) if name == "c2w" else known.all() | np.isnan(value).all()
+            if not whole.all():
+                raise EpisodeError(f"episode {self.seed}: {name} holds NaN or infinite values in some places; what is unknown must be NaN throughout")
+        if self.seen is None:
+            self.seen = np.ones(length, bool)
+        if self.seen.shape != (length,) or (self.recorded is not None and len(self.recorded) != length):
+            raise EpisodeError(f"episode {self.seed}: seen and recorded must have {length} rows")
+        if self.recorded is not None and not np.isfinite(self.recorded).all():
+            raise EpisodeError(f"episode {self.seed}: recorded actions hold NaN or infinite values")
 
     def __len__(self) -> int:
         return len(self.frames)

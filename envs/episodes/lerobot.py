@@ -98,6 +98,7 @@ class LeRobotWriter:
                 "seed": episode.seed,
                 "behaviour": episode.behaviour,
                 "success": episode.succeeded,
+                "recorded_layout": episode.recorded_layout,
                 "data/chunk_index": shard // 1000,
                 "data/file_index": shard % 1000,
                 "dataset_from_index": row,
@@ -113,6 +114,8 @@ class LeRobotWriter:
             for column, attribute in (*_COLUMNS.items(), ("action", "commands")):
                 value = getattr(episode, attribute).reshape(len(episode), -1)
                 record |= {f"stats/{column}/{name}": stat for name, stat in _stats(value).items()}
+            if episode.recorded is not None:
+                record |= {f"stats/action.recorded/{name}": stat for name, stat in _stats(episode.recorded).items()}
             records.append(record)
             row, clock = row + len(episode), clock + len(episode)
         _replace(self.root / _part("meta/episodes", shard, "parquet"), lambda path: pq.write_table(pa.Table.from_pylist(records), path))
@@ -138,6 +141,9 @@ class LeRobotWriter:
         # LeRobot's action at t is what is done next; the last row repeats, for nothing follows it.
         columns["action"] = _flat(np.concatenate([episode.commands[1:], episode.commands[-1:]]))
         columns["observation.camera.intrinsic"] = _flat(np.tile(episode.intrinsic.reshape(1, -1), (length, 1)))
+        if episode.recorded is not None:
+            columns["action.recorded"] = _flat(episode.recorded)
+        columns["observation.seen"] = pa.array(episode.seen)
         columns["success"] = pa.array(episode.success)
         columns["progress"] = pa.array(episode.progress)
         columns["timestamp"] = pa.array((np.arange(length) / self.fps).astype(np.float32))
@@ -186,12 +192,15 @@ class LeRobotWriter:
             "observation.eef_pose": numbers(_POSE_NAMES, 14),
             "observation.camera.c2w": numbers(None, 16 * count_views),
             "observation.camera.intrinsic": numbers(None, 9 * count_views),
-            "observation.objects": numbers(None, 6),
+            "observation.objects": numbers(None, len(rows[0]["stats/observation.objects/mean"])),
+            "observation.seen": {"dtype": "bool", "shape": [1], "names": None},
             "action": numbers(_POSE_NAMES, 14),
             "success": {"dtype": "bool", "shape": [1], "names": None},
             "progress": {"dtype": "float32", "shape": [1], "names": None},
             "timestamp": {"dtype": "float32", "shape": [1], "names": None},
         }
+        if "stats/action.recorded/mean" in rows[0]:
+            features["action.recorded"] = numbers(None, len(rows[0]["stats/action.recorded/mean"]))
         features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in ("frame_index", "episode_index", "index", "task_index")}
         info = {
             "codebase_version": _VERSION,
@@ -300,6 +309,9 @@ class LeRobotDataset:
                 behaviour=row["behaviour"],
                 views=self.views,
                 fps=self.fps,
+                seen=table["observation.seen"].to_numpy().astype(bool) if "observation.seen" in table.column_names else None,  # type: ignore[arg-type]
+                recorded=read("action.recorded") if "action.recorded" in table.column_names else None,
+                recorded_layout=row.get("recorded_layout") or "",
             )
         except (EpisodeError, KeyError, ValueError) as error:
             raise EpisodeError(f"{path}: episode {row['episode_index']}: {error}") from error

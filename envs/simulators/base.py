@@ -7,6 +7,7 @@ resetting some sessions is a masked write, and all randomness comes from (sessio
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +15,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from envs.episodes.clips import memory_indices
+from envs.layouts import CommandLayout
 from envs.simulators.places import Places
 
 
@@ -28,6 +30,7 @@ class WorldShape:
         memory: sparse memory frames, M; the first frame is always one of them.
         fps: frames per second.
         objects: things whose places are followed (places.py), S; 0 follows none.
+        layout: what its commands are, A numbers a frame.
     """
 
     views: int = 3
@@ -36,6 +39,11 @@ class WorldShape:
     memory: int = 4
     fps: float = 10.0
     objects: int = 2
+    layout: CommandLayout = CommandLayout.EEF
+
+    def __post_init__(self) -> None:
+        if self.objects and self.layout is not CommandLayout.EEF:
+            raise ValueError("simulator.objects follows things under end-effector commands only; set it to 0 for joint commands")
 
 
 class Simulator(nn.Module):
@@ -58,8 +66,8 @@ class Simulator(nn.Module):
 
         Args:
             inputs: TensorDict [B] with memory (frames, pose_map uint8 [M, V, 3, H, W], c2w [M, V, 4, 4]),
-                future (pose_map uint8 [K, V, 3, H, W], c2w [K, V, 4, 4], commands [K, 14], places [K, S, 3]),
-                now (command [14], state [16], places [S, 3]; NaN where unknown),
+                future (pose_map uint8 [K, V, 3, H, W], c2w [K, V, 4, 4], commands [K, A], places [K, S, 3]),
+                now (command [A], state [16], places [S, 3]; NaN where unknown),
                 intrinsic [V, 3, 3], seed int64 [], chunk_index int64 [].
 
         Returns:
@@ -117,7 +125,7 @@ class Simulator(nn.Module):
         Args:
             frames: uint8 [B, V, 3, H, W].
             intrinsic: [B, V, 3, 3] pixels; c2w: [B, V, 4, 4].
-            command: [B, 14] command in force; state: [B, 16] joint state.
+            command: [B, A] command in force; state: [B, 16] joint state.
             pose_map: uint8 [B, V, 3, H, W] of that command.
             seed: int64 [B].
             likeliest: let objects go their likeliest way, for comparing with what happened; else the seed decides.
@@ -155,7 +163,7 @@ class Simulator(nn.Module):
         """Advance every session by one chunk; `state` is used up, its buffers go into the one returned.
 
         Args:
-            commands: [B, K, 14] absolute; pose_map: uint8 [B, K, V, 3, H, W]; c2w: [B, K, V, 4, 4].
+            commands: [B, K, A] absolute; pose_map: uint8 [B, K, V, 3, H, W]; c2w: [B, K, V, 4, 4].
 
         Returns:
             frames uint8 [B, K, V, 3, H, W], features [B, *feature_shape], next state. The joint states of the new
@@ -164,14 +172,16 @@ class Simulator(nn.Module):
         batch, count = commands.shape[:2]
         rows = torch.arange(batch, device=commands.device)
         length = state["length"]
-        memory = memory_indices(length, self.shape.memory)
         history = state["history"]
         now = history.select("commands", "states", "places")[rows, length - 1]
-        luck = self._luck(state["seed"], state["chunk_index"]).to(commands.device).masked_fill(state["likeliest"][:, None, None], 0.0)
-        ahead = self.places.push(now["places"], self.recent(state, 1 + count)["commands"], commands, luck)
+        if self.shape.objects:
+            luck = self._luck(state["seed"], state["chunk_index"]).to(commands.device).masked_fill(state["likeliest"][:, None, None], 0.0)
+            ahead = self.places.push(now["places"], self.recent(state, 1 + count)["commands"], commands, luck)
+        else:
+            ahead = now["places"][:, None].expand(-1, count, -1, -1)
         inputs = TensorDict(
             {
-                "memory": history.select("frames", "pose_map", "c2w")[rows[:, None], memory],
+                "memory": self.recall(state, pose_map, c2w),
                 "future": TensorDict({"pose_map": pose_map, "c2w": c2w, "commands": commands, "places": ahead}, [batch]),
                 "now": TensorDict({"command": now["commands"], "state": now["states"], "places": now["places"]}, [batch]),
                 "intrinsic": state["intrinsic"],
@@ -192,18 +202,18 @@ class Simulator(nn.Module):
         new = {"frames": pictures, "pose_map": pose_map, "c2w": c2w, "commands": commands, "states": now["states"][:, None].expand(-1, count, -1), "places": ahead}
         for name, value in new.items():
             history[name][rows[:, None], at] = value
-        state = TensorDict(
-            {
-                "history": history,
-                "length": length + count,
-                "intrinsic": state["intrinsic"],
-                "likeliest": state["likeliest"],
-                "seed": state["seed"],
-                "chunk_index": state["chunk_index"] + 1,
-            },
-            [batch],
-        )
+        state = state.copy()  # of the names only
+        state["history"], state["length"], state["chunk_index"] = history, length + count, state["chunk_index"] + 1
         return pictures, features.float(), state
+
+    def recall(self, state: TensorDict, pose_map: Tensor, c2w: Tensor) -> TensorDict:
+        """What is remembered for the next chunk: frames, pose_map, c2w [B, M, ...], evenly spread over the past and with the first frame.
+
+        Args:
+            pose_map, c2w: of the chunk to come, [B, K, ...].
+        """
+        rows = torch.arange(len(state), device=state["length"].device)[:, None]
+        return state["history"].select("frames", "pose_map", "c2w")[rows, memory_indices(state["length"], self.shape.memory)]
 
     def _luck(self, seed: Tensor, chunk_index: Tensor) -> Tensor:
         """Standard normal numbers [B, S, 3] that belong to each session's seed and chunk; objects stray along the ground."""
@@ -219,6 +229,21 @@ class Simulator(nn.Module):
         state["history", "states"][rows, at] = decoded
 
     @staticmethod
+    def stack(states: Sequence[TensorDict]) -> TensorDict:
+        """Sessions [B1], [B2], ... of equal or different length as one state; rows past a session's own length hold anything."""
+        most = max(state["history"].shape[1] for state in states)
+        parts = []
+        for state in states:
+            part, history = state.copy(), state["history"]
+            if history.shape[1] < most:
+                longer = history.new_empty(len(state), most)
+                for name, value in history.items():
+                    longer[name][:, : history.shape[1]] = value
+                part["history"] = longer
+            parts.append(part)
+        return torch.cat(parts)
+
+    @staticmethod
     def recent(state: TensorDict, count: int) -> TensorDict:
         """The last `count` commands and states [B, count, ...] of each session, the first repeated where there are fewer."""
         length = state["length"]
@@ -226,11 +251,15 @@ class Simulator(nn.Module):
         at = (length[:, None] - count + torch.arange(count, device=length.device)).clamp(min=0)
         return state["history"].select("commands", "states")[rows, at]
 
+    def release(self, state: TensorDict, mask: Tensor) -> None:
+        """The sessions of `mask` [B] end; what is held for them elsewhere can go. Here nothing is."""
+
     @staticmethod
     def replace(state: TensorDict, mask: Tensor, fresh: TensorDict) -> TensorDict:
         """The state with the sessions of `mask` [B] replaced by those of `fresh` (one row per True, in order)."""
-        for name in ("length", "intrinsic", "likeliest", "seed", "chunk_index"):
-            state[name][mask] = fresh[name].to(state[name].dtype)
+        for name in state.keys():
+            if name != "history":
+                state[name][mask] = fresh[name].to(state[name].dtype)
         for name in state["history"].keys():
             state["history", name][mask.nonzero().flatten(), 0] = fresh["history", name][:, 0]
         return state

@@ -8,11 +8,13 @@ outputs, mixed by learned scalars, are what the state expert attends to when it 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 _BASE_FPS = 24.0
 _STATE_ROPE_LENGTH = 57.0
@@ -33,6 +35,8 @@ class DiTShape:
         views: number of view embeddings.
         concat_padding_mask: whether the network adds its own channel of zeros.
         pose_in_channels, pose_num_attention_heads, pose_attention_head_dim: of the state expert.
+        pose_expert: whether there is one; GE-Sim 1 has none.
+        pose_layers: of the state expert; 0 is as many as the trunk, as released.
     """
 
     in_channels: int = 26
@@ -51,6 +55,8 @@ class DiTShape:
     pose_in_channels: int = 16
     pose_num_attention_heads: int = 16
     pose_attention_head_dim: int = 32
+    pose_expert: bool = True
+    pose_layers: int = 0
 
     @property
     def width(self) -> int:
@@ -127,14 +133,21 @@ class Attention(nn.Module):
         self.norm_q, self.norm_k = RMSNorm(head_dim, 1e-5), RMSNorm(head_dim, 1e-5)
         self.to_out = nn.ModuleList([nn.Linear(inner, width, bias=bias)])
 
-    def forward(self, x: Tensor, context: Tensor | None = None, rope: tuple[Tensor, Tensor] | None = None) -> Tensor:
-        source = x if context is None else context
-        q, k, v = (layer(y).unflatten(-1, (self.heads, -1)).transpose(1, 2) for layer, y in ((self.to_q, x), (self.to_k, source), (self.to_v, source)))
-        q, k = self.norm_q(q), self.norm_k(k)
+    def forward(self, x: Tensor, context: Tensor | None = None, rope: tuple[Tensor, Tensor] | None = None, known: tuple[Tensor, Tensor] | None = None) -> Tensor:
+        """Tokens [B, L, width]; `known` are keys and values of a context that was met before (`keys_of`)."""
+        q = self.norm_q(self._heads(self.to_q(x)))
+        k, v = known if known is not None else self.keys_of(x if context is None else context)
         if rope is not None:
             q, k = rotate(q, rope), rotate(k, rope)
-        out = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
+        out = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype).expand(len(q), -1, -1, -1), v.expand(len(q), -1, -1, -1))
         return self.to_out[0](out.transpose(1, 2).flatten(2))
+
+    def keys_of(self, context: Tensor) -> tuple[Tensor, Tensor]:
+        """Keys and values [B, heads, L, head_dim] of a context [B, L, width]."""
+        return self.norm_k(self._heads(self.to_k(context))), self._heads(self.to_v(context))
+
+    def _heads(self, x: Tensor) -> Tensor:
+        return x.unflatten(-1, (self.heads, -1)).transpose(1, 2)
 
 
 class _Gelu(nn.Module):
@@ -184,8 +197,8 @@ class VisionBlock(nn.Module):
         self.attn2 = Attention(width, heads, size, shape.text_embed_dim)
         self.ff = FeedForward(width, shape.mlp_ratio)
 
-    def forward(self, x: Tensor, text: Tensor, embedded: Tensor, temb: Tensor, rope: tuple[Tensor, Tensor], views: int) -> Tensor:
-        """Tokens [B * V, L, D]; with `views` > 1 self-attention joins the tokens of all views."""
+    def forward(self, x: Tensor, text: Tensor | tuple[Tensor, Tensor], embedded: Tensor, temb: Tensor, rope: tuple[Tensor, Tensor], views: int) -> Tensor:
+        """Tokens [B * V, L, D], and the text or its keys and values; with `views` > 1 self-attention joins the tokens of all views."""
         h, gate = self.norm1(x, embedded, temb)
         if views > 1:
             joined = h.unflatten(0, (-1, views)).flatten(1, 2)
@@ -195,7 +208,7 @@ class VisionBlock(nn.Module):
             h = self.attn1(h, rope=rope)
         x = x + gate * h
         h, gate = self.norm2(x, embedded, temb)
-        x = x + gate * self.attn2(h, text)
+        x = x + gate * (self.attn2(h, text) if isinstance(text, Tensor) else self.attn2(h, known=text))
         h, gate = self.norm3(x, embedded, temb)
         return x + gate * self.ff(h)
 
@@ -254,11 +267,24 @@ class MultiViewDiT(nn.Module):
 
     Args:
         shape: sizes.
+        trunk, expert: build only one half, the other being somewhere else; both have the learned mix between them.
+
+    Attributes:
+        checkpointing: compute blocks anew in the backward pass instead of keeping what they computed.
     """
 
-    def __init__(self, shape: DiTShape):
+    def __init__(self, shape: DiTShape, trunk: bool = True, expert: bool = True):
         super().__init__()
-        self.shape = shape
+        self.shape, self.checkpointing = shape, False
+        self._text: tuple[Tensor, int, list[tuple[Tensor, Tensor]]] | None = None
+        if trunk:
+            self._build_trunk(shape)
+        if shape.pose_expert:
+            self._build_mix(shape)
+            if expert:
+                self._build_expert(shape)
+
+    def _build_trunk(self, shape: DiTShape) -> None:
         width, patch = shape.width, math.prod(shape.patch_size)
         self.patch_embed = nn.ModuleDict({"proj": nn.Linear((shape.in_channels + shape.concat_padding_mask) * patch, width, bias=False)})
         self.time_embed = _VideoTime(width)
@@ -267,16 +293,26 @@ class MultiViewDiT(nn.Module):
         self.transformer_blocks = nn.ModuleList(VisionBlock(shape) for _ in range(shape.num_layers))
         self.norm_out = _AdaLN(width, shape.adaln_lora_dim, 2)
         self.proj_out = nn.Linear(width, patch * shape.out_channels, bias=False)
+    def _build_mix(self, shape: DiTShape) -> None:
         self.video_buffer_weights = nn.Parameter(torch.ones(shape.num_layers))
-        self.video_buffer_norm = nn.LayerNorm(width, eps=1e-6)
-        state = shape.pose_num_attention_heads * shape.pose_attention_head_dim
-        self.pose_proj_in = nn.Linear(shape.pose_in_channels, state)
-        self.pose_time_embed = _StateTime(state)
-        self.pose_blocks = nn.ModuleList(StateBlock(state, shape.pose_num_attention_heads, shape.pose_attention_head_dim, width) for _ in range(shape.num_layers))
-        self.pose_scale_shift_table = nn.Parameter(torch.randn(2, state) / state**0.5)
-        self.pose_proj_out = nn.Linear(state, shape.pose_in_channels)
+        self.video_buffer_norm = nn.LayerNorm(shape.width, eps=1e-6)
 
-    def forward(self, latents: Tensor, timestep: Tensor, text: Tensor, views: int, fps: float) -> tuple[Tensor, Tensor]:
+    def add_expert(self) -> None:
+        """Give a network that came without one (GE-Sim 1) an untrained state expert."""
+        if not self.shape.pose_expert:
+            self.shape = replace(self.shape, pose_expert=True)
+            self._build_mix(self.shape)
+            self._build_expert(self.shape)
+
+    def _build_expert(self, shape: DiTShape) -> None:
+        width = shape.pose_num_attention_heads * shape.pose_attention_head_dim
+        self.pose_proj_in = nn.Linear(shape.pose_in_channels, width)
+        self.pose_time_embed = _StateTime(width)
+        self.pose_blocks = nn.ModuleList(StateBlock(width, shape.pose_num_attention_heads, shape.pose_attention_head_dim, shape.width) for _ in range(shape.pose_layers or shape.num_layers))
+        self.pose_scale_shift_table = nn.Parameter(torch.randn(2, width) / width**0.5)
+        self.pose_proj_out = nn.Linear(width, shape.pose_in_channels)
+
+    def forward(self, latents: Tensor, timestep: Tensor, text: Tensor, views: int, fps: float, layers: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """One denoising step of the video.
 
         Args:
@@ -284,6 +320,7 @@ class MultiViewDiT(nn.Module):
             timestep: [B * V, 1, T, 1, 1] or [B * V, T] noise level of every latent frame.
             text: [B, L, D] or [B * V, L, D] prompt embedding.
             fps: of the video.
+            layers: takes what every block says, each [B * V, tokens, width], for training the mix (`fuse`).
 
         Returns:
             velocity [B * V, out_channels, T, H, W] and the fused features [B * V, tokens, width] for the state expert.
@@ -300,16 +337,42 @@ class MultiViewDiT(nn.Module):
         spread = grid[1] * grid[2]
         temb, embedded = (part.unflatten(0, (batch, -1)).repeat_interleave(spread, 1) for part in (temb, embedded))
         temb = temb + self.view_ada(self.view_embed).repeat(batch // views, 1)[:, None]
-        if len(text) != batch:
-            text = text.repeat_interleave(batch // len(text), 0)
+        said = self._known(text, batch)
         fused = torch.zeros_like(x)
         for index, block in enumerate(self.transformer_blocks):
-            x = block(x, text, embedded, temb, rope, views if index % 3 == 0 else 1)
-            fused = fused + self.video_buffer_weights[index] * x
+            arguments = (x, said[index], embedded, temb, rope, views if index % 3 == 0 else 1)
+            x = checkpoint(block, *arguments, use_reentrant=False) if self.checkpointing and torch.is_grad_enabled() else block(*arguments)
+            if self.shape.pose_expert:
+                fused = fused + self.video_buffer_weights[index] * x
+            if layers is not None:
+                layers.append(x)
         x, _ = self.norm_out(x, embedded, temb)
         x = self.proj_out(x).unflatten(2, (ph, pw, pt, -1)).unflatten(1, grid)
         video = x.permute(0, 7, 1, 6, 2, 4, 3, 5).flatten(6, 7).flatten(4, 5).flatten(2, 3)
-        return video, self.video_buffer_norm(fused)
+        return video, self.video_buffer_norm(fused) if self.shape.pose_expert else fused
+
+    def fuse(self, layers: Sequence[Tensor]) -> Tensor:
+        """The features of `forward` from what every block said."""
+        return self.video_buffer_norm(sum(weight * x for weight, x in zip(self.video_buffer_weights, layers, strict=True)))
+
+    def _known(self, text: Tensor, batch: int) -> Sequence[Tensor | tuple[Tensor, Tensor]]:
+        """The text for every block. Sessions that share one prompt share its keys and values, which outside training are computed once."""
+        if len(text) > 1 and text.stride(0):
+            return [text.repeat_interleave(batch // len(text), 0)] * len(self.transformer_blocks)
+        one = text[:1]
+        if torch.is_grad_enabled() or self.training:
+            return [one] * len(self.transformer_blocks)
+        if self._text is None or self._text[0].data_ptr() != one.data_ptr() or self._text[1] != self._stamp():
+            self._text = (one, self._stamp(), [attention.keys_of(one) for attention in self._to_text()])
+        return self._text[2]
+
+    def _to_text(self) -> list[Attention]:
+        return [block.attn2 for block in self.transformer_blocks if isinstance(block, VisionBlock)]
+
+    def _stamp(self) -> int:
+        """Changes whenever weights do that the kept keys depend on, and with the precision they are computed in."""
+        precision = torch.is_autocast_enabled(self.view_embed.device.type)
+        return hash((precision, *((p.data_ptr(), p._version) for attention in self._to_text() for p in attention.parameters())))
 
     def decode_states(self, states: Tensor, timestep: Tensor, features: Tensor, views: int, mask: Tensor | None = None) -> Tensor:
         """One denoising step of the joint states.

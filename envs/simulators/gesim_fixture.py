@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from envs.simulators.dit import DiTShape, MultiViewDiT
 
 # What the public configuration may say besides sizes, and the only values that this network knows.
-_FIXED = {"extra_pos_embed_type": None, "use_view_embed": True, "pose_expert": True}
+_FIXED = {"extra_pos_embed_type": None, "use_view_embed": True}
 
 
 class FixtureError(ValueError):

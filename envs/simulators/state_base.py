@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor, nn
+
+from envs.simulators.base import Simulator
 
 
 class StateDecoder(nn.Module):
@@ -11,7 +14,12 @@ class StateDecoder(nn.Module):
 
     Args:
         memory: frames of command and state history it reads.
+
+    Attributes:
+        normalised: whether its units came with its weights, so that data need not set them.
     """
+
+    normalised = False
 
     def __init__(self, memory: int):
         super().__init__()
@@ -21,12 +29,20 @@ class StateDecoder(nn.Module):
         """Set units from joint states [N, 16]."""
         raise NotImplementedError
 
+    def look(self, simulator: Simulator, inputs: TensorDict) -> Tensor:
+        """Features [B, *feature_shape] of training inputs (Simulator.asked); the simulator is frozen, what the decoder owns is not."""
+        with torch.no_grad():
+            return simulator.features(inputs).float()
+
+    def attach(self, simulator: Simulator) -> None:
+        """Tell the simulator what its features should be, if that is the decoder's to say."""
+
     def decode(self, features: Tensor, commands: Tensor, past_commands: Tensor, past_states: Tensor, seed: Tensor, chunk_index: Tensor) -> Tensor:
         """Joint states of one chunk.
 
         Args:
             features: [B, *feature_shape] of the simulator.
-            commands: [B, K, 14] absolute; past_commands: [B, M, 14] and past_states: [B, M, 16] up to the chunk's start.
+            commands: [B, K, A] absolute; past_commands: [B, M, A] and past_states: [B, M, 16] up to the chunk's start.
             seed, chunk_index: int64 [B], all the randomness there is.
 
         Returns:

@@ -2,7 +2,9 @@
 
 from torchrl.envs import Compose
 
+from envs.conditioning import PoseMapStyle
 from envs.judges import Judge
+from envs.kinematics import Kinematics
 from envs.schema import Rewards
 from envs.simulators.state_base import StateDecoder
 from envs.transforms.judge_reward import JudgeReward
@@ -12,6 +14,8 @@ from envs.transforms.state_expert import StateExpertTransform
 __all__ = ["JudgeReward", "PoseMapTransform", "StateExpertTransform", "world_transforms"]
 
 
-def world_transforms(decoder: StateDecoder, judge: Judge, rewards: Rewards, views: tuple[str, ...], later: bool = False) -> Compose:
+def world_transforms(
+    decoder: StateDecoder, judge: Judge, rewards: Rewards, views: tuple[str, ...], later: bool = False, style: PoseMapStyle | None = None, kinematics: Kinematics | None = None
+) -> Compose:
     """The three transforms in their order: commands to pose maps going in, joint states and rewards coming out, the latter at once or `later`."""
-    return Compose(PoseMapTransform(views), StateExpertTransform(decoder), JudgeReward(judge, rewards, later))
+    return Compose(PoseMapTransform(views, style, kinematics), StateExpertTransform(decoder), JudgeReward(judge, rewards, later))

@@ -24,11 +24,9 @@ def train_state(decoder: StateDecoder, simulator: Simulator, store: ClipStore, e
         return store.sample(episodes, options.part, ClipSpec(shape.memory, shape.chunk), generator)
 
     def loss(clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
-        inputs = simulator.asked(clip, 0, generator=generator)
-        with torch.no_grad():
-            features = simulator.features(inputs)
+        features = decoder.look(simulator, simulator.asked(clip, 0, generator=generator))
         future, history = clip["future"], clip["history"]
-        value = decoder.loss(features.float(), future["commands"], history["commands"], history["states"], future["states"], future["valid"].float(), generator)
+        value = decoder.loss(features, future["commands"], history["commands"], history["states"], future["states"], future["valid"].float(), generator)
         return value, {}
 
     stats = fit("state", decoder, batch, loss, options, folder)

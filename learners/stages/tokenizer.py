@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from envs.episodes.clips import ClipStore
+from envs.simulators.autoencoder import Autoencoder
 from envs.simulators.base import foreground_weight
 from envs.simulators.dit_world import DiTSimulator
 from learners.fit import FitConfig, fit
@@ -17,8 +18,8 @@ from learners.fit import FitConfig, fit
 def train_tokenizer(simulator: DiTSimulator, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path) -> dict[str, float]:
     """Train the simulator's autoencoder in place on single frames, then set its latents' units."""
     rows = torch.cat([torch.arange(int(store.start[n]), int(store.start[n] + store.length[n])) for n in episodes.tolist()])
-    codec = simulator.codec
-    gain = simulator.config.foreground
+    codec, gain = simulator.codec, simulator.foreground
+    assert isinstance(codec, Autoencoder)
 
     def batch(step: int, generator: torch.Generator) -> Tensor:
         return store.frames(rows[torch.randint(len(rows), (options.part,), generator=generator)]).flatten(0, 1)

@@ -10,7 +10,7 @@ from envs.simulators.base import WorldShape
 from envs.simulators.dit import DiTShape, MultiViewDiT
 from envs.simulators.dit_world import DiTConfig, DiTSimulator
 from envs.simulators.replay import replay
-from envs.simulators.state_flow import StateExpert, StateExpertConfig
+from envs.simulators.state_flow import StateExpertConfig, untrained_expert
 
 TINY = DiTConfig(layers=3, heads=2, head_dim=32, adaln_rank=8, codec_width=16, steps=2)
 
@@ -23,7 +23,7 @@ def dit() -> DiTSimulator:
 
 def test_rollouts_depend_on_seed_and_not_on_batch(dit: DiTSimulator, store: ClipStore) -> None:
     torch.manual_seed(1)
-    expert = StateExpert(dit.feature_shape, 4, 4, StateExpertConfig(layers=2)).eval()
+    expert = untrained_expert(dit, StateExpertConfig(layers=2)).eval()
     both = replay(dit, store, torch.tensor([1, 2]), expert, bf16=False)
     alone = replay(dit, store, torch.tensor([2]), expert, bf16=False)
     length = alone.frames.shape[1]
@@ -49,3 +49,44 @@ def test_cross_view_attention_in_every_third_block_only() -> None:
         block.register_forward_pre_hook(lambda module, args: calls.append(args[-1]))
     net(torch.randn(3, 4, 2, 4, 4), torch.rand(3, 2), torch.zeros(1, 1, 8), 3, 10.0)
     assert calls == [3, 1, 1]
+
+
+def test_known_text_keys_change_nothing_and_follow_the_weights() -> None:
+    torch.manual_seed(0)
+    net = MultiViewDiT(DiTShape(in_channels=4, out_channels=4, num_attention_heads=2, attention_head_dim=24, num_layers=3, text_embed_dim=8, adaln_lora_dim=8)).eval()
+    for p in net.parameters():
+        torch.nn.init.normal_(p, std=0.1)
+    latents, times, text = torch.randn(6, 4, 2, 4, 4), torch.rand(6, 2), torch.randn(1, 5, 8)
+    anew = net(latents, times, text.repeat(6, 1, 1), 3, 10.0)[0].detach()
+    with torch.no_grad():
+        kept = [net(latents, times, text, 3, 10.0)[0] for _ in range(2)]
+        assert torch.allclose(kept[0], anew, atol=1e-5) and torch.equal(*kept)
+        net.transformer_blocks[0].attn2.to_v.weight.mul_(3.0)
+        assert not torch.allclose(net(latents, times, text, 3, 10.0)[0], kept[0], atol=1e-4)
+
+
+def test_the_expert_learns_its_mix_and_the_simulator_takes_it_over(dit: DiTSimulator, store: ClipStore) -> None:
+    torch.manual_seed(1)
+    expert = untrained_expert(dit, StateExpertConfig(layers=2))
+    clip = store.clips(torch.tensor([1, 2]), torch.tensor([0, 3]), ClipSpec(4, 4))
+    inputs = dit.asked(clip, 0, generator=torch.Generator().manual_seed(0))
+    dit.requires_grad_(False)
+    features = expert.look(dit, inputs)
+    history, future = clip["history"], clip["future"]
+    expert.loss(features, future["commands"], history["commands"], history["states"], future["states"], future["valid"].float(), torch.Generator().manual_seed(0)).backward()
+    assert expert.net.video_buffer_weights.grad.abs().max() > 0
+    with torch.no_grad():
+        expert.net.video_buffer_weights.copy_(torch.tensor([0.5, 2.0, -1.0]))
+        expert.attach(dit)
+        assert torch.allclose(dit.features(inputs), expert.look(dit, inputs), atol=1e-5)
+
+
+def test_checkpointed_blocks_give_the_same_gradients(dit: DiTSimulator, store: ClipStore) -> None:
+    clip = store.clips(torch.tensor([1]), torch.tensor([0]), ClipSpec(4, 4))
+    grads = []
+    for checkpointing in (False, True):
+        dit.net.checkpointing = checkpointing
+        dit.zero_grad()
+        dit.loss(clip, torch.Generator().manual_seed(0))[0].backward()
+        grads.append(dit.net.transformer_blocks[1].attn1.to_q.weight.grad.clone())
+    assert torch.allclose(*grads, atol=1e-7)

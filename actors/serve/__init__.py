@@ -1,0 +1,1 @@
+"""Any simulator behind GE-Sim's protocol: sessions, their shared forward passes, HTTP, and a page to watch them."""
