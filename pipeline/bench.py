@@ -18,7 +18,9 @@ from envs.physics.bench import Bench
 from envs.physics.pool import BenchPool
 from envs.precision import mixed_precision
 from pipeline.bench_actors import actors
+from pipeline.bench_gesim import gesim
 from pipeline.bench_learning import learning
+from pipeline.bench_training import overfit, pretrained
 from pipeline.config import load_config
 
 
@@ -123,14 +125,16 @@ def world(cfg: dict[str, Any]) -> None:
         print(f"batch {batch}: {8 * batch * shape.chunk / total:.0f} frames/s, forward pass {100 * spent[0] / total:.1f}% of the step")
 
 
-BENCHES: dict[str, Callable[[dict[str, Any]], None]] = {"conditioning": conditioning, "physics": physics, "world": world, "actors": actors, "learning": learning}
+BENCHES: dict[str, Callable[[dict[str, Any]], Any]] = {"conditioning": conditioning, "physics": physics, "world": world, "actors": actors, "learning": learning, "gesim": gesim, "overfit": overfit, "pretrained": pretrained}
+# What a benchmark takes for granted unless the command line says otherwise.
+BASES = {"actors": ["launch=ray"], "overfit": ["simulator=gesim"], "pretrained": ["experiment=smoke", "simulator=dit_small"]}
 
 
 def run_bench(words: list[str]) -> None:
     """`worldloop bench NAME [overrides]`."""
     if not words or words[0] not in BENCHES:
         raise ConfigError(f"say which: worldloop bench {'|'.join(BENCHES)}")
-    extra = ["launch=ray"] if words[0] == "actors" and not any(word.startswith("launch=") for word in words) else []
+    extra = [word for word in BASES.get(words[0], []) if not any(own.startswith(word.split("=")[0] + "=") for own in words)]
     BENCHES[words[0]](load_config([*extra, *words[1:]]))
 
 

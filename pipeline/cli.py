@@ -19,6 +19,7 @@ from envs.episodes.foreign import Cut
 from envs.physics.pool import PoolError
 from envs.physics.render import MissingGL
 from envs.simulators.gesim_fixture import FixtureError
+from envs.simulators.gesim_folder import CheckpointError
 from envs.simulators.remote import RemoteError
 from learners.fit import TrainingDiverged
 from pipeline import work
@@ -141,7 +142,7 @@ def config(words: list[str]) -> None:
 
 
 def bench(words: list[str]) -> None:
-    """measure performance: worldloop bench conditioning|physics|world|actors"""
+    """measure performance: worldloop bench conditioning|physics|world|actors|learning|gesim|overfit|pretrained"""
     from pipeline.bench import run_bench
 
     run_bench(words)
@@ -175,6 +176,17 @@ def controls(words: list[str]) -> None:
     cfg = load_config(words)
     prepare_process(cfg["seed"])
     run_controls(cfg, _root(cfg))
+
+
+def finetune(words: list[str]) -> None:
+    """train a simulator on any LeRobot data: worldloop finetune simulator=gesim simulator.checkpoint=<folder> finetune.data=[<folder>]"""
+    from pipeline.finetune import build_finetune
+
+    cfg = load_config(words)
+    prepare_process(cfg["seed"])
+    graph = build_finetune(cfg, _root(cfg))
+    graph.run()
+    print(f"weights in {graph.folder('vision')} and {graph.folder('state')}")
 
 
 def serve(words: list[str]) -> None:
@@ -217,7 +229,7 @@ def inspect(words: list[str]) -> None:
         print(path)
 
 
-COMMANDS: dict[str, Callable[[list[str]], None]] = {f.__name__: f for f in (run, rl, stage, stages, evaluate, controls, serve, convert, inspect, bench, verify, submit, chaos, config, doctor)}
+COMMANDS: dict[str, Callable[[list[str]], None]] = {f.__name__: f for f in (run, rl, stage, stages, evaluate, controls, finetune, serve, convert, inspect, bench, verify, submit, chaos, config, doctor)}
 
 
 def _help() -> str:
@@ -236,7 +248,7 @@ def main() -> None:
         sys.exit(2)
     try:
         COMMANDS[words[0]](words[1:])
-    except (ConfigError, EpisodeError, FixtureError, FleetError, MissingGL, PolicyServerError, PoolError, RemoteError, TrainingDiverged, OSError) as error:
+    except (CheckpointError, ConfigError, EpisodeError, FixtureError, FleetError, MissingGL, PolicyServerError, PoolError, RemoteError, TrainingDiverged, OSError) as error:
         print(f"worldloop {words[0]}: {error}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:

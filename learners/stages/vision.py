@@ -11,7 +11,9 @@ from torch import Tensor
 
 from envs.episodes.clips import ClipSpec, ClipStore
 from envs.simulators.base import Simulator
+from envs.simulators.latent_world import LatentWorld
 from learners.fit import FitConfig, fit, step_generator
+from learners.lora import low_rank
 
 
 @dataclass(frozen=True)
@@ -23,12 +25,14 @@ class VisionConfig:
         unroll: chunks predicted from own predictions after that; the batch shrinks so that a step costs the same.
         strides: frame strides to draw from, uniformly.
         fresh: share of each batch drawn from the newest data set, so that what the policy now does is seen often; 0 draws by size.
+        lora: rank of the adapters that learn instead of all weights (latent worlds only); 0 trains all weights.
     """
 
     alone: float = 0.6
     unroll: int = 4
     strides: tuple[int, ...] = (1,)
     fresh: float = 0.0
+    lora: int = 0
 
 
 def train_vision(simulator: Simulator, store: ClipStore, episodes: Tensor, config: VisionConfig, options: FitConfig, folder: Path, newest: Tensor | None = None) -> dict[str, float]:
@@ -46,7 +50,15 @@ def train_vision(simulator: Simulator, store: ClipStore, episodes: Tensor, confi
             parts.append(store.sample(newest, recent, spec, generator))
         return torch.cat(parts) if len(parts) > 1 else parts[0]
 
-    return fit("vision", simulator, batch, simulator.loss, options, folder)
+    if not config.lora:
+        return fit("vision", simulator, batch, simulator.loss, options, folder)
+    if not isinstance(simulator, LatentWorld):
+        raise ValueError(f"vision lora={config.lora} adapts transformers; simulator.engine=dit and gesim have one")
+    simulator.requires_grad_(False)
+    with low_rank(simulator.net, config.lora):
+        stats = fit("vision", simulator, batch, simulator.loss, options, folder)
+    simulator.requires_grad_(True)
+    return stats
 
 
 def train_places(simulator: Simulator, store: ClipStore, episodes: Tensor, kept: Tensor, options: FitConfig, folder: Path) -> dict[str, float]:

@@ -80,7 +80,7 @@ def test_specs_and_partial_resets(server: Running, store: ClipStore) -> None:
 
 
 def test_more_rows_than_places_and_many_urls(server: Running, simulator: UNetSimulator, decoder: StateHead, store: ClipStore) -> None:
-    with pytest.raises(RemoteError, match="4 sessions are wanted, the servers at simulator.model.urls hold 3"):
+    with pytest.raises(RemoteError, match=r"4 sessions are wanted, the servers at simulator\.model\.urls hold 3"):
         world(RemoteSimulator(SHAPE, RemoteConfig((server.url,))), GivenStates(4), store, 4).reset()
     second = Running(SessionHost(simulator, decoder, ServeConfig(sessions=1), bf16=False))
     try:

@@ -1,0 +1,66 @@
+"""The commands around GE-Sim: convert, inspect, finetune, serve, and the benchmark's floor."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from actors.factory import ConfigError, build_simulator, build_state_decoder
+from envs.simulators.dit import DiTShape
+from pipeline import cli
+from pipeline.bench_gesim import FULL, count_flops
+from pipeline.config import load_config
+from pipeline.finetune import build_finetune
+from pipeline.serving import build_session_host
+from tests.envs.gesim_tiny import NET, VAE, write_checkpoint
+
+WORDS = ["simulator=gesim", "task.size=[32,48]", "task.chunk=5", "task.control_hz=30", "task.horizon=10", "task.mode=absolute", "track=disabled"]
+
+
+def test_convert_and_inspect(shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cli.convert([str(shared / "data/gesim_v2"), str(tmp_path / "out"), "frames=6", "size=[32,48]"])
+    cli.inspect([str(tmp_path / "out"), str(tmp_path / "pictures")])
+    assert "1 episodes" in capsys.readouterr().out and len(list((tmp_path / "pictures").glob("*.png"))) == 1
+    with pytest.raises(ConfigError, match="worldloop convert SRC DST"):
+        cli.convert(["only-one"])
+
+
+def test_finetune_a_checkpoint_and_serve_what_came_of_it(shared: Path, tmp_path: Path) -> None:
+    cli.convert([str(shared / "data/gesim_v2"), str(tmp_path / "data"), "frames=12", "size=[32,48]"])
+    checkpoint = write_checkpoint(tmp_path / "released")
+    words = [*WORDS, f"simulator.checkpoint={checkpoint}", f"runs={tmp_path / 'runs'}", f"finetune.data=[{tmp_path / 'data'}]"]
+    words += ["finetune.vision.fit.steps=2", "finetune.vision.fit.batch=2", "finetune.vision.lora=2", "finetune.state.fit.steps=2", "finetune.state.fit.batch=2"]
+    cfg = load_config(words)
+    graph = build_finetune(cfg, tmp_path / "runs/default")
+    done = graph.run()
+    assert set(done) == {"vision", "state"}
+    simulator = build_simulator(cfg, graph.folder("vision") / "weights.safetensors")
+    build_state_decoder(cfg, simulator, graph.folder("state") / "weights.safetensors")
+    host, config = build_session_host(cfg, tmp_path / "runs/default")
+    assert config.host == "127.0.0.1" and host.simulator.shape.chunk == 5 and host.decoder is not None
+    with pytest.raises(ConfigError, match="run this experiment first"):
+        build_session_host(load_config(WORDS), tmp_path / "nowhere")
+    with pytest.raises(ConfigError, match=r"finetune\.data"):
+        build_finetune(load_config(WORDS), tmp_path / "none").run()
+
+
+def test_gesim_sizes_come_from_the_config() -> None:
+    cfg = load_config([*WORDS])
+    cfg["simulator"]["model"] |= {"net": NET, "vae": VAE}
+    assert build_simulator(cfg).feature_shape == (3, 36, 48)
+    cfg["simulator"]["model"]["net"] = {"layers": 3}
+    with pytest.raises(ConfigError, match="layers"):
+        build_simulator(cfg)
+
+
+def test_the_floor_counts_what_the_network_does() -> None:
+    small = count_flops(FULL, DiTShape(num_layers=2), 1, {"base_dim": 16})
+    twice = count_flops(FULL, DiTShape(num_layers=4), 1, {"base_dim": 16})
+    # Per layer: 24 width^2 a token for attention and feed-forward to itself, and attention over 8448 or 25344 tokens.
+    tokens, width = 3 * 8448, 2048
+    least = 2 * (4 + 8) * width**2 * tokens * 2
+    assert twice["trunk"] - small["trunk"] > least and torch.isfinite(torch.tensor(list(small.values()))).all()
+    assert json.dumps(small)
