@@ -165,7 +165,7 @@ def count_flops(shape: WorldShape, net: DiTShape, steps: int, vae: dict[str, Any
     latents = 1 + (shape.chunk - 1) // 4
     height, width = shape.size[0] // 8, shape.size[1] // 8
     with torch.device("meta"):
-        trunk = MultiViewDiT(net).eval()
+        trunk = MultiViewDiT(net)  # not eval: what it keeps between steps has no meaning without numbers
         codec = AutoencoderKLWan(**vae).eval()
         z = torch.zeros(shape.views, net.in_channels, shape.memory + latents, height, width)
         times, text = torch.zeros(shape.views, shape.memory + latents), torch.zeros(1, 512, net.text_embed_dim)
@@ -178,10 +178,11 @@ def count_flops(shape: WorldShape, net: DiTShape, steps: int, vae: dict[str, Any
         return float(counter.get_total_flops()), out
 
     once, (_, fused) = counted(lambda: trunk(z, times, text, shape.views, shape.fps))
-    expert, _ = counted(lambda: trunk.decode_states(states, state_times, fused, shape.views))
+    keys, known = counted(lambda: trunk.feature_keys(fused, shape.views))
+    expert, _ = counted(lambda: trunk.decode_states(states, state_times, known, shape.views))
     encoded, _ = counted(lambda: codec.encode(still).latent_dist.mode())
     decoded, _ = counted(lambda: codec.decode(clip))
-    return {"trunk": steps * once, "state expert": steps * expert, "memory encoded": shape.views * shape.memory * encoded, "chunk decoded": shape.views * decoded}
+    return {"trunk": steps * once, "state expert": keys + steps * expert, "memory encoded": shape.views * shape.memory * encoded, "chunk decoded": shape.views * decoded}
 
 
 def floor(cfg: Mapping[str, Any]) -> None:

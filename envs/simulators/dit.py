@@ -255,10 +255,11 @@ class StateBlock(nn.Module):
         self.ff = FeedForward(width, 4.0, bias=True, approximate="tanh")
         self.scale_shift_table = nn.Parameter(torch.randn(6, width) / width**0.5)
 
-    def forward(self, x: Tensor, context: Tensor, temb: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
+    def forward(self, x: Tensor, context: Tensor | tuple[Tensor, Tensor], temb: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
+        """Tokens [B, N, width], and the features [B, L, context] or their keys and values."""
         shift1, scale1, gate1, shift2, scale2, gate2 = (self.scale_shift_table + temb.unflatten(-1, (6, -1))).unbind(-2)
         x = x + gate1 * self.attn1(rms(x) * (1 + scale1) + shift1, rope=rope)
-        x = x + self.attn2(x, context)
+        x = x + (self.attn2(x, context) if isinstance(context, Tensor) else self.attn2(x, known=context))
         return x + gate2 * self.ff(rms(x) * (1 + scale2) + shift2)
 
 
@@ -374,23 +375,28 @@ class MultiViewDiT(nn.Module):
         precision = torch.is_autocast_enabled(self.view_embed.device.type)
         return hash((precision, *((p.data_ptr(), p._version) for attention in self._to_text() for p in attention.parameters())))
 
-    def decode_states(self, states: Tensor, timestep: Tensor, features: Tensor, views: int, mask: Tensor | None = None) -> Tensor:
+    def feature_keys(self, features: Tensor, views: int) -> list[tuple[Tensor, Tensor]]:
+        """Keys and values of features [B * V, L, width] for every block of the state expert, the same at all its steps."""
+        context = features.unflatten(0, (-1, views)).flatten(1, 2)
+        return [block.attn2.keys_of(context) for block in self.pose_blocks if isinstance(block, StateBlock)]
+
+    def decode_states(self, states: Tensor, timestep: Tensor, features: Tensor | list[tuple[Tensor, Tensor]], views: int, mask: Tensor | None = None) -> Tensor:
         """One denoising step of the joint states.
 
         Args:
             states: [B, N, 16] history and future tokens; timestep: [B, N] noise level of each.
-            features: [B * V, L, width] from `forward`.
+            features: [B * V, L, width] from `forward`, or their `feature_keys`.
             mask: [B, N, 16] of the numbers that the robot has, 1, and has not, 0; the latter are neither seen nor moved.
 
         Returns:
             velocity [B, N, 16].
         """
         batch, count = states.shape[:2]
-        context = features.unflatten(0, (batch, views)).flatten(1, 2)
+        contexts = [features.unflatten(0, (batch, views)).flatten(1, 2)] * len(self.pose_blocks) if isinstance(features, Tensor) else features
         x = self.pose_proj_in(states if mask is None else states * mask)
         temb, embedded = (part.unflatten(0, (batch, count)) for part in self.pose_time_embed(timestep.reshape(-1)))
         rope = state_rope(count, self.shape.pose_attention_head_dim, states.device)
-        for block in self.pose_blocks:
+        for block, context in zip(self.pose_blocks, contexts, strict=True):
             x = block(x, context, temb, rope)
         shift, scale = (self.pose_scale_shift_table + embedded[:, :, None]).unbind(2)
         x = F.layer_norm(x, (x.shape[-1],), eps=1e-6) * (1 + scale) + shift

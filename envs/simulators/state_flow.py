@@ -106,10 +106,10 @@ class StateExpert(StateDecoder):
         moves = torch.cat([to_relative(past_commands, now), to_relative(commands, now)], 1) * 10.0
         return torch.cat([torch.nn.functional.pad(moves, (0, TOKEN - moves.shape[-1])), past], 1), past[:, -1:]
 
-    def _velocity(self, z: Tensor, level: Tensor, tokens: Tensor, features: Tensor) -> Tensor:
+    def _velocity(self, z: Tensor, level: Tensor, tokens: Tensor, features: Tensor | list[tuple[Tensor, Tensor]]) -> Tensor:
         levels = torch.zeros(len(z), tokens.shape[1] + self.chunk, device=z.device)
         levels[:, tokens.shape[1] :] = self.time_scale * level[:, None]
-        return self.net.decode_states(torch.cat([tokens, z], 1), levels, features.flatten(0, 1), self.views)[:, -self.chunk :].float()
+        return self.net.decode_states(torch.cat([tokens, z], 1), levels, features, self.views)[:, -self.chunk :].float()
 
     def _thinned(self, past: Tensor, commands: Tensor, chunk_index: Tensor) -> Tensor:
         """Every so many-th of the past [B, M * every, 16], for chunks before the first the first command to come."""
@@ -129,7 +129,8 @@ class StateExpert(StateDecoder):
             generator = torch.Generator().manual_seed((int(s) * 999_983 + int(c)) & 0x7FFF_FFFF_FFFF)
             rows.append(torch.randn(self.chunk, STATE_DIM, generator=generator))
         noise = torch.stack(rows).to(features.device)
-        z = self.sampler(lambda z, level: self._velocity(z, torch.full((len(z),), level, device=z.device), tokens, features), noise)
+        known = self.net.feature_keys(features.flatten(0, 1), self.views)
+        z = self.sampler(lambda z, level: self._velocity(z, torch.full((len(z),), level, device=z.device), tokens, known), noise)
         return (origin + z) * self.state_std + self.state_mean
 
     def loss(self, features: Tensor, commands: Tensor, past_commands: Tensor, past_states: Tensor, truth: Tensor, valid: Tensor, generator: torch.Generator) -> Tensor:
@@ -140,7 +141,7 @@ class StateExpert(StateDecoder):
         noise = torch.randn(target.shape, generator=generator).to(target.device)
         level = torch.rand(len(target), generator=generator).to(target.device)
         mixed = level[:, None, None]
-        velocity = self._velocity((1 - mixed) * target + mixed * noise, level, tokens, features)
+        velocity = self._velocity((1 - mixed) * target + mixed * noise, level, tokens, features.flatten(0, 1))
         error = (velocity - (noise - target)).square() * valid[..., None]
         return error.sum() / (valid.sum() * STATE_DIM).clamp(min=1)
 

@@ -9,13 +9,20 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
 from envs.conditioning import render_ray_map
+from envs.judges import LearnedJudge
+from envs.kinematics import Kinematics, KinematicsError
 from envs.layouts import CommandLayout
+from envs.schema import CHUNK, STATE, ActionMode, Rewards
 from envs.simulators.base import WorldShape
 from envs.simulators.gesim import GESimConfig, GESimulator
 from envs.simulators.gesim_folder import CheckpointError, load_released
 from envs.simulators.sampling import EDM, Distilled
+from envs.transforms import world_transforms
+from envs.world import Starts, WorldEnv
 from tests.envs.gesim_tiny import NET, VAE, write_checkpoint
 
 SHAPE = WorldShape(views=3, size=(32, 48), chunk=5, memory=4, fps=30.0, objects=0, layout=CommandLayout.JOINTS)
@@ -145,3 +152,34 @@ def test_from_nothing_at_any_size_and_chunks_that_fit_the_autoencoder() -> None:
         GESimConfig(steps=9)
     with pytest.raises(ValueError, match="parity"):
         GESimConfig(parity="almost")
+
+
+def test_a_joint_world_is_an_ordinary_environment(world: GESimulator) -> None:
+    rest = torch.tensor([0, -0.35, 0, 2.1, 0, 1.39, 0, 0.2] * 2)
+    count, views = 3, ("head", "hand_left", "hand_right")
+    k = torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]).repeat(count, 3, 1, 1)
+    c2w = torch.eye(4).repeat(count, 3, 1, 1)
+    c2w[..., 2, 3] = -2.0
+    pictures = torch.randint(0, 255, (count, 3, 3, *SHAPE.size), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    starts = Starts(pictures, torch.full_like(pictures, 50), rest.repeat(count, 1), rest.repeat(count, 1), k, c2w, ["pour"] * count, views)
+
+    def env(kinematics: Kinematics | None) -> TransformedEnv:
+        base = WorldEnv(world, starts, 2, 10, ActionMode.ABSOLUTE, bf16=False)
+        return TransformedEnv(base, world_transforms(world.state_expert().eval(), LearnedJudge(3, 4), Rewards(), views, kinematics=kinematics))
+
+    check_env_specs(env(Kinematics()))
+    acting = env(Kinematics())
+    now = acting.reset()
+    now[CHUNK] = rest.repeat(2, 5, 1)
+    after = acting.step(now)["next"]
+    assert after[STATE].shape == (2, 16) and after["observation", "command"].shape == (2, 16)
+    # Wrist cameras went with the hands, which the joints say stayed where they were.
+    assert torch.allclose(after["camera", "c2w"], now["camera", "c2w"], atol=1e-5)
+    lost = env(None)
+    now = lost.reset()
+    now[CHUNK] = rest.repeat(2, 5, 1)
+    with pytest.raises(KinematicsError, match=r"simulator\.kinematics"):
+        lost.step(now)
+    now[CHUNK] = torch.zeros(2, 5, 14)
+    with pytest.raises(ValueError, match="L7,Lg,R7,Rg"):
+        lost.step(now)

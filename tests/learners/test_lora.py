@@ -40,7 +40,7 @@ def test_memory_augmentation_spoils_chosen_clips_alone_and_all_views_alike() -> 
     frames = torch.rand(64, 4, 3, 3, 16, 16)
     chosen = chosen_clips(64, 0.5, generator)
     spoilt = spoil_pictures(frames, chosen, generator)
-    assert torch.equal(spoilt[~chosen], frames[~chosen]) and 0 <= spoilt.min() and spoilt.max() <= 1
+    assert torch.equal(spoilt[~chosen], frames[~chosen]) and spoilt.min() >= 0 and spoilt.max() <= 1
     assert 0.3 < (spoilt[chosen] != frames[chosen]).flatten(1).any(1).float().mean() < 0.95
     grey = torch.full((64, 2, 3, 3, 16, 16), 0.5)
     shifted = spoil_pictures(grey, torch.ones(64, dtype=torch.bool), generator)
