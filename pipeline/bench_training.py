@@ -50,7 +50,7 @@ def latent_error(world: LatentWorld, store: ClipStore, episodes: Tensor, begin: 
     return float((made - truth).square().mean().sqrt() / (still - truth).square().mean().sqrt())
 
 
-def overfit(cfg: Mapping[str, Any], steps: int = 600) -> dict[str, float]:
+def overfit(cfg: Mapping[str, Any], steps: int = 400) -> dict[str, float]:
     """A tiny GE-Sim on a bundle's calibration and Bridge frames: vision, then adapters alone, then the state expert.
 
     The autoencoder has random weights, so errors are those of latents. finetune.data=[bundle folder, clip folder].

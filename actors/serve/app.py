@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
 import cv2
@@ -76,11 +76,24 @@ class Server:
             ("/step", self.step),
         ):
             app.router.add_post(path, call)
+        app.cleanup_ctx.append(self._sweep)
         app.router.add_get("/healthz", self.healthz)
         app.router.add_get("/", self.page)
         app.router.add_get("/api/status", self.status)
         app.router.add_get("/api/preview.jpg", self.preview)
         return app
+
+    async def _sweep(self, app: web.Application) -> AsyncIterator[None]:
+        """End idle sessions for as long as the server runs."""
+
+        async def forever() -> None:
+            while True:
+                await asyncio.sleep(min(30.0, self.host.config.idle_s / 2))
+                self.host.expire()
+
+        task = asyncio.create_task(forever())
+        yield
+        task.cancel()
 
     async def _body(self, request: web.Request) -> bytes:
         if (request.content_length or 0) > self.limit:

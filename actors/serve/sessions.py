@@ -40,7 +40,7 @@ class ServeConfig:
         sessions: held at once; /init beyond that is refused.
         batch: sessions that share a forward pass.
         linger_ms: that a step waits for company.
-        idle_s: after which an unused session may be ended.
+        idle_s: after which an unused session ends.
         body_mb: largest request body.
         seed: of sessions that name none.
     """
@@ -119,16 +119,20 @@ class SessionHost:
         Raises:
             NoPlace: if all places are in use.
         """
-        now = time.monotonic()
-        for client in [key for key, session in self.sessions.items() if now - session.touched > self.config.idle_s and not session.lock.locked()]:
-            self.close(client)
+        self.expire()
         if len(self.sessions) >= self.config.sessions:
             raise NoPlace(f"all serve.sessions={self.config.sessions} are in use; close one, or wait until one was idle for serve.idle_s={self.config.idle_s:g} seconds")
-        session = Session(uuid.uuid4().hex, user, self.config.seed + self.opened if seed is None else seed, now)
+        session = Session(uuid.uuid4().hex, user, self.config.seed + self.opened if seed is None else seed, time.monotonic())
         self.opened += 1
         self.sessions[session.client_id] = session
         self.latest = session
         return session
+
+    def expire(self) -> None:
+        """End the sessions that nobody used for `idle_s` seconds."""
+        now = time.monotonic()
+        for client in [key for key, session in self.sessions.items() if now - session.touched > self.config.idle_s and not session.lock.locked()]:
+            self.close(client)
 
     def get(self, client_id: object) -> Session:
         """The session of a client.
