@@ -96,7 +96,7 @@ def gesim(cfg: Mapping[str, Any]) -> None:
     count = sum(p.numel() for p in world.net.parameters())
     print(f"{count / 1e6:.0f}M parameters, {shape.views} x {shape.size[0]} x {shape.size[1]}, {shape.chunk} frames, {len(world.sampler.sigmas)} steps, {torch.cuda.get_device_name() if big else 'CPU'}")  # type: ignore[attr-defined]
     watch = Watch(device)
-    repeats = 5 if big else 3
+    repeats = 5 if big else 2
     plain = 0.0
     for batch in (1, 2, 4, 8):
         if big:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -368,7 +369,7 @@ class MultiViewDiT(nn.Module):
         return self._text[2]
 
     def _to_text(self) -> list[Attention]:
-        return [block.attn2 for block in self.transformer_blocks if isinstance(block, VisionBlock)]
+        return [cast(VisionBlock, block).attn2 for block in self.transformer_blocks]
 
     def _stamp(self) -> int:
         """Changes whenever weights do that the kept keys depend on, and with the precision they are computed in."""
@@ -378,7 +379,7 @@ class MultiViewDiT(nn.Module):
     def feature_keys(self, features: Tensor, views: int) -> list[tuple[Tensor, Tensor]]:
         """Keys and values of features [B * V, L, width] for every block of the state expert, the same at all its steps."""
         context = features.unflatten(0, (-1, views)).flatten(1, 2)
-        return [block.attn2.keys_of(context) for block in self.pose_blocks if isinstance(block, StateBlock)]
+        return [cast(StateBlock, block).attn2.keys_of(context) for block in self.pose_blocks]
 
     def decode_states(self, states: Tensor, timestep: Tensor, features: Tensor | list[tuple[Tensor, Tensor]], views: int, mask: Tensor | None = None) -> Tensor:
         """One denoising step of the joint states.
