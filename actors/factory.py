@@ -125,6 +125,11 @@ def build_kinematics(cfg: Mapping[str, Any]) -> Kinematics | None:
         raise ConfigError(str(error)) from error
 
 
+def joints_to_hands(cfg: Mapping[str, Any]) -> Kinematics | None:
+    """Kinematics for those who say joints to a world of end-effector commands; where none are named, the bench's, whose worlds those are."""
+    return build_kinematics(cfg) or (Kinematics() if CommandLayout(cfg["simulator"]["layout"]) is CommandLayout.EEF else None)
+
+
 def open_clips(cfg: Mapping[str, Any], folders: Iterable[Path]) -> ClipStore:
     """Data sets as one store, with the commands and pose maps that the simulator takes."""
     return ClipStore(list(folders), CommandLayout(cfg["simulator"]["layout"]), pose_style(cfg))
@@ -203,10 +208,9 @@ def build_policy(cfg: Mapping[str, Any], weights: Path | None = None) -> ChunkPo
 
 
 def build_openpi(cfg: Mapping[str, Any], url: str) -> OpenPIPolicy:
-    """An openpi server as a policy for the worlds of this config; the bench's own kinematics stand in where none are named."""
+    """An openpi server as a policy for the worlds of this config."""
     layout = CommandLayout(cfg["simulator"]["layout"])
-    kinematics = build_kinematics(cfg) or (Kinematics() if layout is CommandLayout.EEF else None)
-    return OpenPIPolicy(url, tuple(cfg["task"]["views"]), cfg["task"]["chunk"], layout, ActionMode(cfg["task"]["mode"]), kinematics)
+    return OpenPIPolicy(url, tuple(cfg["task"]["views"]), cfg["task"]["chunk"], layout, ActionMode(cfg["task"]["mode"]), joints_to_hands(cfg))
 
 
 def build_physics(cfg: Mapping[str, Any], batch: int, record: bool = False, seed: int = 0) -> PhysicsEnv:

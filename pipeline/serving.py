@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from actors.factory import ConfigError, build_kinematics, build_simulator, build_state_decoder, options
+from actors.factory import ConfigError, build_simulator, build_state_decoder, joints_to_hands, options
 from actors.serve.sessions import ServeConfig, SessionHost
 from pipeline.loop import build_loop
 
@@ -27,4 +27,4 @@ def build_session_host(cfg: Mapping[str, Any], root: Path) -> tuple[SessionHost,
         raise ConfigError(f"{weights} does not exist; run this experiment first, or serve released weights by simulator=gesim simulator.checkpoint=<folder>")
     simulator = build_simulator(cfg, weights if weights.exists() else None)
     decoder = build_state_decoder(cfg, simulator, decoder_weights if decoder_weights.exists() else None)
-    return SessionHost(simulator, decoder.eval(), config, build_kinematics(cfg), cfg["simulator"]["bf16"]), config
+    return SessionHost(simulator, decoder.eval(), config, joints_to_hands(cfg), cfg["simulator"]["bf16"]), config
