@@ -110,7 +110,7 @@ def gesim(cfg: Mapping[str, Any]) -> None:
         print(f"batch {batch}: {seconds:.2f} s a chunk{note}, {batch * shape.chunk / seconds:.1f} frames/s, {plain * batch / seconds:.2f}x the frames per second of batch 1, {memory:.1f} GiB at most")
     _parts(world, device, watch)
     _variants(world, device, watch, plain, repeats)
-    floor(cfg)
+    floor()
 
 
 def _parts(world: GESimulator, device: torch.device, watch: Watch) -> None:
@@ -140,11 +140,10 @@ def _variants(world: GESimulator, device: torch.device, watch: Watch, plain: flo
         print(f"  {name}: {seconds:.2f} s, {plain / seconds:.2f}x")
 
     print("one change at a time, against the plain run:")
-    known, prompt = world.net._known, world.prompt
+    known = world.net._known
     world.net._known = lambda text, batch: [text[:1].repeat(batch, 1, 1)] * len(world.net.transformer_blocks)  # type: ignore[method-assign, assignment]
     ratio("the text's keys computed anew for every view, block and step")
     world.net._known = known  # type: ignore[method-assign]
-    world.prompt = prompt
     codec: Any = world.codec
     pixels, codec.pixels = codec.pixels, 1
     ratio("views encoded and decoded one after another")
@@ -185,7 +184,7 @@ def count_flops(shape: WorldShape, net: DiTShape, steps: int, vae: dict[str, Any
     return {"trunk": steps * once, "state expert": keys + steps * expert, "memory encoded": shape.views * shape.memory * encoded, "chunk decoded": shape.views * decoded}
 
 
-def floor(cfg: Mapping[str, Any]) -> None:
+def floor() -> None:
     """Operations and bytes of the 2B configuration, and the seconds below which no dense bf16 run of it can go."""
     net = DiTShape()
     flops = count_flops(FULL, net, 4, {})
