@@ -213,11 +213,7 @@ class SessionHost:
             commands = commands.to(device)
             with mixed_precision(device, self.bf16):
                 frames, features, state = self.simulator.step(state, commands, maps.to(device), c2w.to(device))
-            decoded: Tensor | None = None
-            if self.decoder is not None:
-                recent = self.simulator.recent(state, self.decoder.memory + chunk)[:, : self.decoder.memory]
-                decoded = self.decoder.decode(features, commands, recent["commands"], recent["states"], state["seed"], state["chunk_index"])
-                self.simulator.remember_states(state, decoded)
+            decoded = None if self.decoder is None else self.decoder.follow(self.simulator, state, features)
             self.passes, self.steps = self.passes + 1, self.steps + len(jobs)
             out = []
             for row, job in enumerate(jobs):

@@ -47,12 +47,7 @@ def replay(simulator: Simulator, store: ClipStore, episodes: Tensor, decoder: St
             commands = store.arrays["commands"][at].to(device)
             with mixed_precision(device, bf16):
                 made, features, state = simulator.step(state, commands, store.pose_maps(at).to(device), store.arrays["c2w"][at].to(device))
-            if decoder is not None:
-                recent = simulator.recent(state, decoder.memory + chunk)[:, : decoder.memory]
-                decoded = decoder.decode(features, commands, recent["commands"], recent["states"], state["seed"], state["chunk_index"])
-                simulator.remember_states(state, decoded)
-            else:
-                decoded = store.arrays["states"][start][:, None].expand(-1, chunk, -1)
+            decoded = decoder.follow(simulator, state, features) if decoder is not None else store.arrays["states"][start][:, None].expand(-1, chunk, -1)
             frames.append(made.cpu())
             rows.append(at)
             valid.append(ahead <= last)

@@ -50,6 +50,22 @@ class StateDecoder(nn.Module):
         """
         raise NotImplementedError
 
+    def follow(self, simulator: Simulator, state: TensorDict, features: Tensor) -> Tensor:
+        """Decode the chunk that a session has just made, and write it into its memory.
+
+        Args:
+            state: of the simulator after the step, changed in place.
+            features: of that step.
+
+        Returns:
+            float32 [B, K, 16].
+        """
+        chunk = simulator.shape.chunk
+        recent = simulator.recent(state, self.memory + chunk)
+        decoded = self.decode(features, recent["commands"][:, -chunk:], recent["commands"][:, : self.memory], recent["states"][:, : self.memory], state["seed"], state["chunk_index"])
+        simulator.remember_states(state, decoded)
+        return decoded
+
     def loss(self, features: Tensor, commands: Tensor, past_commands: Tensor, past_states: Tensor, truth: Tensor, valid: Tensor, generator: torch.Generator) -> Tensor:
         """Training loss against true states [B, K, 16], where valid [B, K]."""
         raise NotImplementedError

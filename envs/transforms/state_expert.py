@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.envs import Transform
 
 from envs.schema import FEATURES, STATE
@@ -23,15 +23,8 @@ class StateExpertTransform(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         world = self.parent.base_env
-        session: TensorDict = world.session
-        count = world.chunk
-        recent = world.simulator.recent(session, self.decoder.memory + count)
-        history = recent[:, : self.decoder.memory]
         with torch.no_grad():
-            states = self.decoder.decode(
-                next_tensordict[FEATURES], recent["commands"][:, -count:], history["commands"], history["states"], session["seed"], session["chunk_index"]
-            )
-        world.simulator.remember_states(session, states)
+            states = self.decoder.follow(world.simulator, world.session, next_tensordict[FEATURES])
         next_tensordict[STATE] = states[:, -1]
         return next_tensordict
 
