@@ -105,7 +105,7 @@ def bench_config(cfg: Mapping[str, Any]) -> BenchConfig:
 def world_shape(cfg: Mapping[str, Any]) -> WorldShape:
     """What every simulator of this config shows."""
     task = cfg["task"]
-    return WorldShape(len(task["views"]), tuple(task["size"]), task["chunk"], cfg["simulator"]["memory"], task["control_hz"], cfg["simulator"]["objects"], CommandLayout(cfg["simulator"]["layout"]))
+    return WorldShape(len(task["views"]), tuple(task["size"]), task["chunk"], cfg["simulator"]["memory"], task["control_hz"], tuple(cfg["simulator"]["sides"]), CommandLayout(cfg["simulator"]["layout"]))
 
 
 def pose_style(cfg: Mapping[str, Any]) -> PoseMapStyle:

@@ -15,6 +15,7 @@ from torchrl.data.vla import ACTION_CHUNK_KEY, IMAGE_KEY, STATE_KEY
 from envs.layouts import CommandLayout
 
 ACTION_DIM = 14  # [x, y, z, roll, pitch, yaw, gripper] of the left, then the right arm; metres, radians, 0 open..1 closed
+OBJECT_DIM = 4  # [x, y, z, heading] of a thing; metres, and radians about the vertical; what is not known is NaN
 STATE_DIM = 16  # [left joints 7, left gripper, right joints 7, right gripper]; radians, 0 open..1 closed
 
 CHUNK = ACTION_CHUNK_KEY  # ("vla_action", "chunk") float32 [B, K, 14]

@@ -25,7 +25,7 @@ from envs.simulators.base import WorldShape
 from envs.simulators.dit import DiTShape, MultiViewDiT
 from envs.simulators.gesim import GESimConfig, GESimulator
 
-FULL = WorldShape(views=3, size=(384, 512), chunk=25, memory=4, fps=30.0, objects=0, layout=CommandLayout.JOINTS)
+FULL = WorldShape(views=3, size=(384, 512), chunk=25, memory=4, fps=30.0, sides=(), layout=CommandLayout.JOINTS)
 SMALL = replace(FULL, size=(96, 128))
 SMALL_NET: dict[str, Any] = {"num_attention_heads": 4, "attention_head_dim": 64, "num_layers": 6, "text_embed_dim": 64, "adaln_lora_dim": 64, "pose_num_attention_heads": 4, "pose_attention_head_dim": 32}
 SMALL_VAE: dict[str, Any] = {"base_dim": 16}
@@ -116,7 +116,7 @@ def gesim(cfg: Mapping[str, Any]) -> None:
 def _parts(world: GESimulator, device: torch.device, watch: Watch) -> None:
     """Where the seconds of one chunk go at batch 1."""
     state, arguments = _inputs(world, 1, device)
-    names = ((world, "remember", "memory encoded"), (world, "conditioning", "conditioning"), (world, "_velocity", "trunk"), (world, "decode", "chunk decoded"), (world, "_noise", "noise"))
+    names = ((world, "remember", "memory encoded"), (world, "conditioning", "conditioning"), (world, "_says", "trunk"), (world, "decode", "chunk decoded"), (world, "_noise", "noise"))
     with mixed_precision(device, True):
         world.step(state.clone(), *arguments)
         undo = [watch.wrap(*name) for name in names]

@@ -45,7 +45,7 @@ def latent_error(world: LatentWorld, store: ClipStore, episodes: Tensor, begin: 
     """Root-mean-square error of generated latents of single chunks, as a share of what saying nothing moves would cost (1 is no better)."""
     clip = store.clips(episodes, begin, ClipSpec(world.shape.memory, world.shape.chunk))
     world.eval()
-    made, _ = world._denoise(world.asked(clip, 0, generator=torch.Generator().manual_seed(1)))
+    made, *_ = world._denoise(world.asked(clip, 0, generator=torch.Generator().manual_seed(1)))
     truth = world.encode(unit(clip["future", "frames"]))
     still = world.encode(unit(clip["memory", "frames"][:, 0, -1:].expand(-1, world.shape.chunk, -1, -1, -1, -1)))
     return float((made - truth).square().mean().sqrt() / (still - truth).square().mean().sqrt())
@@ -63,7 +63,7 @@ def overfit(cfg: Mapping[str, Any], steps: int = 400) -> dict[str, float]:
         folder = Path(name)
         bundle, clips = cfg["finetune"]["data"]
         store, turned = (bridge_under_calibration(Path(bundle), Path(clips), folder / f"data-{turn}", turn) for turn in (0, 1))
-        shape = WorldShape(3, store.size, 5, 4, 30.0, 0, CommandLayout.JOINTS)
+        shape = WorldShape(3, store.size, 5, 4, 30.0, (), CommandLayout.JOINTS)
         world = GESimulator.build(shape, GESimConfig(net=TINY_NET, vae=TINY_VAE, sampling="edm", augment=0.0), None)
         _normalise_latents(world, store)
         begin = torch.arange(0, 10)

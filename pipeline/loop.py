@@ -46,7 +46,7 @@ def build_loop(cfg: Cfg, root: Path) -> Graph:
         vision = add(f"vision-{number}", (*data, *warm), {**learned, "vision": cfg["vision"][steps]}, work.vision, data=tuple(data), warm=warm, steps=steps)
         state = add(f"state-{number}", (*data, vision, *((state,) if state else ())), {**learned, "state": cfg["state"][steps]}, work.state, data=tuple(data), vision=vision, warm=state, steps=steps)
         settings = {**learned, "judge": cfg["judge"], "judge_fit": cfg["judge_fit"][steps]}
-        judge = add(f"judge-{number}", (*data, vision, *((judge,) if judge else ())), settings, work.judge, data=tuple(data), vision=vision, warm=judge, steps=steps, number=number)
+        judge = add(f"judge-{number}", (*data, vision, *((judge,) if judge else ())), settings, work.judge, data=tuple(data), vision=vision, warm=judge, steps=steps)
         settings = {**settings, "policy": cfg["policy"]}
         gap = add(f"gap-{number}", (*data, vision, state, judge, policy, held_out), {**settings, "measure": cfg["measure"]}, work.gap, data=tuple(data), vision=vision, state=state, judge=judge, policy=policy, number=number)
         cloned = add(f"clone-{number}", (*data, policy, vision), {**learned, "policy": cfg["policy"], "imitation": cfg["imitation"], "clone": cfg["clone"]}, work.clone, data=tuple(data), policy=policy, vision=vision)

@@ -23,20 +23,20 @@ def rollout_error(store: ClipStore, episodes: Tensor, made: Replay) -> dict[str,
 
     Returns:
         Object position error in pixels and centimetres (median, 90th percentile; over all frames, and at the last),
-        share of frames in which the object is lost, PSNR of the first chunk's and the last frames in dB, joint
+        the error of the place where the simulator itself has the object, share of frames in which the object is lost, PSNR of the first chunk's and the last frames in dB, joint
         state error in rad, and the error of the measuring stick itself on true video.
     """
     start = store.start[episodes]
     first = store.frames(start)[:, 0]
     intrinsic, c2w = store.intrinsic[episodes][:, 0], store.arrays["c2w"][start][:, 0]
     objects = store.arrays["objects"]
-    block = objects[start][:, 0]
+    block = objects[start][:, 0, :3]
     truth = store.frames(made.rows)
     said, lost = locate(made.frames[:, :, 0], first, block, intrinsic, c2w)
     seen, hidden = locate(truth[:, :, 0], first, block, intrinsic, c2w)
-    where, _ = project(objects[made.rows][:, :, 0], intrinsic, c2w)
+    where, _ = project(objects[made.rows][:, :, 0, :3], intrinsic, c2w)
     height = block[:, None, None, 2].expand(-1, said.shape[1], 1)
-    metres = (on_plane(said, height, intrinsic, c2w) - objects[made.rows][:, :, 0])[..., :2].norm(dim=-1)
+    metres = (on_plane(said, height, intrinsic, c2w) - objects[made.rows][:, :, 0, :3])[..., :2].norm(dim=-1)
     pixels = (said - where).norm(dim=-1)
     count = made.valid.shape[1]
     last = made.valid.long().cumsum(1).argmax(1)
@@ -54,6 +54,7 @@ def rollout_error(store: ClipStore, episodes: Tensor, made: Replay) -> dict[str,
         "object_cm": quantiles(metres[use & ~lost] * 100),
         "object_px_at_end": quantiles(pixels[use & ~lost & ends]),
         "object_cm_at_end": quantiles(metres[use & ~lost & ends] * 100),
+        "place_cm": quantiles(100 * (made.places[:, :, 0, :2] - objects[made.rows][:, :, 0, :2]).norm(dim=-1)[made.valid]),
         "object_lost": share(lost[use]),
         "psnr_first_frames": float(psnr[made.valid & early].mean()),
         "psnr_last_frames": float(psnr[made.valid & late].mean()),

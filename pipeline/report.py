@@ -169,11 +169,11 @@ def _pm(entry: Mapping[str, float], digits: int = 2) -> str:
 
 def _rollout_table(result: Mapping[str, Any]) -> str:
     rows = [
-        [name, str(e["episodes"]), _pm(e["object_px"]), _pm(e["object_cm"]), _pm(e["object_cm_at_end"]), f"{100 * e['object_lost']:.1f}%", f"{e['psnr_first_frames']:.1f} → {e['psnr_last_frames']:.1f}", _pm(e["state_rad"], 4), _pm(e["stick_px"])]
+        [name, str(e["episodes"]), _pm(e["object_px"]), _pm(e["object_cm"]), _pm(e["object_cm_at_end"]), _pm(e["place_cm"]), f"{100 * e['object_lost']:.1f}%", f"{e['psnr_first_frames']:.1f} → {e['psnr_last_frames']:.1f}", _pm(e["state_rad"], 4), _pm(e["stick_px"])]
         for name, e in result["rollout"].items()
     ]
     speed = ", ".join(f"{name}: {value:.0f}" for name, value in result["frames_per_second"].items())
-    head = ["episodes", "n", "object px, median / p90", "cm", "cm at the end", "lost", "PSNR dB, first → last", "state rad", "stick px"]
+    head = ["episodes", "n", "object px, median / p90", "cm", "cm at the end", "own account cm", "lost", "PSNR dB, first → last", "state rad", "stick px"]
     return _table(head, rows) + f"<p class=dim>frames per second (all views of a time step count once): {speed}</p>"
 
 
@@ -230,11 +230,10 @@ def _curves(found: Found, rounds: int) -> list[str]:
                 values = smooth([row[metric] for row in rows], 25)
                 curves.append((name, list(range(len(values))), values))
         urls.append(plot(curves, title, "step", metric.split("/")[1].replace("_", " ")))
-    rows = read_metrics(found["vision-1"] / "places")
-    if rows:  # empty where no episode knows its objects' places
-        curves = []
-        for key, label in (("found_cm", "found in the first view"), ("way_cm", "moved by commands")):
-            values = smooth([row[f"places/{key}"] for row in rows], 50)
-            curves.append((label, list(range(len(values))), values))
+    curves = []
+    for part, key, label in (("sight", "found_cm", "found in the first view"), ("contact", "way_cm", "moved by commands")):
+        values = smooth([row[f"{part}/{key}"] for row in read_metrics(found["vision-1"] / part)], 50)
+        curves.append((label, list(range(len(values))), values))
+    if any(values for _, _, values in curves):  # empty where no episode knows its objects' places
         urls.append(plot(curves, "Objects' places, round 1", "step", "error in cm"))
     return urls

@@ -41,9 +41,9 @@ from learners.parallel import leads
 from learners.rl import train_rl
 from learners.stages.generated import generated_frames
 from learners.stages.imitation import Cloning, train_imitation
-from learners.stages.judge import calibrate, train_judge
+from learners.stages.judge import calibrate, train_judge, unseen_by_judge
 from learners.stages.state import train_state
-from learners.stages.vision import VisionConfig, train_places, train_vision
+from learners.stages.vision import VisionConfig, train_contact, train_sight, train_vision
 from pipeline import measurement
 from pipeline.artefact import save_weights, write_text
 from pipeline.statistics import rate_entry
@@ -200,13 +200,14 @@ def tokenizer(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...]) -> di
 def vision(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], warm: tuple[str, ...], steps: str) -> dict[str, Any]:
     """The simulator, from nothing in the first round and from its predecessor after that."""
     section = dict(cfg["vision"][steps])
-    fit_section, places_section = section.pop("fit"), section.pop("places")
+    fit_section, sight_section, contact_section = (section.pop(name) for name in ("fit", "sight", "contact"))
     store = open_store(cfg, found, data)
     train, kept = split(store)
     newest = train[train >= len(store) - len(open_store(cfg, found, data[-1:]))]
     prepare_process(cfg["seed"])
     simulator = build_simulator(cfg, found[warm[0]] / "weights.safetensors" if warm else None)
-    train_places(simulator, store, train, kept, fit_options(cfg, places_section, f"vision.{steps}.places"), folder / "places")
+    train_sight(simulator, store, train, fit_options(cfg, sight_section, f"vision.{steps}.sight"), folder / "sight")
+    train_contact(simulator, store, train, kept, fit_options(cfg, contact_section, f"vision.{steps}.contact"), folder / "contact")
     stats = train_vision(simulator, store, train, options(VisionConfig, section, f"vision.{steps}"), fit_options(cfg, fit_section, f"vision.{steps}.fit"), folder, newest)
     save_weights(simulator, folder)
     return {**stats, "parameters": sum(p.numel() for p in simulator.parameters())}
@@ -227,12 +228,14 @@ def state(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
     return stats
 
 
-def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, warm: str, steps: str, number: int) -> dict[str, Any]:
-    """The judge on real and on generated frames, its threshold calibrated on real video of the policy that was deployed last."""
+def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str, warm: str, steps: str) -> dict[str, Any]:
+    """The judge on real and on generated frames, its threshold calibrated on real video that no judge learns from."""
     section = dict(cfg["judge_fit"][steps])
     fit_section = section.pop("fit")
     store = open_store(cfg, found, data)
     train, _ = split(store)
+    unseen = unseen_by_judge(store)
+    train = train[~torch.isin(train, unseen)]
     prepare_process(cfg["seed"])
     simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
     judge = build_judge(cfg, found[warm] / "weights.safetensors" if warm else None)
@@ -240,11 +243,11 @@ def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
     # Half a centimetre is what the judge is to tell apart; labels further off would blur that.
     imagined = generated_frames(simulator, store, pick, cfg["simulator"]["bf16"], within=0.005) if len(pick) else None
     stats = train_judge(judge, store, train, fit_options(cfg, fit_section, f"judge_fit.{steps}.fit"), folder, imagined)
-    mine = store.select([f"policy-{number}"])
-    rows, valid = store.whole(mine)
-    success = measurement.judge_frames(judge, store.frames(rows), store, mine)
-    rate = torch.tensor([store.episodes[n]["success"] for n in mine.tolist()]).float().mean()
-    calibrate(judge, torch.where(valid, success, 0.0), float(rate))
+    if len(unseen):
+        rows, valid = store.whole(unseen)
+        success = measurement.judge_frames(judge, store.frames(rows), store, unseen)
+        rate = torch.tensor([store.episodes[n]["success"] for n in unseen.tolist()]).float().mean()
+        calibrate(judge, torch.where(valid, success, 0.0), float(rate))
     save_weights(judge, folder)
     return {**stats, "threshold": float(judge.threshold), "generated_frames": len(imagined) if imagined is not None else 0}
 

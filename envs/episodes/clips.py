@@ -126,9 +126,9 @@ class ClipStore:
         """Clips that begin at frame `begin` [B] of `episode` [B].
 
         Returns:
-            TensorDict [B] with memory (index [L, M], frames, pose_map uint8 [L, M, V, 3, H, W], c2w [L, M, V, 4, 4]),
-            future (frames, pose_map [L*K, V, 3, H, W], c2w, commands [L*K, 14], states [L*K, 16], objects [L*K, 2, 3], valid [L*K]),
-            now (command [14], state [16], objects [2, 3]), history (states, commands [M, ...]), intrinsic [V, 3, 3], begin [].
+            TensorDict [B] with memory (index [L, M], frames, pose_map uint8 [L, M, V, 3, H, W], c2w [L, M, V, 4, 4], objects [L, M, 2, 4]),
+            future (frames, pose_map [L*K, V, 3, H, W], c2w, commands [L*K, 14], states [L*K, 16], objects [L*K, 2, 4], valid [L*K]),
+            now (command [14], state [16], objects [2, 4]), history (states, commands [M, ...]), intrinsic [V, 3, 3], begin [].
             Frames past the episode's end repeat its last, and they and black frames are not valid.
         """
         total = spec.chunks * spec.chunk
@@ -150,7 +150,7 @@ class ClipStore:
 
         return TensorDict(
             {
-                "memory": TensorDict({"index": index, "frames": self.frames(memory), "pose_map": self.pose_maps(memory), "c2w": pick("c2w", memory)}, size),
+                "memory": TensorDict({"index": index, "frames": self.frames(memory), "pose_map": self.pose_maps(memory), "c2w": pick("c2w", memory), "objects": pick("objects", memory)}, size),
                 "future": TensorDict(
                     {
                         "frames": self.frames(rows),
@@ -181,7 +181,7 @@ class ClipStore:
         """`count` random pictures of the first view, every other one an episode's first.
 
         Returns:
-            TensorDict [count] with frames uint8 [3, H, W], objects [2, 3], intrinsic [3, 3] and c2w [4, 4].
+            TensorDict [count] with frames uint8 [3, H, W], objects [2, 4], intrinsic [3, 3] and c2w [4, 4].
         """
         chosen = episodes[torch.randint(len(episodes), (count,), generator=generator)]
         ahead = (torch.rand(count, generator=generator) * self.length[chosen]).long()
@@ -194,8 +194,8 @@ class ClipStore:
         """`count` random chunks without pictures, each wholly within its episode.
 
         Returns:
-            TensorDict [count] with recent [1 + K, 14], the commands up to now, now (objects [2, 3]) and future (commands [K, 14],
-            objects [K, 2, 3]).
+            TensorDict [count] with recent [1 + K, 14], the commands up to now, now (objects [2, 4]) and future (commands [K, 14],
+            objects [K, 2, 4]).
         """
         choices = (self.length[episodes] - chunk).clamp(min=0)
         if not int(choices.sum()):
@@ -235,7 +235,7 @@ class _Part:
     arrays: dict[str, NDArray[Any]]
 
 
-_CACHE_FORM = b"2"  # changes when what a cache holds does
+_CACHE_FORM = b"3"  # changes when what a cache holds does
 _NUMERIC = ("commands", "achieved", "states", "c2w", "success", "progress", "objects", "seen", "recorded")
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.video import read_video
 from envs.layouts import JointLayout, Joints
-from envs.schema import ACTION_DIM, STATE_DIM
+from envs.schema import ACTION_DIM, OBJECT_DIM, STATE_DIM
 
 VIEWS = ("head", "hand_left", "hand_right")
 _GRIPPER = (35.0, 85.0)  # AgiBot's gripper readings: open, and how much further closed
@@ -118,7 +118,7 @@ def _assemble(pictures: dict[int, list[NDArray[np.uint8]]], length: int, place: 
     values.setdefault("achieved", values["commands"])
     values.setdefault("c2w", np.full((length, shape[0], 4, 4), np.nan, np.float32))
     return Episode(
-        frames=frames, seen=seen, success=np.zeros(length, bool), progress=np.zeros(length, np.float32), objects=np.full((length, 2, 3), np.nan, np.float32), **values
+        frames=frames, seen=seen, success=np.zeros(length, bool), progress=np.zeros(length, np.float32), objects=np.full((length, 2, OBJECT_DIM), np.nan, np.float32), **values
     )
 
 

@@ -20,11 +20,13 @@ from numpy.typing import NDArray
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.video import read_video, write_video
 from envs.physics.scene import ARMS
+from envs.schema import OBJECT_DIM
 
 _VERSION = "v3.0"
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
 _POSE_NAMES = [f"{side}_{axis}" for side in ARMS for axis in _AXES]
 _STATE_NAMES = [f"{side}_{joint}" for side in ARMS for joint in (*(f"joint{k}" for k in range(1, 8)), "gripper")]
+_OBJECT_NAMES = ("x", "y", "z", "heading")
 # parquet column -> Episode field, for numeric columns stored flat per row
 _COLUMNS = {
     "observation.state": "states",
@@ -177,6 +179,7 @@ class LeRobotWriter:
         def numbers(names: list[str] | None, size: int) -> dict[str, Any]:
             return {"dtype": "float32", "shape": [size], "names": names}
 
+        objects = [f"object{k}_{name}" for k in range(len(rows[0]["stats/observation.objects/mean"]) // OBJECT_DIM) for name in _OBJECT_NAMES]
         features: dict[str, Any] = {
             f"observation.images.{view}": {
                 "dtype": "video",
@@ -192,7 +195,7 @@ class LeRobotWriter:
             "observation.eef_pose": numbers(_POSE_NAMES, 14),
             "observation.camera.c2w": numbers(None, 16 * count_views),
             "observation.camera.intrinsic": numbers(None, 9 * count_views),
-            "observation.objects": numbers(None, len(rows[0]["stats/observation.objects/mean"])),
+            "observation.objects": numbers(objects, len(objects)),
             "observation.seen": {"dtype": "bool", "shape": [1], "names": None},
             "action": numbers(_POSE_NAMES, 14),
             "success": {"dtype": "bool", "shape": [1], "names": None},
@@ -244,6 +247,9 @@ class LeRobotDataset:
         missing = [c for c in (*_COLUMNS, "action", "observation.camera.intrinsic", "success", "progress") if c not in info["features"]]
         if missing or not self.views:
             raise EpisodeError(f"{path}: features {missing or ['observation.images.*']} are missing; Worldloop needs poses, cameras and success in the data set")
+        names = info["features"]["observation.objects"]["names"] or ()
+        if not all(name.endswith(_OBJECT_NAMES[k % OBJECT_DIM]) for k, name in enumerate(names)) or len(names) != info["features"]["observation.objects"]["shape"][0]:
+            raise EpisodeError(f"{path}: observation.objects holds {names or 'numbers without names'}; Worldloop needs {list(_OBJECT_NAMES)} of every object. Collect or convert the data again.")
         height, width, _ = info["features"][prefix + self.views[0]]["shape"]
         self.size: tuple[int, int] = (height, width)
         self.fps = float(info["fps"])
@@ -297,7 +303,7 @@ class LeRobotDataset:
             return Episode(
                 frames=frames,
                 c2w=read("observation.camera.c2w").reshape(length, views, 4, 4),
-                objects=read("observation.objects").reshape(length, -1, 3),
+                objects=read("observation.objects").reshape(length, -1, OBJECT_DIM),
                 intrinsic=read("observation.camera.intrinsic")[0].reshape(views, 3, 3),
                 states=read("observation.state"),
                 commands=read("observation.command"),

@@ -40,7 +40,7 @@ class Judge(nn.Module):
             frames: uint8 [B, T, V, 3, H, W].
             first: uint8 [B, V, 3, H, W], the episode's first frame, in which everything can still be seen.
             tokens: int64 [B, WORDS], the instruction (language.tokenize).
-            objects: float32 [B, T, 2, 3] true positions of block and target in metres; only the rule judge looks.
+            objects: float32 [B, T, 2, 4] true places of block and target (schema.OBJECT_DIM); only the rule judge looks.
         """
         raise NotImplementedError
 

@@ -2,7 +2,7 @@
 
 The first frame says where things were before an arm stood in front of them or a block lay upon the target. Whether
 it is done is a matter of millimetres between things, so some of the judge's key-points are taught to lie on them, as
-far as the data say where they are, and it is told how far these lie apart.
+far as the data say where they are; it looks closely there, and is told how far they lie apart.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from envs.encoders import PatchEncoder, SpatialEncoder, WordEncoder, to_signed
+from envs.encoders import CloseUp, PatchEncoder, SpatialEncoder, WordEncoder, to_signed
 from envs.judges.base import Judge, Verdict, ok_status
 from envs.schema import Status
 
@@ -38,27 +38,30 @@ class LearnedJudge(Judge):
         self.margin, self.aims = margin, aims
         self.main = SpatialEncoder(points, width, pictures=2)
         self.sides = nn.ModuleList(PatchEncoder(16, 8) for _ in range(views - 1))
+        self.closer = CloseUp(aims, pictures=2, reach=0.2) if aims else None
         self.words = WordEncoder(16)
         self.sharpness = nn.Parameter(torch.tensor([2.0]))  # FSDP2 takes no scalars
         apart = 3 * (aims * (aims - 1) // 2)
         self.head = nn.Sequential(nn.Linear(self.main.out_features + 16 * views + apart, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU(), nn.Linear(128, 2))
 
     def forward(self, frames: Tensor, first: Tensor, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Logits of success and of progress, float32 [N], and where it sees the objects, [N, aims, 2] in half-pictures from the middle.
+        """Logits of success and of progress, float32 [N], and where it sees the objects, at a first look and closely, [N, 2, aims, 2] in half-pictures from the middle.
 
         Args:
             frames, first: uint8 or float (-1..1) [N, V, 3, H, W]; tokens: int64 [N, WORDS].
         """
         pictures = to_signed(frames)
-        points, grid = self.main.look(torch.cat((pictures[:, 0], to_signed(first[:, 0])), 1))
+        pair = torch.cat((pictures[:, 0], to_signed(first[:, 0])), 1)
+        points, grid = self.main.look(pair)
         aimed = points[:, : self.aims]
+        close = aimed if self.closer is None else self.closer(pair, aimed)[0]
         one, other = torch.triu_indices(self.aims, self.aims, 1, device=points.device)
-        apart = _GAIN * (aimed[:, one] - aimed[:, other])
+        apart = _GAIN * (close[:, one] - close[:, other])
         apart = torch.cat((apart, apart.norm(dim=-1, keepdim=True)), -1).flatten(1)
         parts = [points.flatten(1), grid, apart, *(side(pictures[:, k + 1]) for k, side in enumerate(self.sides))]
         out = self.head(torch.cat([*parts, self.words(tokens)], -1)).float()
         # Success is for the most part progress beyond some point, and progress is taught by every frame.
-        return out[:, 0] + self.sharpness * out[:, 1], out[:, 1], aimed
+        return out[:, 0] + self.sharpness * out[:, 1], out[:, 1], torch.stack((aimed, close), 1)
 
     @torch.no_grad()
     def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
@@ -87,5 +90,6 @@ class LearnedJudge(Judge):
         shaped = (towards.sigmoid() - progress).abs().mean()
         right = ((logit > 0) == (label > 0.5)).float().mean()
         known = torch.isfinite(where).all(-1)
-        off = ((aimed - torch.nan_to_num(where)).norm(dim=-1) * known).sum() / known.sum().clamp(min=1)
-        return success + 10.0 * shaped + 48.0 * off, {"success": success.detach(), "frame_accuracy": right, "progress_error": shaped.detach(), "aim_error": off.detach()}
+        off = ((aimed - torch.nan_to_num(where)[:, None]).norm(dim=-1) * known[:, None]).sum((0, 2)) / known.sum().clamp(min=1)
+        figures = {"success": success.detach(), "frame_accuracy": right, "progress_error": shaped.detach(), "aim_error": off[1].detach()}
+        return success + 10.0 * shaped + 48.0 * off.sum(), figures

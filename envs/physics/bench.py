@@ -144,8 +144,10 @@ class Bench:
 
     @property
     def block(self) -> Array:
-        """Position [3] of the block's centre in metres."""
-        return self.data.qpos[self._block : self._block + 3].copy()
+        """Place [4] of the block: its centre in metres and its heading, the angle of its own x axis about the vertical in radians."""
+        w, x, y, z = self.data.qpos[self._block + 3 : self._block + 7]
+        heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return np.array([*self.data.qpos[self._block : self._block + 3], heading])
 
     def state(self) -> Array:
         """Joint state [16] = left joints (7, rad), left gripper, right joints (7), right gripper; 1 is closed."""

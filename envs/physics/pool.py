@@ -30,7 +30,7 @@ class Track:
     """What one episode leaves behind, a row per video frame; row 0 is the start.
 
     frames uint8 [T, V, 3, H, W], commands and achieved [T, 14], states [T, 16], c2w [T, V, 4, 4], success [T],
-    progress [T], objects [T, 2, 3] = positions of block and target in metres.
+    progress [T], objects [T, 2, 4] = places of block and target (schema.OBJECT_DIM); a disc has no heading.
     """
 
     seed: int
@@ -49,7 +49,7 @@ class Track:
             "c2w": c2w,
             "success": bench.success,
             "progress": bench.task.progress(bench.distance),
-            "objects": np.stack([bench.block, np.array([*bench.layout.target, 0.0])]),
+            "objects": np.stack([bench.block, np.array([*bench.layout.target, 0.0, np.nan])]),
         }
         for name, value in row.items():
             self.rows.setdefault(name, []).append(value)
@@ -192,7 +192,8 @@ class BenchPool:
         if count == 1:
             self._inline = Worker(config, slots, horizon)
             return
-        context = multiprocessing.get_context("spawn")
+        context = multiprocessing.get_context("forkserver")  # whose imports later pools share; a fork of this process would share its threads' locks
+        context.set_forkserver_preload(["torchrl.envs", __name__])  # torchrl for the script that started us, which workers import anew
         for size in sizes:
             ours, theirs = context.Pipe()
             process = context.Process(target=_serve, args=(theirs, config, size, horizon), daemon=True)
@@ -248,9 +249,10 @@ class BenchPool:
 
     def close(self) -> None:
         """End the workers."""
-        for pipe, process in zip(self._pipes, self._processes, strict=True):
+        for pipe in self._pipes:
             with contextlib.suppress(OSError):  # gone already, which is what we ask for
                 pipe.send(None)
+        for pipe, process in zip(self._pipes, self._processes, strict=True):
             process.join(timeout=5)
             if process.is_alive():
                 process.kill()

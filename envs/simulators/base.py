@@ -29,7 +29,7 @@ class WorldShape:
         chunk: frames per step, K.
         memory: sparse memory frames, M; the first frame is always one of them.
         fps: frames per second.
-        objects: things whose places are followed (places.py), S; 0 follows none.
+        sides: of things whose places are followed (places.py), S of them, the turns of a circle that leave each looking the same; () follows none.
         layout: what its commands are, A numbers a frame.
     """
 
@@ -38,12 +38,17 @@ class WorldShape:
     chunk: int = 8
     memory: int = 4
     fps: float = 10.0
-    objects: int = 2
+    sides: tuple[int, ...] = (4, 0)
     layout: CommandLayout = CommandLayout.EEF
 
     def __post_init__(self) -> None:
-        if self.objects and self.layout is not CommandLayout.EEF:
-            raise ValueError("simulator.objects follows things under end-effector commands only; set it to 0 for joint commands")
+        if self.sides and self.layout is not CommandLayout.EEF:
+            raise ValueError("simulator.sides follows things under end-effector commands only; set it to [] for joint commands")
+
+    @property
+    def objects(self) -> int:
+        """Number of things followed, S."""
+        return len(self.sides)
 
 
 class Simulator(nn.Module):
@@ -58,22 +63,25 @@ class Simulator(nn.Module):
     def __init__(self, shape: WorldShape):
         super().__init__()
         self.shape = shape
-        self.places = Places(shape.objects, shape.chunk)
+        self.places = Places(shape.sides)
 
     # -- what a subclass gives -----------------------------------------------------------------------------------
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """Generate the frames of one chunk.
 
         Args:
-            inputs: TensorDict [B] with memory (frames, pose_map uint8 [M, V, 3, H, W], c2w [M, V, 4, 4]),
-                future (pose_map uint8 [K, V, 3, H, W], c2w [K, V, 4, 4], commands [K, A], places [K, S, 3]),
-                now (command [A], state [16], places [S, 3]; NaN where unknown),
+            inputs: TensorDict [B] with memory (frames, pose_map uint8 [M, V, 3, H, W], c2w [M, V, 4, 4], places [M, S, 4]),
+                future (pose_map uint8 [K, V, 3, H, W], c2w [K, V, 4, 4], commands [K, A], places [K, S, 4]),
+                now (command [A], state [16], places [S, 4]; NaN where unknown),
                 intrinsic [V, 3, 3], seed int64 [], chunk_index int64 [].
 
         Returns:
             frames float32 [B, K, V, 3, H, W] in 0..1 and features float32 [B, *feature_shape] for the state expert.
         """
         raise NotImplementedError
+
+    def glance(self, frames: Tensor, c2w: Tensor) -> None:
+        """Look at first pictures uint8 [N, V, 3, H, W] of different episodes, c2w [N, V, 4, 4], before training; an engine may learn what is the same in all."""
 
     def features(self, inputs: TensorDict) -> Tensor:
         """Only the features of `predict`, for training the state expert."""
@@ -94,6 +102,7 @@ class Simulator(nn.Module):
         chunk, size = self.shape.chunk, clip.shape
         part = slice(number * chunk, (number + 1) * chunk)
         memory = TensorDict({key: clip["memory", key][:, number] for key in ("frames", "pose_map", "c2w")}, size)
+        memory["places"] = self.places.of(clip["memory", "objects"][:, number])
         if drawn is not None:
             rows = torch.arange(len(clip), device=clip.device)[:, None]
             ahead = clip["memory", "index"][:, number] - clip["begin"][:, None] - 1
@@ -145,7 +154,7 @@ class Simulator(nn.Module):
                         "c2w": c2w[:, None].float(),
                         "commands": command[:, None].float(),
                         "states": state[:, None].float(),
-                        "places": torch.where(self.places.taught, places, torch.nan)[:, None],
+                        "places": places[:, None],
                     },
                     [*size, 1],
                 ),
@@ -207,18 +216,18 @@ class Simulator(nn.Module):
         return pictures, features.float(), state
 
     def recall(self, state: TensorDict, pose_map: Tensor, c2w: Tensor) -> TensorDict:
-        """What is remembered for the next chunk: frames, pose_map, c2w [B, M, ...], evenly spread over the past and with the first frame.
+        """What is remembered for the next chunk: frames, pose_map, c2w, places [B, M, ...], evenly spread over the past and with the first frame.
 
         Args:
             pose_map, c2w: of the chunk to come, [B, K, ...].
         """
         rows = torch.arange(len(state), device=state["length"].device)[:, None]
-        return state["history"].select("frames", "pose_map", "c2w")[rows, memory_indices(state["length"], self.shape.memory)]
+        return state["history"].select("frames", "pose_map", "c2w", "places")[rows, memory_indices(state["length"], self.shape.memory)]
 
     def _luck(self, seed: Tensor, chunk_index: Tensor) -> Tensor:
-        """Standard normal numbers [B, S, 3] that belong to each session's seed and chunk; objects stray along the ground."""
+        """Standard normal numbers [B, S, 3] that belong to each session's seed and chunk."""
         rows = [torch.randn(self.shape.objects, 3, generator=noise_generator(s, c)) for s, c in zip(seed.tolist(), chunk_index.tolist(), strict=True)]
-        return torch.stack(rows) * torch.tensor([1.0, 1.0, 0.0])
+        return torch.stack(rows)
 
     @staticmethod
     def remember_states(state: TensorDict, decoded: Tensor) -> None:

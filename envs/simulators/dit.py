@@ -183,7 +183,8 @@ class _AdaLN(nn.Module):
 
     def forward(self, x: Tensor, embedded: Tensor, temb: Tensor) -> tuple[Tensor, Tensor | None]:
         parts = self.linear_2(self.linear_1(F.silu(embedded))) + temb[..., : self.outputs * self.width]
-        shift, scale, *gate = parts.chunk(self.outputs, -1)
+        # All tokens of a frame have its time step.
+        shift, scale, *gate = parts.repeat_interleave(x.shape[1] // parts.shape[1], 1).chunk(self.outputs, -1)
         return F.layer_norm(x, (self.width,), eps=1e-6) * (1 + scale) + shift, gate[0] if gate else None
 
 
@@ -336,8 +337,7 @@ class MultiViewDiT(nn.Module):
         rope = video_rope(self.shape, *grid, fps, latents.device)
         steps = timestep.reshape(batch, -1)
         temb, embedded = self.time_embed(steps.reshape(-1))
-        spread = grid[1] * grid[2]
-        temb, embedded = (part.unflatten(0, (batch, -1)).repeat_interleave(spread, 1) for part in (temb, embedded))
+        temb, embedded = (part.unflatten(0, (batch, -1)) for part in (temb, embedded))
         temb = temb + self.view_ada(self.view_embed).repeat(batch // views, 1)[:, None]
         said = self._known(text, batch)
         fused = torch.zeros_like(x)

@@ -13,8 +13,9 @@ from envs.conditioning import render_ray_map
 from envs.simulators.autoencoder import STRIDE, Autoencoder
 from envs.simulators.base import WorldShape
 from envs.simulators.dit import DiTShape, MultiViewDiT
-from envs.simulators.latent_world import LatentWorld
-from envs.simulators.places import in_view, place_map
+from envs.simulators.draft import Draft
+from envs.simulators.in_view import place_map
+from envs.simulators.latent_world import LatentWorld, unit
 from envs.simulators.sampling import Euler
 
 
@@ -49,7 +50,7 @@ class DiTConfig:
 
 
 class DiTSimulator(LatentWorld):
-    """LatentWorld at a small size; beside hands and cameras it is told where objects will be.
+    """LatentWorld at a small size that corrects drafts (draft.py); beside hands and cameras it is told where objects will be.
 
     Args:
         shape: what it shows; sizes must be multiples of 8 * patch.
@@ -60,7 +61,7 @@ class DiTSimulator(LatentWorld):
         config = config or DiTConfig()
         net = MultiViewDiT(
             DiTShape(
-                in_channels=config.channels + 3 + 6 + 1 + shape.objects,
+                in_channels=2 * config.channels + 3 + 6 + 1 + shape.objects,
                 out_channels=config.channels,
                 num_attention_heads=config.heads,
                 attention_head_dim=config.head_dim,
@@ -78,6 +79,19 @@ class DiTSimulator(LatentWorld):
         codec = Autoencoder(config.channels, config.codec_width)
         # The public network embeds levels as they are; at thousandfold they span the sinusoids' range.
         super().__init__(shape, net, codec, torch.zeros(1, 1, 32), Euler(config.steps, config.shift), 1000.0, config.shift, config.foreground, config.augment)
+        self.draft = Draft(shape.views, shape.size)
+        with torch.no_grad():
+            net.proj_out.weight.mul_(0.05)  # it starts from the draft, for random corrections take long to unlearn
+
+    def glance(self, frames: Tensor, c2w: Tensor) -> None:
+        """See Simulator.glance."""
+        self.draft.learn(frames, c2w)
+
+    def drafted(self, inputs: TensorDict) -> Tensor:
+        """See LatentWorld."""
+        seen, cameras = self.draft.look(inputs)
+        firsts = unit(inputs["memory", "frames"][:, 0])
+        return torch.stack([self.draft(view, firsts, seen, cameras, inputs["intrinsic"]) for view in range(self.shape.views)], 2)
 
     def conditioning(self, inputs: TensorDict, places: tuple[int, int]) -> Tensor:
         """See LatentWorld; spots of the objects stand beside, known from the last remembered frame on."""
@@ -87,7 +101,6 @@ class DiTSimulator(LatentWorld):
         rays = render_ray_map(inputs["intrinsic"], c2w, self.shape.size, stride=STRIDE)  # [B, V, T, 6, h, w]
         mask = torch.zeros_like(rays[:, :, :, :1])
         mask[:, :, : self.shape.memory] = 1.0
-        known = torch.cat([inputs["now", "places"][:, None], inputs["future", "places"]], 1)
-        spots = place_map(in_view(known, inputs["intrinsic"], c2w[:, :, self.shape.memory - 1 :].transpose(1, 2), self.shape.size), *places)
+        spots = place_map(self.draft.look(inputs)[0].at(slice(None), slice(1, None)), *places)
         spots = F.pad(spots, (0, 0, 0, 0, 0, 0, self.shape.memory - 1, 0))
         return torch.cat([small.permute(0, 2, 1, 3, 4, 5), rays, mask, spots], 3).transpose(2, 3)

@@ -1,12 +1,16 @@
 """What every latent diffusion world shares, small or 2B: GE-Sim 2.0's way from remembered frames to a chunk of new ones.
 
 Latents of sparse memory frames and of the chunk to come stand in one sequence, with pose map, ray map and a memory
-mask as further channels; memory is clean, the future is denoised along the flow.
+mask as further channels; memory is clean, the future is denoised along the flow. A world that has drafts of the frames to come (draft.py) denoises
+corrections of their latents instead.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -16,7 +20,17 @@ from envs.simulators.base import Simulator, WorldShape, foreground_weight, noise
 from envs.simulators.dit import MultiViewDiT
 from envs.simulators.sampling import Sampler
 
+_CORRECTION = 0.5  # standard deviation of corrections, in latents of deviation one
+_CHANGED = 0.15  # of 0..1, by which a pixel was corrected beyond which nothing of the draft is put back
 MEMORY_NOISE = 1e-4 / (1 + 1e-4)  # the noise level at which memory stands, as released
+
+
+class _Setting(NamedTuple):
+    """conditioning [B, V, C, M + T', h, w]; draft frames [B, K, V, 3, H, W] and their latents base [B, V, C, T', h, w], if there are any."""
+
+    conditioning: Tensor
+    draft: Tensor | None
+    base: Tensor | None
 
 
 class LatentWorld(Simulator):
@@ -54,6 +68,10 @@ class LatentWorld(Simulator):
         """Channels [B, V, C, M + T', h, w] beside the latents, at places = (h, w): pose map, ray map, memory mask, and what else the network reads."""
         raise NotImplementedError
 
+    def drafted(self, inputs: TensorDict) -> Tensor | None:
+        """Drafts of the chunk, float [B, K, V, 3, H, W] in 0..1, if this world corrects drafts; their latents then stand beside the conditioning."""
+        return None
+
     # -- latents ---------------------------------------------------------------------------------------------------
     def remember(self, frames: Tensor) -> Tensor:
         """Latents [B, V, C, M, h, w] of memory frames, float [B, M, V, 3, H, W] in 0..1, each encoded on its own."""
@@ -72,8 +90,20 @@ class LatentWorld(Simulator):
         clips = self.codec.decode_clips(latents.flatten(0, 1)).float()
         return clips.unflatten(0, latents.shape[:2]).transpose(1, 2)
 
-    def _velocity(self, future: Tensor, memory: Tensor, level: Tensor, conditioning: Tensor, layers: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
-        """Velocity of the future latents [B, V, C, T', h, w] at noise level [B], and the fused features."""
+    def _setting(self, inputs: TensorDict, memory: Tensor) -> _Setting:
+        """What stays the same at every step of a chunk."""
+        conditioning, draft = self.conditioning(inputs, (memory.shape[-2], memory.shape[-1])), self.drafted(inputs)
+        if draft is None:
+            return _Setting(conditioning, None, None)
+        base = self.encode(draft)
+        return _Setting(torch.cat([conditioning, F.pad(base, (0, 0, 0, 0, self.shape.memory, 0))], 2), draft, base)
+
+    def _says(self, future: Tensor, memory: Tensor, level: Tensor, conditioning: Tensor, layers: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
+        """What the network says of the future latents [B, V, C, T', h, w] at noise level [B], and the fused features.
+
+        Of whole latents it says their velocity, as released. Of corrections it says the correction: for the most part
+        that is nothing, which a network says well from the start, where nothing by velocity is a cancellation of noise.
+        """
         latents = torch.cat([torch.cat([memory, future], 3), conditioning], 2)
         steps = torch.full((len(future), latents.shape[3]), MEMORY_NOISE, device=future.device)
         steps[:, self.shape.memory :] = level[:, None]
@@ -84,8 +114,14 @@ class LatentWorld(Simulator):
     # -- contract --------------------------------------------------------------------------------------------------
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; noise comes from (seed, chunk_index), features from the last step."""
-        latents, fused = self._denoise(inputs)
-        return self.decode(latents), fused
+        latents, fused, setting = self._denoise(inputs)
+        frames = self.decode(latents)
+        if setting.draft is None or setting.base is None:
+            return frames, fused
+        # Where the draft needs no correction, what the autoencoder blurs is put back.
+        blurred = self.decode(setting.base)
+        keep = (1 - (frames - blurred).abs().amax(3, keepdim=True) / _CHANGED).clamp(min=0)
+        return frames + keep * (setting.draft - blurred), fused
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is decoded to pixels."""
@@ -97,20 +133,21 @@ class LatentWorld(Simulator):
         self._denoise(inputs, said)
         return said
 
-    def _denoise(self, inputs: TensorDict, layers: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
-        """Future latents [B, V, C, T', h, w], and the features of the last step."""
+    def _denoise(self, inputs: TensorDict, layers: list[Tensor] | None = None) -> tuple[Tensor, Tensor, _Setting]:
+        """Future latents [B, V, C, T', h, w], the features of the last step, and what was given."""
         memory = self.remember(unit(inputs["memory", "frames"]))
-        conditioning = self.conditioning(inputs, (memory.shape[-2], memory.shape[-1]))
+        setting = self._setting(inputs, memory)
         kept: list[Tensor] = []
 
         def velocity(z: Tensor, level: float) -> Tensor:
             if layers is not None:
                 layers.clear()
-            value, fused = self._velocity(z, memory, torch.full((len(z),), level, device=z.device), conditioning, layers)
+            value, fused = self._says(z, memory, torch.full((len(z),), level, device=z.device), setting.conditioning, layers)
             kept[:] = [fused]
-            return value
+            return value if setting.base is None else (z - value) / level
 
-        return self.sampler(velocity, self._noise(inputs["seed"], inputs["chunk_index"], memory)), kept[0]
+        latents = self.sampler(velocity, self._noise(inputs["seed"], inputs["chunk_index"], memory))
+        return latents if setting.base is None else setting.base + _CORRECTION * latents, kept[0], setting
 
     def _noise(self, seed: Tensor, chunk_index: Tensor, like: Tensor) -> Tensor:
         """Noise [B, V, C, T', h, w], row by row from its own generator, so that it is the same in any batch."""
@@ -121,27 +158,32 @@ class LatentWorld(Simulator):
         return torch.stack(rows).to(like.device)
 
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        """Flow matching on the future latents of the last chunk (memory has no loss); the chunks before it are the model's own."""
-        chunk, chunks = self.shape.chunk, clip["memory", "index"].shape[1]
+        """Flow matching on the future latents of one chunk (memory has no loss), any of the clip's; those before it are the model's own."""
+        chunk = self.shape.chunk
+        # Chunks wholly past the end of every episode teach nothing.
+        whole = clip["future", "valid"].any(0).unflatten(0, (-1, chunk)).any(1)
+        chosen = int(torch.randint(max(1, int(whole.long().sum())), (1,), generator=generator))
         drawn: Tensor | None = None
-        for number in range(chunks - 1):
+        for number in range(chosen):
             with torch.no_grad():
                 pictures = (self.predict(self.asked(clip, number, drawn, generator))[0].clamp(0, 1) * 255).round().to(torch.uint8)
             drawn = pictures if drawn is None else torch.cat([drawn, pictures], 1)
-        inputs, part = self.asked(clip, chunks - 1, drawn, generator), slice((chunks - 1) * chunk, chunks * chunk)
+        inputs, part = self.asked(clip, chosen, drawn, generator), slice(chosen * chunk, (chosen + 1) * chunk)
         truth = unit(clip["future", "frames"][:, part])
         spoilt = chosen_clips(len(truth), self.augment, generator)
         memory = spoil_latents(self.remember(spoil_pictures(unit(inputs["memory", "frames"]), spoilt, generator)), spoilt, generator)
-        target = self.encode(truth)
-        conditioning = self.conditioning(inputs, (memory.shape[-2], memory.shape[-1]))
+        target, setting = self.encode(truth), self._setting(inputs, memory)
+        if setting.base is not None:
+            target = (target - setting.base) / _CORRECTION
         draw = torch.rand(clip.shape, generator=generator).to(clip.device)
         level = self.shift * draw / (1 + (self.shift - 1) * draw)
         noise = torch.randn(target.shape, generator=generator).to(clip.device)
         mixed = level[:, None, None, None, None, None]
-        velocity, _ = self._velocity((1 - mixed) * target + mixed * noise, memory, level, conditioning)
+        said, _ = self._says((1 - mixed) * target + mixed * noise, memory, level, setting.conditioning)
+        wanted = noise - target if setting.base is None else target
         weight = foreground_weight(truth, self.foreground) * clip["future", "valid"][:, part][:, :, None, None, None, None]
-        weight = torch.nn.functional.avg_pool2d(self.codec.pool_time(weight).flatten(0, 2), STRIDE).unflatten(0, (len(truth), self.ahead, -1)).permute(0, 2, 3, 1, 4, 5)
-        value = ((velocity - (noise - target)).square() * weight).sum() / (weight.sum() * target.shape[2]).clamp(min=1)
+        weight = F.avg_pool2d(self.codec.pool_time(weight).flatten(0, 2), STRIDE).unflatten(0, (len(truth), self.ahead, -1)).permute(0, 2, 3, 1, 4, 5)
+        value = ((said - wanted).square() * weight).sum() / (weight.sum() * target.shape[2]).clamp(min=1)
         return value, {}
 
 

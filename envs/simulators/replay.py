@@ -15,7 +15,7 @@ from envs.simulators.state_base import StateDecoder
 
 class Replay(NamedTuple):
     """frames uint8 [N, T, V, 3, H, W] generated, rows int64 [N, T] of the true frames, valid bool [N, T], states float32 [N, T, 16] decoded,
-    places float32 [N, T, S, 3] where the simulator has its objects, in metres, NaN where it does not know."""
+    places float32 [N, T, S, 4] where the simulator has its objects (schema.OBJECT_DIM), NaN where it does not know."""
 
     frames: Tensor
     rows: Tensor

@@ -1,10 +1,10 @@
 """The strong cheap engine: a U-Net that predicts a whole chunk in one deterministic pass.
 
 Each view is folded into channels (side views at half the detail), memory and future pose maps ride along as
-channels beside spots where objects are and will be, and commands modulate every block. A pixel of the output is a
-soft choice between sources: the last frame as it is, the last frame moved by a predicted flow, the first frame, the
-median colour, a drawn colour, and, for every object, the last frame moved as that object moves. Things that move are
-then copied instead of remembered by the network, which learns far faster than a residual does.
+channels beside drafts of the frames to come (draft.py) and spots where objects are and will be, and commands modulate
+every block. A pixel of the output is a soft choice between sources: the draft, the last frame as it is, the last frame
+moved by a predicted flow, and a drawn colour. Things that move are then copied instead of remembered by the network,
+which learns far faster than a residual does.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from torch import Tensor, nn
 from envs.conditioning import render_ray_map
 from envs.schema import ACTION_DIM, to_relative
 from envs.simulators.base import Simulator, WorldShape, foreground_weight
-from envs.simulators.places import InView, in_view, place_map
+from envs.simulators.draft import Draft
+from envs.simulators.in_view import pixel_grid, place_map
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,6 @@ class UNetConfig:
         blocks: residual blocks per fine half, and in the bottleneck.
         foreground: extra loss weight of what differs from the median colour.
         emphasis: loss weight of each view.
-        jitter: metres by which objects are misplaced in training, as the places of a rollout are.
     """
 
     shrink: tuple[int, ...] = (1, 2, 2)
@@ -40,11 +40,10 @@ class UNetConfig:
     blocks: tuple[int, int] = (1, 3)
     foreground: float = 8.0
     emphasis: tuple[float, ...] = (1.0, 0.4, 0.4)
-    jitter: float = 0.003
 
 
 _FOLD = 4  # pixels folded into channels, both ways
-_SOURCES = 5  # still, flow, first frame, median colour, drawn colour; and then the objects
+_SOURCES = 4  # draft, still, flow, drawn colour
 _REACH = 8.0  # pixels one unit of flow moves
 
 
@@ -69,7 +68,7 @@ class _Block(nn.Module):
 
 
 def _head(width: int, chunk: int, channels: int) -> nn.Sequential:
-    """Output layer of one view; it starts from "nothing moves", for random output takes hundreds of steps to unlearn."""
+    """Output layer of one view; it starts from the draft, for random output takes hundreds of steps to unlearn."""
     last = nn.Conv2d(width, channels * chunk * _FOLD**2, 1)
     bias = torch.zeros(chunk, channels, _FOLD**2)
     bias[:, 0] = 3.0
@@ -78,55 +77,25 @@ def _head(width: int, chunk: int, channels: int) -> nn.Sequential:
     return nn.Sequential(nn.GroupNorm(8, width), nn.SiLU(), last)
 
 
-def _compose(drawn: Tensor, last: Tensor, first: Tensor, seen: InView, spots: Tensor) -> Tensor:
-    """Frames of a chunk in one view.
-
-    Args:
-        drawn: [B, K, 5 + S + 2 + 3, H, W] output maps; last, first: [B, 3, H, W] frames.
-        seen: the objects in this view now and at every frame, each [B, 1 + K, S]; spots: [B, K, S, H, W] maps of the latter.
-
-    Returns:
-        [B, K, 3, H, W].
-    """
+def _compose(drawn: Tensor, draft: Tensor, last: Tensor) -> Tensor:
+    """Frames [B, K, 3, H, W] of a chunk in one view, from output maps [B, K, 9, H, W], drafts [B, K, 3, H, W] and the last frame [B, 3, H, W]."""
     _, chunk, _, height, width = drawn.shape
-    objects = spots.shape[2]
     # Split, not sliced: the gradient of a slice is a full map of zeros.
-    logits, carried, flow, colour = drawn.split((_SOURCES, objects, 2, 3), 2)
-    # From the start an object is likely to lie where it is said to.
-    chosen = torch.cat((logits, carried - 3 + 8 * spots), 2).softmax(2)
-    still, moves, past, middle, fresh, *lifted = chosen.split(1, 2)
-    v, u = torch.meshgrid(
-        torch.linspace(-1 + 1 / height, 1 - 1 / height, height, device=drawn.device),
-        torch.linspace(-1 + 1 / width, 1 - 1 / width, width, device=drawn.device),
-        indexing="ij",
-    )
-    flow_u, flow_v = (flow * (2 * _REACH)).unbind(2)
-    grids = [torch.stack((u + flow_u / width, v + flow_v / height), -1)]
-    place, known = torch.stack((u, v), -1), seen.visible[:, :1] & seen.visible[:, 1:]
-    for number in range(objects):
-        now, then = seen.where[:, :1, number, None, None], seen.where[:, 1:, number, None, None]
-        growth = (seen.span[:, 1:, number] / seen.span[:, :1, number]).clamp(0.5, 2.0)[..., None, None, None]
-        grids.append(torch.where(known[:, :, number, None, None, None], now + (place - then) / growth, place))
+    logits, flow, colour = drawn.split((_SOURCES, 2, 3), 2)
+    drafted, still, moves, fresh = logits.softmax(2).split(1, 2)
+    grid = pixel_grid(height, width, drawn.device) + (2 * _REACH * flow).permute(0, 1, 3, 4, 2) / torch.tensor([width, height], device=drawn.device)
     # All frames of a chunk are sampled from one picture: stack them as rows of one tall grid.
-    grid = torch.stack(grids, 1).flatten(1, 3)
-    median = first.flatten(2).median(-1).values[..., None, None]
-    moved = F.grid_sample(last, grid, padding_mode="border", align_corners=False)
-    moved = moved.unflatten(2, (1 + objects, chunk, height)).permute(2, 0, 3, 1, 4, 5)  # [1 + S, B, K, 3, H, W]
-    out = still * last[:, None] + moves * moved[0] + past * first[:, None] + middle * median[:, None] + fresh * (0.5 + 0.5 * colour)
-    for weight, picture in zip(lifted, moved[1:], strict=True):
-        out = out + weight * picture
-    return out
+    moved = F.grid_sample(last, grid.flatten(1, 2), padding_mode="border", align_corners=False).unflatten(2, (chunk, height)).transpose(1, 2)
+    return drafted * draft + still * last[:, None] + moves * moved + fresh * (0.5 + 0.5 * colour)
 
 
-def _fold(pictures: Tensor) -> Tensor:
-    """[B, C, H, W] -> [B, C * 16, H / 4, W / 4] with squares of 4x4 pixels as channels; copies bytes faster than torch's pixel_unshuffle."""
-    batch, channels, height, width = pictures.shape
-    squares = pictures.view(batch, channels, height // _FOLD, _FOLD, width // _FOLD, _FOLD)
-    return squares.permute(0, 1, 3, 5, 2, 4).reshape(batch, channels * _FOLD**2, height // _FOLD, width // _FOLD)
+def _halve(pictures: Tensor) -> Tensor:
+    """Pictures [..., H, W] at half the detail, the mean of each four pixels; four sums are faster than torch's pooling."""
+    return (pictures[..., ::2, ::2] + pictures[..., 1::2, ::2] + pictures[..., ::2, 1::2] + pictures[..., 1::2, 1::2]) / 4
 
 
 def _unfold(maps: Tensor) -> Tensor:
-    """The reverse of _fold; its gradient is one copy, where that of torch's pixel_shuffle is slow."""
+    """[B, C * 16, h, w] -> [B, C, 4 h, 4 w], squares of 4x4 pixels out of channels; its gradient is one copy, where that of torch's pixel_shuffle is slow."""
     batch, channels, height, width = maps.shape
     squares = maps.view(batch, channels // _FOLD**2, _FOLD, _FOLD, height, width)
     return squares.permute(0, 1, 4, 2, 5, 3).reshape(batch, channels // _FOLD**2, height * _FOLD, width * _FOLD)
@@ -148,13 +117,14 @@ class UNetSimulator(Simulator):
         if not set(config.shrink) <= {1, 2}:
             raise ValueError(f"simulator.shrink={list(config.shrink)} may hold 1 (full detail) and 2 (half) only")
         wide = 2 * config.width
-        # Memory frames and pose maps, future pose maps, and spots of the objects now and in future.
-        pictures = 3 * (2 * shape.memory + shape.chunk) + shape.objects * (1 + shape.chunk)
-        self.channels = _SOURCES + shape.objects + 2 + 3
+        # Memory frames and pose maps, future pose maps and drafts, and spots of the objects now and in future.
+        pictures = 3 * (2 * shape.memory + 2 * shape.chunk) + shape.objects * (1 + shape.chunk)
+        self.channels = _SOURCES + 2 + 3
+        self.draft = Draft(shape.views, shape.size)
         cond = 256
         self.feature_shape = (wide + cond,)
         self.actions = nn.Sequential(nn.Linear((shape.chunk + 1) * ACTION_DIM, cond), nn.SiLU(), nn.Linear(cond, cond))
-        self.embed = nn.ModuleList(nn.Conv2d(pictures * _FOLD**2, config.width if s == 1 else wide, 1) for s in config.shrink)
+        self.embed = nn.ModuleList(nn.Conv2d(pictures, config.width if s == 1 else wide, _FOLD, stride=_FOLD) for s in config.shrink)
         self.rays = nn.Conv2d(12 * shape.views, wide, 1)
         self.down = nn.Conv2d(config.width, wide, 2, stride=2)
         self.up = nn.Conv2d(wide, config.width * 4, 1)
@@ -164,6 +134,10 @@ class UNetSimulator(Simulator):
         self.deep = nn.ModuleList(_Block(wide, cond) for _ in range(deep))
         self.fine_out = nn.ModuleList(_Block(config.width, cond) for _ in range(fine))
         self.heads = nn.ModuleList(_head(config.width if s == 1 else wide, shape.chunk, self.channels) for s in config.shrink)
+
+    def glance(self, frames: Tensor, c2w: Tensor) -> None:
+        """See Simulator.glance."""
+        self.draft.learn(frames, c2w)
 
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; features are the pooled bottleneck beside the action embedding."""
@@ -179,48 +153,49 @@ class UNetSimulator(Simulator):
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is drawn."""
-        _, z, cond, *_ = self._encode(inputs)
+        _, z, cond, _ = self._encode(inputs)
         return torch.cat([z.float().mean((-2, -1)), cond.float()], 1)
 
-    def _encode(self, inputs: TensorDict) -> tuple[Tensor, Tensor, Tensor, list[tuple[Tensor, Tensor, Tensor]], InView]:
-        """Fine and coarse maps, the action embedding, each view's first and last frame and spots [B, 1 + K, S, h, w] as it is looked at, and the objects in view."""
+    def _encode(self, inputs: TensorDict) -> tuple[Tensor, Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
+        """Fine and coarse maps, the action embedding, and each view's drafts [B, K, 3, h, w] and last frame as it is looked at."""
         memory, future = inputs["memory"], inputs["future"]
         stack = torch.cat([memory["frames"], memory["pose_map"], future["pose_map"]], 1)  # uint8 [B, 2M+K, V, 3, H, W]
         relative = to_relative(future["commands"], inputs["now", "command"]) * 10.0  # decimetres
         cond = self.actions(torch.cat([relative.flatten(1), inputs["now", "command"]], 1))
         fine: list[Tensor] = []
         deep = [self.rays(self._rays(inputs))]
-        ends: list[tuple[Tensor, Tensor, Tensor]] = []
-        places = torch.cat((inputs["now", "places"][:, None], inputs["future", "places"]), 1)
-        cameras = torch.cat((memory["c2w"][:, -1:], future["c2w"]), 1)
-        seen = in_view(places, inputs["intrinsic"], cameras, self.shape.size)
+        ends: list[tuple[Tensor, Tensor]] = []
+        seen, cameras = self.draft.look(inputs)
+        firsts = memory["frames"][:, 0].float() / 255
         for view, (shrink, embed) in enumerate(zip(self.config.shrink, self.embed, strict=True)):
             pictures = stack[:, :, view].flatten(1, 2).float().div_(255.0)
             if shrink > 1:
-                pictures = F.avg_pool2d(pictures, shrink)
+                pictures = _halve(pictures)
             latest = 3 * (self.shape.memory - 1)
-            spots = place_map(InView(*(value[:, view : view + 1] for value in seen)), *pictures.shape[-2:])[:, 0]
-            ends.append((pictures[:, :3], pictures[:, latest : latest + 3], spots))
-            folded = _fold(torch.cat((pictures * 2 - 1, spots.flatten(1, 2)), 1)).contiguous(memory_format=torch.channels_last)
-            (fine if shrink == 1 else deep).append(embed(folded))
+            spots = place_map(seen.at(view, slice(1, None)), *pictures.shape[-2:])
+            begin = firsts if shrink == 1 else _halve(firsts)
+            draft = self.draft(view, begin, seen, cameras, inputs["intrinsic"])
+            ends.append((draft, pictures[:, latest : latest + 3]))
+            shown = torch.cat((pictures * 2 - 1, draft.flatten(1, 2) * 2 - 1, spots.flatten(1, 2)), 1)
+            (fine if shrink == 1 else deep).append(embed(shown))
         x = torch.stack(fine).sum(0)
         for block in self.fine_in:
             x = block(x, cond)
         z = self.down(x) + torch.stack(deep).sum(0)
         for block in self.deep:
             z = block(z, cond)
-        return x, z, cond, ends, seen
+        return x, z, cond, ends
 
     def views(self, inputs: TensorDict) -> tuple[list[Tensor], Tensor]:
         """Frames of each view [B, K, 3, H / shrink, W / shrink], not yet enlarged, and the features."""
-        x, z, cond, ends, seen = self._encode(inputs)
+        x, z, cond, ends = self._encode(inputs)
         x = self.fuse(torch.cat([x, F.pixel_shuffle(self.up(z), 2)], 1))
         for block in self.fine_out:
             x = block(x, cond)
         views: list[Tensor] = []
-        for view, (shrink, head, (first, last, spots)) in enumerate(zip(self.config.shrink, self.heads, ends, strict=True)):
+        for shrink, head, (draft, last) in zip(self.config.shrink, self.heads, ends, strict=True):
             drawn = _unfold(head(x if shrink == 1 else z).float().contiguous()).unflatten(1, (self.shape.chunk, self.channels))
-            views.append(_compose(drawn, last, first, InView(*(value[:, view] for value in seen)), spots[:, 1:]))
+            views.append(_compose(drawn, draft, last))
         return views, torch.cat([z.float().mean((-2, -1)), cond.float()], 1)
 
     def _rays(self, inputs: TensorDict) -> Tensor:
@@ -235,21 +210,18 @@ class UNetSimulator(Simulator):
         Gradients stay within a chunk; predictions are rounded to bytes in between, as they are in rollouts.
         """
         chunk, chunks = self.shape.chunk, clip["memory", "index"].shape[1]
-        misplaced = self.config.jitter * torch.randn((*clip.shape, 1, 1, 3), generator=generator).to(clip.device)
         drawn: Tensor | None = None
         losses = []
         for number in range(chunks):
             part = slice(number * chunk, (number + 1) * chunk)
             inputs = self.asked(clip, number, drawn)
-            inputs["now", "places"] = inputs["now", "places"] + misplaced[:, 0]
-            inputs["future", "places"] = inputs["future", "places"] + misplaced
             views, _ = self.views(inputs)
             valid = clip["future", "valid"][:, part, None, None, None]
             error, norm = torch.zeros(()), torch.zeros(())
             for view, (frames, shrink, emphasis) in enumerate(zip(views, self.config.shrink, self.config.emphasis, strict=True)):
                 truth = clip["future", "frames"][:, part, view].float() / 255
                 if shrink > 1:
-                    truth = F.avg_pool2d(truth.flatten(0, 1), shrink).unflatten(0, truth.shape[:2])
+                    truth = _halve(truth)
                 weight = foreground_weight(truth, self.config.foreground) * valid * emphasis
                 # An absolute error alone never leaves "nothing moves", the median of sparse change; squares do.
                 gap = frames - truth

@@ -23,7 +23,7 @@ def generated_frames(simulator: Simulator, store: ClipStore, episodes: Tensor, b
 
     Returns:
         TensorDict [N] with frames uint8 [V, 3, H, W], row (that of the true frame), begin (that of the episode's first),
-        places [S, 3] where the simulator has its objects, tokens and progress.
+        places [S, 4] where the simulator has its objects, tokens and progress.
     """
     made = replay(simulator, store, episodes, bf16=bf16)
     truth = simulator.places.of(store.arrays["objects"][made.rows])

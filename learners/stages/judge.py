@@ -27,12 +27,17 @@ def episode_labels(store: ClipStore, hold: int) -> Tensor:
 
 
 def sights(store: ClipStore, objects: Tensor, rows: Tensor, count: int) -> Tensor:
-    """Where objects [N, S, 3] are in the first view at the cameras of `rows` [N]: [N, count, 2] in half-pictures from the middle, NaN where unknown or out of sight."""
+    """Where objects [N, S, 4] are in the first view at the cameras of `rows` [N]: [N, count, 2] in half-pictures from the middle, NaN where unknown or out of sight."""
     owner = torch.searchsorted(store.start, rows, right=True) - 1
     known = torch.nn.functional.pad(objects[:, :count], (0, 0, 0, max(0, count - objects.shape[1])), value=torch.nan)
-    pixels, depth = project(known, store.intrinsic[owner, 0], store.arrays["c2w"][rows, 0])
+    pixels, depth = project(known[..., :3], store.intrinsic[owner, 0], store.arrays["c2w"][rows, 0])
     where = pixels / (torch.tensor(store.size[::-1]) / 2) - 1
     return torch.where(((depth > 0.02) & (where.abs() < 1).all(-1))[..., None], where, torch.nan)
+
+
+def unseen_by_judge(store: ClipStore) -> Tensor:
+    """Every eighth episode of any behaviour, on which judges are calibrated, and from which none learns, int64 [N]."""
+    return torch.tensor([number for number, row in enumerate(store.episodes) if row["seed"] % 8 == 4], dtype=torch.int64)
 
 
 def train_judge(
@@ -91,12 +96,12 @@ def calibrate(judge: Judge, success: Tensor, rate: float) -> None:
     """Set the judge's threshold so that as many episodes pass as succeeded.
 
     On real video, that is: on generated video the threshold would also make up for what the simulator gets wrong, and
-    a judge made lenient for a pessimistic simulator is what a policy learns to exploit. Matching a rate uses all
-    episodes of the deployed policy; a threshold of best accuracy on the few dozen that are kept from training jumps
-    with each of these.
+    a judge made lenient for a pessimistic simulator is what a policy learns to exploit. And on video that it has not
+    learned from, of which it is too sure. Matching a rate uses all those episodes, where a threshold of best accuracy
+    jumps with a few of them.
 
     Args:
-        success: frame probabilities [N, T] of real episodes of that policy, 0 where they are over; rate: its success rate.
+        success: frame probabilities [N, T] of real episodes that it did not learn from, 0 where they are over; rate: their share of successes.
     """
     # An episode succeeds if its best run of `hold` frames lies above the threshold throughout.
     best = success.unfold(1, judge.hold, 1).amin(-1).amax(1)

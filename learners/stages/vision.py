@@ -15,6 +15,8 @@ from envs.simulators.latent_world import LatentWorld
 from learners.fit import FitConfig, fit, step_generator
 from learners.lora import low_rank
 
+_GLANCES = 128  # first pictures of different episodes, at which a simulator looks before it learns
+
 
 @dataclass(frozen=True)
 class VisionConfig:
@@ -50,6 +52,8 @@ def train_vision(simulator: Simulator, store: ClipStore, episodes: Tensor, confi
             parts.append(store.sample(newest, recent, spec, generator))
         return torch.cat(parts) if len(parts) > 1 else parts[0]
 
+    some = store.start[episodes[torch.randperm(len(episodes), generator=torch.Generator().manual_seed(options.seed))[:_GLANCES]]]
+    simulator.glance(store.frames(some), store.arrays["c2w"][some])
     if not config.lora:
         return fit("vision", simulator, batch, simulator.loss, options, folder)
     if not isinstance(simulator, LatentWorld):
@@ -61,26 +65,39 @@ def train_vision(simulator: Simulator, store: ClipStore, episodes: Tensor, confi
     return stats
 
 
-def train_places(simulator: Simulator, store: ClipStore, episodes: Tensor, kept: Tensor, options: FitConfig, folder: Path) -> dict[str, float]:
-    """Train `simulator.places` in place and fit its doubt to the `kept` episodes; does nothing where no episode knows its objects' places.
-
-    Motions are few numbers, so a step sees `options.batch` of them, and few pictures beside them, which are soon learned.
-    """
+def train_sight(simulator: Simulator, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path) -> dict[str, float]:
+    """Train what finds the simulator's objects in first pictures, in place; does nothing where no episode knows its objects' places."""
     places = simulator.places
-    known = torch.isfinite(store.arrays["objects"][store.start[episodes]][:, : places.objects]).any()
-    if not known:
+    if not _placed(simulator, store, episodes):
         return {}
 
-    def batch(step: int, generator: torch.Generator) -> TensorDict:
-        shown = store.shots(episodes, max(1, options.part // 32), generator)
-        motion = store.motions(episodes, options.part, simulator.shape.chunk, generator)
-        return TensorDict({"shown": shown, "motion": motion}, [])
+    def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        return places.sight.loss(data, places.of(data["objects"]))
+
+    stats = fit("sight", places.sight, lambda _, generator: store.shots(episodes, options.part, generator), loss, options, folder)
+    places.taught.fill_(True)
+    return stats
+
+
+def train_contact(simulator: Simulator, store: ClipStore, episodes: Tensor, kept: Tensor, options: FitConfig, folder: Path) -> dict[str, float]:
+    """Train what moves the simulator's objects, in place, and fit its doubt to the `kept` episodes; does nothing where no episode knows its objects' places."""
+    places, chunk = simulator.places, simulator.shape.chunk
+    if not _placed(simulator, store, episodes):
+        return {}
+
+    def whole(motion: TensorDict) -> Tensor:
+        return places.of(torch.cat((motion["now", "objects"][:, None], motion["future", "objects"]), 1))
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        return places.loss(data["shown"], data["motion"])
+        return places.contact.loss(whole(data), data)
 
-    stats = fit("places", places, batch, loss, options, folder)
-    places.taught.fill_(True)
+    stats = fit("contact", places.contact, lambda _, generator: store.motions(episodes, options.part, chunk, generator), loss, options, folder)
     if len(kept):
-        places.calibrate(store.motions(kept, 4096, simulator.shape.chunk, step_generator(options.seed, options.steps)))
-    return {**stats, "spread": float(places.spread)}
+        motion = store.motions(kept, 4096, chunk, step_generator(options.seed, options.steps)).to(places.taught.device)
+        places.contact.calibrate(whole(motion), motion)
+    return {**stats, "spread": float(places.contact.spread)}
+
+
+def _placed(simulator: Simulator, store: ClipStore, episodes: Tensor) -> bool:
+    """Whether any episode knows where any object stands that the simulator follows."""
+    return bool(torch.isfinite(simulator.places.of(store.arrays["objects"][store.start[episodes]])[..., :3]).any())

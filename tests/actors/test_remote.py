@@ -27,7 +27,7 @@ from envs.transforms import world_transforms
 from envs.world import Starts, WorldEnv
 from tests.actors.serving import Running
 
-SHAPE = WorldShape(chunk=4, objects=0)
+SHAPE = WorldShape(chunk=4, sides=())
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ from envs.transforms import world_transforms
 from envs.world import Starts, WorldEnv
 from tests.envs.gesim_tiny import NET, VAE, write_checkpoint
 
-SHAPE = WorldShape(views=3, size=(32, 48), chunk=5, memory=4, fps=30.0, objects=0, layout=CommandLayout.JOINTS)
+SHAPE = WorldShape(views=3, size=(32, 48), chunk=5, memory=4, fps=30.0, sides=(), layout=CommandLayout.JOINTS)
 
 
 @pytest.fixture(scope="module")
@@ -140,14 +140,14 @@ def test_what_is_wrong_with_a_checkpoint_is_listed(folder: Path, tmp_path: Path)
     with pytest.raises(CheckpointError, match="cannot be read"):
         load_released(broken)
     with pytest.raises(CheckpointError, match="3 views"):
-        GESimulator.build(WorldShape(views=2, size=(32, 48), chunk=5, objects=0, layout=CommandLayout.JOINTS), GESimConfig(), str(folder))
+        GESimulator.build(WorldShape(views=2, size=(32, 48), chunk=5, sides=(), layout=CommandLayout.JOINTS), GESimConfig(), str(folder))
 
 
 def test_from_nothing_at_any_size_and_chunks_that_fit_the_autoencoder() -> None:
     world = GESimulator.build(SHAPE, GESimConfig(net=NET, vae=VAE), None)
     assert world.feature_shape == (3, 6 * 2 * 3, 48)
     with pytest.raises(ValueError, match="1 \\+ a multiple of 4"):
-        GESimulator.build(WorldShape(views=3, size=(32, 48), chunk=6, objects=0), GESimConfig(net=NET, vae=VAE), None)
+        GESimulator.build(WorldShape(views=3, size=(32, 48), chunk=6, sides=()), GESimConfig(net=NET, vae=VAE), None)
     with pytest.raises(ValueError, match="steps=9"):
         GESimConfig(steps=9)
     with pytest.raises(ValueError, match="parity"):

@@ -69,7 +69,7 @@ def test_block_is_seen_where_it_is() -> None:
     red = bench.layout.block_rgb
     picture = bench.render(("head",))[0].astype(float) / 255
     intrinsic, c2w = (torch.from_numpy(a).float() for a in bench.cameras())
-    at, _ = project(torch.from_numpy(bench.block).float()[None], intrinsic[0], c2w[0])
+    at, _ = project(torch.from_numpy(bench.block[:3]).float()[None], intrinsic[0], c2w[0])
     u, v = at[0].round().long().tolist()
     seen = picture[:, v - 1 : v + 2, u - 1 : u + 2].mean((1, 2))
     assert np.argmax(seen) == np.argmax(red)

@@ -9,9 +9,9 @@ import torch
 
 from envs.episodes.clips import ClipStore
 from envs.judges import LearnedJudge
-from envs.simulators.places import in_view
+from envs.simulators.in_view import in_view
 from learners.fit import FitConfig
-from learners.stages.judge import sights, train_judge
+from learners.stages.judge import sights, train_judge, unseen_by_judge
 
 
 def test_sights_are_where_objects_are_drawn(store: ClipStore) -> None:
@@ -39,3 +39,15 @@ def test_objects_nobody_placed_leave_the_aims_alone() -> None:
     value.backward()
     assert float(figures["aim_error"]) == 0.0
     assert all(bool(torch.isfinite(p.grad).all()) for p in judge.parameters() if p.grad is not None)
+
+
+def test_a_judge_without_aims_judges() -> None:
+    judge = LearnedJudge(hold=2, width=8, points=4, aims=0).eval()
+    frames = torch.randint(0, 256, (2, 3, 3, 3, 64, 64), dtype=torch.uint8)
+    verdict = judge.score(frames, frames[:, 0], torch.zeros(2, 12, dtype=torch.int64))
+    assert verdict.success.shape == (2, 3) and bool(torch.isfinite(verdict.success).all())
+
+
+def test_no_judge_learns_from_what_it_is_calibrated_on(store: ClipStore) -> None:
+    unseen = unseen_by_judge(store)
+    assert [store.episodes[n]["seed"] % 8 for n in unseen.tolist()] == [4] * len(unseen) and len(unseen) == 1
