@@ -75,11 +75,17 @@ class CloseUp(nn.Module):
         self.first = nn.Parameter(torch.randn(points, inside, 64) / inside**0.5)
         self.last = nn.Parameter(torch.randn(points, 64, 2 + out) / 64)
 
-    def forward(self, pictures: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Points moved [B, S, 2], and what else is said [B, S, out], for pictures float [B, C, H, W] in -1..1 and points [B, S, 2] in half-pictures from the middle."""
+    def forward(self, pictures: Tensor, points: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """Points moved [B, S, 2], and what else is said [B, S, out].
+
+        Args:
+            pictures: float [B, C, H, W] in -1..1.
+            points: [B, S, 2] in half-pictures from the middle.
+            generator: misplaces crops, in training.
+        """
         begin = points.detach()
-        if self.training:
-            begin = begin + self.wander * torch.randn_like(begin)
+        if generator is not None:
+            begin = begin + self.wander * torch.randn(begin.shape, generator=generator).to(begin.device)
         offset = self.reach * middles(self.cells, begin.device)
         v, u = torch.meshgrid(offset, offset, indexing="ij")
         grid = begin[:, :, None, None] + torch.stack((u, v), -1)

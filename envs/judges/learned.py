@@ -44,17 +44,18 @@ class LearnedJudge(Judge):
         apart = 3 * (aims * (aims - 1) // 2)
         self.head = nn.Sequential(nn.Linear(self.main.out_features + 16 * views + apart, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU(), nn.Linear(128, 2))
 
-    def forward(self, frames: Tensor, first: Tensor, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, frames: Tensor, first: Tensor, tokens: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Logits of success and of progress, float32 [N], and where it sees the objects, at a first look and closely, [N, 2, aims, 2] in half-pictures from the middle.
 
         Args:
             frames, first: uint8 or float (-1..1) [N, V, 3, H, W]; tokens: int64 [N, WORDS].
+            generator: see CloseUp.
         """
         pictures = to_signed(frames)
         pair = torch.cat((pictures[:, 0], to_signed(first[:, 0])), 1)
         points, grid = self.main.look(pair)
         aimed = points[:, : self.aims]
-        close = aimed if self.closer is None else self.closer(pair, aimed)[0]
+        close = aimed if self.closer is None else self.closer(pair, aimed, generator)[0]
         one, other = torch.triu_indices(self.aims, self.aims, 1, device=points.device)
         apart = _GAIN * (close[:, one] - close[:, other])
         apart = torch.cat((apart, apart.norm(dim=-1, keepdim=True)), -1).flatten(1)
@@ -75,15 +76,16 @@ class LearnedJudge(Judge):
             status = torch.where(near, Status.ABSTAIN.value, status)
         return Verdict(success, progress.sigmoid().unflatten(0, (batch, count)), status)
 
-    def loss(self, frames: Tensor, first: Tensor, tokens: Tensor, label: Tensor, progress: Tensor, where: Tensor, share: float) -> tuple[Tensor, dict[str, Any]]:
+    def loss(self, frames: Tensor, first: Tensor, tokens: Tensor, label: Tensor, progress: Tensor, where: Tensor, share: float, generator: torch.Generator | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Class-balanced cross-entropy of success plus the absolute errors of progress and of where things are seen.
 
         Args:
             label: float [N] in {0, 1}; progress: float [N] in 0..1.
             where: float [N, aims, 2], half-pictures from the middle of the first view, NaN where nobody knows.
             share: fraction of positive frames in the data, by which the classes are balanced.
+            generator: see CloseUp.
         """
-        logit, towards, aimed = self(frames, first, tokens)
+        logit, towards, aimed = self(frames, first, tokens, generator)
         weight = torch.where(label > 0.5, 0.5 / max(share, 1e-3), 0.5 / max(1 - share, 1e-3))
         success = (F.binary_cross_entropy_with_logits(logit, label, reduction="none") * weight).mean()
         # Cross-entropy hardly minds a few hundredths of progress, which are the centimetre that decides.

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from envs.schema import OBJECT_DIM
 from envs.simulators.contact import Contact
 from envs.simulators.sight import Sight
 
@@ -42,6 +43,8 @@ class Places(nn.Module):
 
     def find(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor) -> Tensor:
         """Places [B, S, 4] in pictures of one camera (Sight.find), NaN before it was taught."""
+        if not self.count:
+            return torch.zeros((len(frames), 0, OBJECT_DIM), device=frames.device)
         return torch.where(self.taught, self.sight.find(frames, intrinsic, c2w), torch.nan)
 
     def push(self, places: Tensor, recent: Tensor, commands: Tensor, luck: Tensor) -> Tensor:

@@ -36,17 +36,18 @@ class Sight(nn.Module):
         self.closer = CloseUp(count, out=2, reach=0.2)
         self.heights = nn.Parameter(torch.zeros(count))  # metres above the world's ground; objects stand on something
 
-    def forward(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Coarse and close places [B, S, 3] in metres, and directions [B, S, 2], (cos, sin) of the heading times the sides.
 
         Args:
             frames: uint8 [B, 3, H, W] of one camera, intrinsic [B, 3, 3] in pixels, c2w [B, 4, 4].
+            generator: see CloseUp.
         """
         height, width = frames.shape[-2:]
         pictures = to_signed(frames)
         heat = self.finder(pictures)
         coarse = centres(heat.flatten(2).mul(4.0).softmax(-1).unflatten(-1, heat.shape[-2:]))
-        close, turned = self.closer(pictures, coarse)
+        close, turned = self.closer(pictures, coarse, generator)
         half = torch.tensor([width, height], device=frames.device) / 2
         count = len(self.sides)
         metres = [on_plane((where[:, :count] + 1) * half, self.heights[:count, None], intrinsic, c2w) for where in (coarse, close)]
@@ -61,9 +62,9 @@ class Sight(nn.Module):
         heading = torch.atan2(turned[..., 1], turned[..., 0]) / sides.clamp(min=1)
         return torch.cat((place, torch.where(sides > 0, heading, torch.nan)[..., None]), -1)
 
-    def loss(self, shown: TensorDict, objects: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, shown: TensorDict, objects: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, dict[str, Tensor]]:
         """Centimetres by which objects [B, S, 4] are missed in the pictures of ClipStore.shots, and how wrongly they are seen turned."""
-        coarse, close, turned = self(shown["frames"], shown["intrinsic"], shown["c2w"])
+        coarse, close, turned = self(shown["frames"], shown["intrinsic"], shown["c2w"], generator)
         guessed, found = (mean_gap(place - objects[..., :3]) for place in (coarse, close))
         angle = objects[..., 3] * torch.tensor(self.sides, device=objects.device)
         wrong = turned - torch.nan_to_num(torch.stack((angle.cos(), angle.sin()), -1))

@@ -81,7 +81,7 @@ def train_judge(
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         views = data["frames"].shape[1]  # the same colours for both, as one camera would give them
         pictures, first = augment(to_signed(torch.cat((data["frames"], data["first"]), 1)), generator).split(views, 1)
-        return judge.loss(pictures, first, data["tokens"], data["label"], data["progress"], data["where"], max(share, 0.3))
+        return judge.loss(pictures, first, data["tokens"], data["label"], data["progress"], data["where"], max(share, 0.3), generator)
 
     return fit("judge", judge, batch, loss, options, folder, watch="frame_accuracy")
 

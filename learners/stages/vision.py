@@ -72,7 +72,7 @@ def train_sight(simulator: Simulator, store: ClipStore, episodes: Tensor, option
         return {}
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        return places.sight.loss(data, places.of(data["objects"]))
+        return places.sight.loss(data, places.of(data["objects"]), generator)
 
     stats = fit("sight", places.sight, lambda _, generator: store.shots(episodes, options.part, generator), loss, options, folder)
     places.taught.fill_(True)
