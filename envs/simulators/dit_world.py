@@ -91,7 +91,7 @@ class DiTSimulator(LatentWorld):
         """See LatentWorld."""
         seen, cameras = self.draft.look(inputs)
         firsts = unit(inputs["memory", "frames"][:, 0])
-        return torch.stack([self.draft(view, firsts, seen, cameras, inputs["intrinsic"]) for view in range(self.shape.views)], 2)
+        return torch.stack(self.draft(range(self.shape.views), firsts, seen, cameras, inputs["intrinsic"]), 2)
 
     def conditioning(self, inputs: TensorDict, places: tuple[int, int]) -> Tensor:
         """See LatentWorld; spots of the objects stand beside, known from the last remembered frame on."""

@@ -7,6 +7,8 @@ and whatever the first picture did not show, are what is left for the network.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
@@ -55,35 +57,38 @@ class Draft(nn.Module):
         return in_view(places, inputs["intrinsic"], cameras, self.size), cameras
 
     @torch.no_grad()
-    def forward(self, view: int, firsts: Tensor, seen: InView, c2w: Tensor, intrinsic: Tensor) -> Tensor:
-        """The frames of one view.
+    def forward(self, views: Sequence[int], firsts: Tensor, seen: InView, c2w: Tensor, intrinsic: Tensor) -> list[Tensor]:
+        """The frames of some views.
 
         Args:
-            view: which.
+            views: which.
             firsts: float [B, V, 3, h, w] in 0..1, the first pictures at the resolution that is wanted.
             seen, c2w: as `look` says them.
             intrinsic: [B, V, 3, 3] in pixels of full size.
 
         Returns:
-            float [B, K, 3, h, w] in 0..1.
+            float [B, K, 3, h, w] in 0..1 for each.
         """
         height, width = firsts.shape[-2:]
         grid = pixel_grid(height, width, firsts.device)
-        mine, then = firsts[:, view], seen.at(view, slice(2, None))
+        # What a camera did not see of a thing at first, the first camera may have.
+        sources = {view: _Source(firsts[:, view], seen.at(view, 0), grid) for view in sorted({0, *views})}
+        return [self._view(view, [sources[number] for number in ((view, 0) if view else (0,))], seen.at(view, slice(2, None)), c2w[:, :, view], intrinsic[:, view], grid) for view in views]
+
+    def _view(self, view: int, sources: list[_Source], then: InView, c2w: Tensor, intrinsic: Tensor, grid: Tensor) -> Tensor:
+        """The frames [B, K, 3, h, w] of one view from its own first picture, and the first camera's."""
+        mine, bare = sources[0].picture, sources[0].bare
+        height, width = mine.shape[-2:]
         mounted = F.interpolate(self.mounted[view][None], size=(height, width), mode="area")
-        bare = _ground_colour(mine)
         ground = torch.lerp(mine, bare, F.max_pool2d(mounted, 5, stride=1, padding=2))  # the edge is neither and goes too
-        # What this camera did not see of a thing at first, the first camera may have.
-        sources = [(mine, bare, seen.at(view, 0))] + ([(firsts[:, 0], _ground_colour(firsts[:, 0]), seen.at(0, 0))] if view else [])
-        covers = [[_cover(*source, number, grid) for number in range(seen.where.shape[3])] for source in sources]
-        for own in covers[0]:
+        for own in sources[0].covers:
             ground = torch.lerp(ground, bare, own)
-        out = self._ground(ground, bare, intrinsic[:, view], c2w[:, :, view], grid)
+        out = self._ground(ground, bare, intrinsic, c2w, grid).permute(0, 1, 3, 4, 2).contiguous()  # the three colours side by side, as pixels are picked
         # What stands higher lies over what it stands on; the data's order has movable things first.
-        for number in reversed(range(len(covers[0]))):
-            things = [(torch.cat((picture, cover[number]), 1), begin.where[:, number], begin.axes[:, number], begin.visible[:, number]) for (picture, _, begin), cover in zip(sources, covers, strict=True)]
+        for number in reversed(range(len(sources[0].covers))):
+            things = [(torch.cat((source.picture, source.covers[number]), 1), source.begin.where[:, number], source.begin.axes[:, number], source.begin.visible[:, number]) for source in sources]
             _paste(out, things, then.where[:, :, number], then.axes[:, :, number], then.visible[:, :, number])
-        return torch.lerp(out, mine[:, None], mounted[:, None])
+        return torch.lerp(out.permute(0, 1, 4, 2, 3), mine[:, None], mounted[:, None])
 
     def _ground(self, picture: Tensor, bare: Tensor, intrinsic: Tensor, c2w: Tensor, grid: Tensor) -> Tensor:
         """The plane z = 0 as it is in picture [B, 3, h, w], seen from the cameras to come: [B, K, 3, h, w]."""
@@ -103,14 +108,14 @@ class Draft(nn.Module):
 
 
 def _paste(out: Tensor, things: list[tuple[Tensor, Tensor, Tensor, Tensor]], where: Tensor, axes: Tensor, visible: Tensor) -> None:
-    """Lay a thing over frames out [B, K, 3, h, w], in place, where it is [B, K, 2] and as it is turned [B, K, 2, 2] there.
+    """Lay a thing over frames out [B, K, h, w, 3], in place, where it is [B, K, 2] and as it is turned [B, K, 2, 2] there.
 
     Args:
         things: pictures with a fourth channel that covers it [B, 4, h, w], where [B, 2] and with which axes [B, 2, 2] it is in them,
             and whether, bool [B]; where the first picture ends, or has it not, the second is taken.
         visible: bool [B, K].
     """
-    (batch, steps, _, height, width), device = out.shape, out.device
+    (batch, steps, height, width, _), device = out.shape, out.device
     back = torch.linalg.inv(regular(axes))
     # Only around the thing; a frame in which it is small is for the most part left alone.
     reach = (_HALF * axes.abs().sum(-1) * visible[..., None]).amax((0, 1)) * torch.tensor([width, height], device=device)
@@ -127,22 +132,39 @@ def _paste(out: Tensor, things: list[tuple[Tensor, Tensor, Tensor, Tensor]], whe
         inside = (at.abs().amax(-1, keepdim=True) < 1) & shown[:, None, None, None, None]
         carried = there if carried is None else torch.where(inside, there, carried)
     assert carried is not None
-    index = (torch.arange(batch, device=device)[:, None, None, None], torch.arange(steps, device=device)[None, :, None, None], slice(None), rows[..., None], columns[:, :, None])
+    index = (torch.arange(batch, device=device)[:, None, None, None], torch.arange(steps, device=device)[None, :, None, None], rows[..., None], columns[:, :, None])
     out[index] = torch.lerp(out[index], carried[..., :3], carried[..., 3:] * visible[..., None, None, None])
 
 
-def _ground_colour(picture: Tensor) -> Tensor:
-    """What most of picture [B, 3, h, w] shows, [B, 3, 1, 1]; a look at every third row and column tells."""
-    return picture[..., ::3, ::3].flatten(2).median(-1).values[..., None, None]
+class _Source:
+    """A first picture [B, 3, h, w] and what is in it: the ground's colour bare [B, 3, 1, 1], and for each thing in view [B, S] which pixels are its own, covers of [B, 1, h, w]."""
+
+    def __init__(self, picture: Tensor, begin: InView, grid: Tensor):
+        self.picture, self.begin = picture, begin
+        # A look at every third row and column tells what most of it shows.
+        self.bare = picture[..., ::3, ::3].flatten(2).median(-1).values[..., None, None]
+        self._from_bare, self._tints = _apart(picture, self.bare), _tint(picture)
+        self._tint_from_bare = _apart(self._tints, _tint(self.bare))
+        self.covers = [self._cover(number, grid) for number in range(begin.where.shape[1])]
+
+    def _cover(self, number: int, grid: Tensor) -> Tensor:
+        """A pixel is a thing's if it is near it, and more of its colour than of the ground's, in light or in shade."""
+        where, axes = self.begin.where[:, number], self.begin.axes[:, number]
+        u, v = on_thing(where, axes, grid).unbind(-1)
+        window = ((_HALF - (u.square() + v.square()).sqrt()) / _SOFT).clamp(0, 1)
+        points = where[:, None] + torch.einsum("bij,nj->bni", axes, 0.01 * torch.tensor([[0.0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], device=where.device))
+        colour = F.grid_sample(self.picture, points[:, None], padding_mode="border", align_corners=False)[:, :, 0].median(-1).values[..., None, None]
+        lit, tinted = self._from_bare - _apart(self.picture, colour), self._tint_from_bare - _apart(self._tints, _tint(colour))
+        return (window * (0.5 + _LIKE * torch.maximum(lit, 2 * tinted)).clamp(0, 1) * self.begin.visible[:, number, None, None])[:, None]
 
 
-def _cover(picture: Tensor, bare: Tensor, begin: InView, number: int, grid: Tensor) -> Tensor:
-    """How far each pixel of picture [B, 3, h, w] is that of a thing in view [B, S], [B, 1, h, w]: near it, and more of its colour than of the ground's, in light or in shade."""
-    where, axes = begin.where[:, number], begin.axes[:, number]
-    window = ((_HALF - on_thing(where, axes, grid).square().sum(-1).sqrt()) / _SOFT).clamp(0, 1)
-    points = where[:, None] + torch.einsum("bij,nj->bni", axes, 0.01 * torch.tensor([[0.0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], device=where.device))
-    colour = F.grid_sample(picture, points[:, None], padding_mode="border", align_corners=False)[:, :, 0].median(-1).values[..., None, None]
-    lit = (picture - bare).abs().sum(1) - (picture - colour).abs().sum(1)
-    tints = [value / value.sum(1, keepdim=True).clamp(min=0.1) for value in (picture, bare, colour)]
-    tinted = (tints[0] - tints[1]).abs().sum(1) - (tints[0] - tints[2]).abs().sum(1)
-    return (window * (0.5 + _LIKE * torch.maximum(lit, 2 * tinted)).clamp(0, 1) * begin.visible[:, number, None, None])[:, None]
+def _apart(one: Tensor, other: Tensor) -> Tensor:
+    """How far apart colours [B, 3, h, w] are, [B, h, w]; three sums are faster than torch's over a short axis."""
+    red, green, blue = (one - other).abs().unbind(1)
+    return red + green + blue
+
+
+def _tint(colours: Tensor) -> Tensor:
+    """Colours [B, 3, h, w] as shares of their light."""
+    red, green, blue = colours.unbind(1)
+    return colours / (red + green + blue).clamp(min=0.1)[:, None]

@@ -167,16 +167,18 @@ class UNetSimulator(Simulator):
         ends: list[tuple[Tensor, Tensor]] = []
         seen, cameras = self.draft.look(inputs)
         firsts = memory["frames"][:, 0].float() / 255
+        drafts: dict[int, Tensor] = {}
+        for shrink in set(self.config.shrink):
+            some = [view for view, s in enumerate(self.config.shrink) if s == shrink]
+            drafts |= zip(some, self.draft(some, firsts if shrink == 1 else _halve(firsts), seen, cameras, inputs["intrinsic"]), strict=True)
         for view, (shrink, embed) in enumerate(zip(self.config.shrink, self.embed, strict=True)):
             pictures = stack[:, :, view].flatten(1, 2).float().div_(255.0)
             if shrink > 1:
                 pictures = _halve(pictures)
             latest = 3 * (self.shape.memory - 1)
             spots = place_map(seen.at(view, slice(1, None)), *pictures.shape[-2:])
-            begin = firsts if shrink == 1 else _halve(firsts)
-            draft = self.draft(view, begin, seen, cameras, inputs["intrinsic"])
-            ends.append((draft, pictures[:, latest : latest + 3]))
-            shown = torch.cat((pictures * 2 - 1, draft.flatten(1, 2) * 2 - 1, spots.flatten(1, 2)), 1)
+            ends.append((drafts[view], pictures[:, latest : latest + 3]))
+            shown = torch.cat((pictures * 2 - 1, drafts[view].flatten(1, 2) * 2 - 1, spots.flatten(1, 2)), 1)
             (fine if shrink == 1 else deep).append(embed(shown))
         x = torch.stack(fine).sum(0)
         for block in self.fine_in:

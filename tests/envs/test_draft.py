@@ -22,7 +22,7 @@ def _drafts(store: ClipStore, episode: int, move: Tensor | None = None) -> tuple
     draft.learn(store.frames(store.start), store.arrays["c2w"][store.start])
     firsts = inputs["memory", "frames"][:, 0].float() / 255
     seen, cameras = draft.look(inputs)
-    made = torch.stack([draft(view, firsts, seen, cameras, inputs["intrinsic"])[0] for view in range(3)], 1)
+    made = torch.stack(draft(range(3), firsts, seen, cameras, inputs["intrinsic"]), 2)[0]
     return made, clip["future", "frames"][0].float() / 255, firsts[0]
 
 
@@ -62,5 +62,5 @@ def test_cameras_nobody_placed_keep_the_first_frame(store: ClipStore) -> None:
         inputs[part, "c2w"] = torch.eye(4).expand_as(inputs[part, "c2w"]).clone()
     draft = Draft(3, store.size)
     firsts = inputs["memory", "frames"][:, 0].float() / 255
-    made = draft(0, firsts, *draft.look(inputs), inputs["intrinsic"])
+    (made,) = draft([0], firsts, *draft.look(inputs), inputs["intrinsic"])
     assert torch.allclose(made[0, 2], firsts[0, 0], atol=1e-4)
