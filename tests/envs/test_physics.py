@@ -24,7 +24,7 @@ def test_same_seed_same_episode_whatever_the_workers() -> None:
         pool.close()
     for one, two in zip(*results, strict=True):
         for name in one.rows:
-            assert np.array_equal(np.stack(one.rows[name]), np.stack(two.rows[name])), name
+            assert np.array_equal(np.stack(one.rows[name]), np.stack(two.rows[name]), equal_nan=True), name
 
 
 @pytest.mark.parametrize("control_hz", [10.0, 5.0])
