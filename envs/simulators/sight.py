@@ -70,7 +70,7 @@ class Sight(nn.Module):
         wrong = turned - torch.nan_to_num(torch.stack((angle.cos(), angle.sin()), -1))
         known = torch.isfinite(angle) & (torch.tensor(self.sides, device=objects.device) > 0)
         askew = (wrong.square().sum(-1) * known).sum() / known.sum().clamp(min=1)
-        return guessed + found + 3 * askew, {"found_cm": found.detach(), "askew": askew.detach()}
+        return guessed + found + 8 * askew, {"found_cm": found.detach(), "askew": askew.detach()}
 
 
 def mean_gap(gap: Tensor) -> Tensor:
