@@ -133,4 +133,4 @@ def centres(share: Tensor) -> Tensor:
 
 def to_signed(frames: Tensor) -> Tensor:
     """uint8 pictures as float32 in -1..1; floats are taken to be so already."""
-    return frames if frames.is_floating_point() else frames.float().div(127.5).sub(1.0)
+    return frames if frames.is_floating_point() else frames.float().mul_(1 / 127.5).sub_(1.0)

@@ -12,6 +12,11 @@ def computes_bf16(device: torch.device) -> bool:
     return bool(torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())
 
 
+def working_dtype(device: torch.device, otherwise: torch.dtype) -> torch.dtype:
+    """What matrices are multiplied in on a device: autocast's type within it, or `otherwise`."""
+    return torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else otherwise
+
+
 def mixed_precision(device: torch.device, wanted: bool) -> torch.autocast:
     """Autocast to bfloat16 where it is wanted and the device computes in it, else a context that changes nothing."""
     return torch.autocast(device.type, torch.bfloat16, enabled=wanted and computes_bf16(device))

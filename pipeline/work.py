@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from actors.factory import (
 from actors.launch import build_fleet
 from actors.recipe import Recipe
 from envs.episodes import Episode, LeRobotDataset, LeRobotWriter
+from envs.episodes.behind import WriteBehind
 from envs.episodes.clips import ClipStore
 from envs.physics.pool import BenchPool, Track
 from envs.simulators.replay import replay
@@ -94,11 +95,11 @@ def collect(cfg: Cfg, folder: Path, found: Found, part: str) -> dict[str, Any]:
     pool = BenchPool(bench, 2 * (torch.get_num_threads()), task["horizon"], cfg["launch"]["workers"])
     done = len(LeRobotDataset(writer.root)) if writer.shards else 0
     try:
-        with tqdm(total=total, initial=done, desc=f"collect {part}", unit="ep", dynamic_ncols=True) as bar:
+        with tqdm(total=total, initial=done, desc=f"collect {part}", unit="ep", dynamic_ncols=True) as bar, WriteBehind(writer) as behind:
             for begin in range(done, total, size):
                 batch = jobs[begin : begin + size]
                 tracks = pool.script([(seed, dial) for seed, dial, _ in batch])
-                writer.write([Episode.from_track(t, b, bench.views, task["control_hz"]) for t, (_, _, b) in zip(tracks, batch, strict=True)])
+                behind.write([Episode.from_track(t, b, bench.views, task["control_hz"]) for t, (_, _, b) in zip(tracks, batch, strict=True)])
                 bar.update(len(batch))
     finally:
         pool.close()
@@ -113,27 +114,26 @@ def deploy(cfg: Cfg, folder: Path, found: Found, number: int, episodes: int) -> 
     seeds = seeds_of(cfg, DEPLOY, episodes, offset=100_000 * number)
     data = folder / "dataset"
     shutil.rmtree(data, ignore_errors=True)  # a deployment is short; half of one is begun anew
-    tracks = run_recorded(cfg, policy, seeds)
-    bench = bench_config(cfg)
-    writer = LeRobotWriter(data, bench.views, bench.size, cfg["task"]["control_hz"])
-    for begin in range(0, len(tracks), 100):
-        writer.write([Episode.from_track(track, f"policy-{number}", bench.views, cfg["task"]["control_hz"]) for track in tracks[begin : begin + 100]])
-    success = torch.tensor([bool(track.rows["success"][-1]) for track in tracks])
-    return {"episodes": len(tracks), "true_stochastic": rate_entry(success), "success": float(success.float().mean())}
+    bench, won = bench_config(cfg), []
+    with WriteBehind(LeRobotWriter(data, bench.views, bench.size, cfg["task"]["control_hz"])) as behind:
+        for tracks in run_recorded(cfg, policy, seeds):
+            behind.write([Episode.from_track(track, f"policy-{number}", bench.views, cfg["task"]["control_hz"]) for track in tracks])
+            won += [bool(track.rows["success"][-1]) for track in tracks]
+    success = torch.tensor(won)
+    return {"episodes": len(success), "true_stochastic": rate_entry(success), "success": float(success.float().mean())}
 
 
-def run_recorded(cfg: Cfg, policy: Any, seeds: list[int], stochastic: bool = True) -> list[Track]:
-    """Recorded episodes of a policy in physics, in the order of the seeds."""
+def run_recorded(cfg: Cfg, policy: Any, seeds: list[int], stochastic: bool = True) -> Iterator[list[Track]]:
+    """Recorded episodes of a policy in physics, in the order of the seeds, as many at once as run side by side."""
     env = build_physics(cfg, batch=min(64, len(seeds)), record=True)
     try:
-        tracks: dict[int, Track] = {}
         for begin in range(0, len(seeds), env.batch_size[0]):
             part = seeds[begin : begin + env.batch_size[0]]
             evaluate(env, policy, part, stochastic=stochastic, label="deploy", sampling_seed=cfg["seed"] * 1000 + begin)
-            tracks |= {track.seed: track for track in env.pop_tracks()}
+            tracks = {track.seed: track for track in env.pop_tracks()}
+            yield [tracks[seed] for seed in part]
     finally:
         env.close()
-    return [tracks[seed] for seed in seeds]
 
 
 def open_store(cfg: Cfg, found: Found, data: Iterable[str]) -> ClipStore:
@@ -364,7 +364,7 @@ def videos(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: 
     seeds = seeds_of(cfg, EVALUATE, cfg["measure"]["videos"])
     names = []
     for label, name in (("before", before), ("after", after)):
-        tracks = run_recorded(cfg, build_policy(cfg, found[name] / "weights.safetensors"), seeds, stochastic=False)
+        tracks = [track for some in run_recorded(cfg, build_policy(cfg, found[name] / "weights.safetensors"), seeds, stochastic=False) for track in some]
         bench = bench_config(cfg)
         data_folder = folder / f"dataset-{label}"
         shutil.rmtree(data_folder, ignore_errors=True)

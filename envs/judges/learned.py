@@ -67,8 +67,8 @@ class LearnedJudge(Judge):
     @torch.no_grad()
     def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
         """See Judge.score; `objects` is ignored."""
-        batch, count = frames.shape[:2]
-        logit, progress, _ = self(frames.flatten(0, 1), first.repeat_interleave(count, 0), tokens.repeat_interleave(count, 0))
+        batch, count = frames.shape[:2]  # of the first frames only the first view is looked at
+        logit, progress, _ = self(frames.flatten(0, 1), first[:, :1].repeat_interleave(count, 0), tokens.repeat_interleave(count, 0))
         success = logit.sigmoid().unflatten(0, (batch, count))
         status = ok_status(success)
         if self.margin:

@@ -134,7 +134,7 @@ class Worker:
         bench = slot.bench
         intrinsic, c2w = bench.cameras()
         return {
-            "image": bench.render(),
+            "image": bench.render() if slot.track is None else slot.track.rows["frames"][-1],
             "state": bench.state(),
             "command": bench.command.copy(),
             "intrinsic": intrinsic,

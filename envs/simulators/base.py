@@ -73,12 +73,20 @@ class Simulator(nn.Module):
             inputs: TensorDict [B] with memory (frames, pose_map uint8 [M, V, 3, H, W], c2w [M, V, 4, 4], places [M, S, 4]),
                 future (pose_map uint8 [K, V, 3, H, W], c2w [K, V, 4, 4], commands [K, A], places [K, S, 4]),
                 now (command [A], state [16], places [S, 4]; NaN where unknown),
-                intrinsic [V, 3, 3], seed int64 [], chunk_index int64 [].
+                begin (what `prepare` made of the first pictures), intrinsic [V, 3, 3], seed int64 [], chunk_index int64 [].
 
         Returns:
-            frames float32 [B, K, V, 3, H, W] in 0..1 and features float32 [B, *feature_shape] for the state expert.
+            frames uint8 [B, K, V, 3, H, W] and features float32 [B, *feature_shape] for the state expert.
         """
         raise NotImplementedError
+
+    def prepare(self, frames: Tensor, places: Tensor, intrinsic: Tensor, c2w: Tensor) -> TensorDict:
+        """What an engine makes of first pictures once, for all chunks of their episodes; a TensorDict [B], here an empty one.
+
+        Args:
+            frames: uint8 [B, V, 3, H, W]; places: [B, S, 4]; intrinsic: [B, V, 3, 3] pixels; c2w: [B, V, 4, 4].
+        """
+        return TensorDict({}, frames.shape[:1])
 
     def glance(self, frames: Tensor, c2w: Tensor) -> None:
         """Look at first pictures uint8 [N, V, 3, H, W] of different episodes, c2w [N, V, 4, 4], before training; an engine may learn what is the same in all."""
@@ -91,18 +99,21 @@ class Simulator(nn.Module):
         """Training loss of a clip (see ClipStore.clips) and figures to log."""
         raise NotImplementedError
 
-    def asked(self, clip: TensorDict, number: int, drawn: Tensor | None = None, generator: torch.Generator | None = None) -> TensorDict:
+    def asked(self, clip: TensorDict, number: int, drawn: Tensor | None = None, generator: torch.Generator | None = None, begin: TensorDict | None = None) -> TensorDict:
         """The inputs of `predict` for chunk `number` of a training clip [B].
 
         Args:
             drawn: uint8 [B, number * K, V, 3, H, W], the model's own frames of the chunks before; memory then shows
                 these instead of true ones.
             generator: draws the noise seeds; without one they are zero.
+            begin: of the clip's episodes, from an earlier call; without it they are prepared anew.
         """
         chunk, size = self.shape.chunk, clip.shape
         part = slice(number * chunk, (number + 1) * chunk)
         memory = TensorDict({key: clip["memory", key][:, number] for key in ("frames", "pose_map", "c2w")}, size)
         memory["places"] = self.places.of(clip["memory", "objects"][:, number])
+        if begin is None:
+            begin = self.prepare(memory["frames"][:, 0], memory["places"][:, 0], clip["intrinsic"], memory["c2w"][:, 0])
         if drawn is not None:
             rows = torch.arange(len(clip), device=clip.device)[:, None]
             ahead = clip["memory", "index"][:, number] - clip["begin"][:, None] - 1
@@ -120,6 +131,7 @@ class Simulator(nn.Module):
                 "memory": memory,
                 "future": future,
                 "now": TensorDict(now, size),
+                "begin": begin,
                 "intrinsic": clip["intrinsic"],
                 "seed": seed.to(clip.device),
                 "chunk_index": torch.zeros(size, dtype=torch.int64, device=clip.device),
@@ -145,6 +157,7 @@ class Simulator(nn.Module):
         size = frames.shape[:1]
         with torch.no_grad():
             places = self.places.find(frames[:, 0], intrinsic[:, 0].float(), c2w[:, 0].float())
+            begin = self.prepare(frames, places, intrinsic.float(), c2w.float())
         return TensorDict(
             {
                 "history": TensorDict(
@@ -158,6 +171,7 @@ class Simulator(nn.Module):
                     },
                     [*size, 1],
                 ),
+                "begin": begin,
                 "length": torch.ones(size, dtype=torch.int64, device=frames.device),
                 "intrinsic": intrinsic.float(),
                 "likeliest": torch.full(size, likeliest, device=frames.device),
@@ -193,14 +207,14 @@ class Simulator(nn.Module):
                 "memory": self.recall(state, pose_map, c2w),
                 "future": TensorDict({"pose_map": pose_map, "c2w": c2w, "commands": commands, "places": ahead}, [batch]),
                 "now": TensorDict({"command": now["commands"], "state": now["states"], "places": now["places"]}, [batch]),
+                "begin": state["begin"],
                 "intrinsic": state["intrinsic"],
                 "seed": state["seed"],
                 "chunk_index": state["chunk_index"],
             },
             [batch],
         )
-        frames, features = self.predict(inputs)
-        pictures = frames.clamp(0, 1).mul_(255).round_().to(torch.uint8)  # in place: these are the rollout's largest tensors
+        pictures, features = self.predict(inputs)
         need = int(length.max()) + count
         if need > history.shape[1]:  # room for twice as many chunks, so that long rollouts copy seldom
             grown = history.new_empty(batch, max(need, 2 * history.shape[1]))  # rows past a session's length are never read
@@ -267,8 +281,9 @@ class Simulator(nn.Module):
     def replace(state: TensorDict, mask: Tensor, fresh: TensorDict) -> TensorDict:
         """The state with the sessions of `mask` [B] replaced by those of `fresh` (one row per True, in order)."""
         for name in state.keys():
-            if name != "history":
+            if name not in ("history", "begin"):
                 state[name][mask] = fresh[name].to(state[name].dtype)
+        state["begin"][mask] = fresh["begin"]
         for name in state["history"].keys():
             state["history", name][mask.nonzero().flatten(), 0] = fresh["history", name][:, 0]
         return state
@@ -279,10 +294,9 @@ def noise_generator(seed: int, chunk_index: int) -> torch.Generator:
     return torch.Generator().manual_seed((int(seed) * 1_000_003 + int(chunk_index)) & 0x7FFF_FFFF_FFFF)
 
 
-def hue_gap(frames: Tensor) -> Tensor:
-    """How unlike in hue each pixel is to the picture's median colour, [..., 1, H, W] in 0..1, for frames [..., 3, H, W] in 0..1."""
-    gap = frames - frames.flatten(-2).median(-1).values[..., None, None]
-    return ((gap - gap.mean(-3, keepdim=True)).abs().amax(-3, keepdim=True) * 4).clamp(max=1.0)
+def to_bytes(frames: Tensor) -> Tensor:
+    """Float frames in 0..1, or somewhat beyond, as uint8."""
+    return frames.clamp(0, 1).mul_(255).round_().to(torch.uint8)  # in place: these are a rollout's largest tensors
 
 
 def foreground_weight(frames: Tensor, gain: float) -> Tensor:
@@ -295,5 +309,7 @@ def foreground_weight(frames: Tensor, gain: float) -> Tensor:
         frames: float [..., 3, H, W] in 0..1.
         gain: weight of a pixel of a fully different hue, above the 1 of the median colour; a grey difference gets a twelfth.
     """
-    grey = (frames - frames.flatten(-2).median(-1).values[..., None, None]).mean(-3, keepdim=True)
-    return 1.0 + gain * (hue_gap(frames) + (grey.abs() * 2.5).clamp(max=1.0) / 12)
+    gap = frames - frames.flatten(-2).median(-1).values[..., None, None]
+    grey = gap.mean(-3, keepdim=True)
+    hue = ((gap - grey).abs().amax(-3, keepdim=True) * 4).clamp(max=1.0)
+    return 1.0 + gain * (hue + (grey.abs() * 2.5).clamp(max=1.0) / 12)

@@ -15,7 +15,7 @@ from envs.simulators.base import WorldShape
 from envs.simulators.dit import DiTShape, MultiViewDiT
 from envs.simulators.draft import Draft
 from envs.simulators.in_view import place_map
-from envs.simulators.latent_world import LatentWorld, unit
+from envs.simulators.latent_world import LatentWorld
 from envs.simulators.sampling import Euler
 
 
@@ -87,11 +87,14 @@ class DiTSimulator(LatentWorld):
         """See Simulator.glance."""
         self.draft.learn(frames, c2w)
 
+    def prepare(self, frames: Tensor, places: Tensor, intrinsic: Tensor, c2w: Tensor) -> TensorDict:
+        """See Simulator.prepare."""
+        return self.draft.prepare(frames, places, intrinsic, c2w)
+
     def drafted(self, inputs: TensorDict) -> Tensor:
         """See LatentWorld."""
-        seen, cameras = self.draft.look(inputs)
-        firsts = unit(inputs["memory", "frames"][:, 0])
-        return torch.stack(self.draft(range(self.shape.views), firsts, seen, cameras, inputs["intrinsic"]), 2)
+        ahead = self.draft.look(inputs).at(slice(None), slice(1, None))
+        return torch.stack(self.draft(inputs["begin"], ahead, inputs["future", "c2w"], inputs["intrinsic"]), 2)
 
     def conditioning(self, inputs: TensorDict, places: tuple[int, int]) -> Tensor:
         """See LatentWorld; spots of the objects stand beside, known from the last remembered frame on."""
@@ -101,6 +104,6 @@ class DiTSimulator(LatentWorld):
         rays = render_ray_map(inputs["intrinsic"], c2w, self.shape.size, stride=STRIDE)  # [B, V, T, 6, h, w]
         mask = torch.zeros_like(rays[:, :, :, :1])
         mask[:, :, : self.shape.memory] = 1.0
-        spots = place_map(self.draft.look(inputs)[0].at(slice(None), slice(1, None)), *places)
+        spots = place_map(self.draft.look(inputs), *places)
         spots = F.pad(spots, (0, 0, 0, 0, 0, 0, self.shape.memory - 1, 0))
         return torch.cat([small.permute(0, 2, 1, 3, 4, 5), rays, mask, spots], 3).transpose(2, 3)

@@ -8,13 +8,16 @@ and whatever the first picture did not show, are what is left for the network.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from envs.encoders import middles
 from envs.geometry import invert
+from envs.simulators.folding import at_detail
 from envs.simulators.in_view import InView, in_view, on_thing, pixel_grid, regular
 
 _HALF = 0.058  # m around a thing's middle within which its pixels lie
@@ -24,138 +27,165 @@ _STILL = 0.02  # largest deviation, over episodes, of the colours (0..1) of what
 
 
 class Draft(nn.Module):
-    """Drafts of frames to come.
+    """Drafts of frames to come. What the first picture gives is prepared once for all of an episode's chunks.
 
     Args:
         views: cameras, V.
         size: (height, width) of their pictures.
+        shrink: how much smaller each view is drafted, 1 or 2; 1 is full detail, and the default.
 
     Attributes:
         mounted: float32 [V, 1, H, W], 1 where a moving camera always sees the same: what it is mounted on.
+        moving: bool [V], which cameras move; the others see the same ground in every frame.
     """
 
     mounted: Tensor
+    moving: Tensor
 
-    def __init__(self, views: int, size: tuple[int, int]):
+    def __init__(self, views: int, size: tuple[int, int], shrink: Sequence[int] | None = None):
         super().__init__()
-        self.size = size
+        self.size, self.shrink = size, tuple(shrink or (1,) * views)
         self.register_buffer("mounted", torch.zeros(views, 1, *size))
+        self.register_buffer("moving", torch.zeros(views, dtype=torch.bool))
 
     @torch.no_grad()
     def learn(self, frames: Tensor, c2w: Tensor) -> None:
         """Find what is mounted on cameras, from frames uint8 [N, V, 3, H, W] of different episodes and c2w [N, V, 4, 4]."""
         frames, c2w = frames.to(self.mounted.device), c2w.to(self.mounted.device)
-        moving = (c2w - c2w[:1]).abs().amax((0, 2, 3)) > 1e-3
+        self.moving.copy_((c2w - c2w[:1]).abs().amax((0, 2, 3)) > 1e-3)
         same = (frames.float() / 255).std(0).amax(1, keepdim=True) < _STILL
-        self.mounted.copy_(same * moving[:, None, None, None])
-
-    def look(self, inputs: TensorDict) -> tuple[InView, Tensor]:
-        """Objects in all views [B, V, 2 + K, S], at the first remembered frame, at the last, and at the K to come, and the cameras [B, 2 + K, V, 4, 4] then; `inputs` are those of Simulator.predict."""
-        memory, future = inputs["memory"], inputs["future"]
-        places = torch.cat((memory["places"][:, :1], inputs["now", "places"][:, None], future["places"]), 1)
-        cameras = torch.cat((memory["c2w"][:, :1], memory["c2w"][:, -1:], future["c2w"]), 1)
-        return in_view(places, inputs["intrinsic"], cameras, self.size), cameras
+        self.mounted.copy_(same * self.moving[:, None, None, None])
 
     @torch.no_grad()
-    def forward(self, views: Sequence[int], firsts: Tensor, seen: InView, c2w: Tensor, intrinsic: Tensor) -> list[Tensor]:
-        """The frames of some views.
+    def prepare(self, frames: Tensor, places: Tensor, intrinsic: Tensor, c2w: Tensor) -> TensorDict:
+        """What drafts are made of: first pictures, cut into ground and things.
 
         Args:
-            views: which.
-            firsts: float [B, V, 3, h, w] in 0..1, the first pictures at the resolution that is wanted.
-            seen, c2w: as `look` says them.
-            intrinsic: [B, V, 3, 3] in pixels of full size.
+            frames: uint8 [B, V, 3, H, W]; places: [B, S, 4] of things in them.
+            intrinsic: [B, V, 3, 3] pixels; c2w: [B, V, 4, 4].
 
         Returns:
-            float [B, K, 3, h, w] in 0..1 for each.
+            TensorDict [B] of one for each view ("0", "1", ...): the camera `c2w`, the ground's colour `bare` [B, 3, 1, 1], the `ground`
+            without things and what is `mounted` [B, 3, h, w], and the things' pictures with a fourth channel that covers
+            them [B, S, 4, h, w], `where` [B, S, 2] and with which `axes` [B, S, 2, 2] they are in them (InView), and whether, `visible`.
         """
-        height, width = firsts.shape[-2:]
-        grid = pixel_grid(height, width, firsts.device)
-        # What a camera did not see of a thing at first, the first camera may have.
-        sources = {view: _Source(firsts[:, view], seen.at(view, 0), grid) for view in sorted({0, *views})}
-        return [self._view(view, [sources[number] for number in ((view, 0) if view else (0,))], seen.at(view, slice(2, None)), c2w[:, :, view], intrinsic[:, view], grid) for view in views]
+        seen = in_view(places[:, None], intrinsic, c2w[:, None], self.size).at(slice(None), 0)
+        return TensorDict({str(view): TensorDict({"c2w": c2w[:, view], **self._cut(frames, seen, view)}, frames.shape[:1]) for view in range(len(self.shrink))}, frames.shape[:1])
 
-    def _view(self, view: int, sources: list[_Source], then: InView, c2w: Tensor, intrinsic: Tensor, grid: Tensor) -> Tensor:
+    def _cut(self, frames: Tensor, seen: InView, view: int) -> dict[str, Tensor]:
+        """One view as `prepare` gives it."""
+        shrink = self.shrink[view]
+        picture = at_detail(frames[:, view], shrink)
+        # A look at every third row and column tells what most of it shows.
+        bare = picture[..., ::3, ::3].flatten(2).median(-1).values[..., None, None]
+        begin = InView(*(value[:, view] for value in seen))
+        covers = _covers(picture, bare, begin)
+        mounted = F.interpolate(self.mounted[view][None], size=picture.shape[-2:], mode="area")
+        mine = F.max_pool2d(mounted, 5, stride=1, padding=2)  # the edge is neither and goes too
+        ground = torch.lerp(picture, bare, 1 - (1 - mine) * (1 - covers).prod(1))
+        out = {"bare": bare, "ground": ground, "mounted": picture * mounted}
+        things = {"things": _with_picture(covers, picture), "where": begin.where, "axes": begin.axes, "visible": begin.visible}
+        if view:
+            # What a camera does not see the whole of at first, the first camera may.
+            other, first = InView(*(value[:, 0] for value in seen)), at_detail(frames[:, 0], shrink)
+            there = _covers(first, first[..., ::3, ::3].flatten(2).median(-1).values[..., None, None], other)
+            whole = begin.visible & (begin.where.abs() + _HALF * begin.axes.abs().sum(-1) < 1).all(-1) | ~other.visible
+            elsewhere = {"things": _with_picture(there, first), "where": other.where, "axes": other.axes, "visible": other.visible}
+            things = {name: torch.where(whole.view(*whole.shape, *[1] * (value.ndim - 2)), value, elsewhere[name]) for name, value in things.items()}
+        return out | things
+
+    def look(self, inputs: TensorDict) -> InView:
+        """Objects in all views [B, V, 1 + K, S], at the last remembered frame and at the K to come; `inputs` are those of Simulator.predict."""
+        places = torch.cat((inputs["now", "places"][:, None], inputs["future", "places"]), 1)
+        cameras = torch.cat((inputs["memory", "c2w"][:, -1:], inputs["future", "c2w"]), 1)
+        return in_view(places, inputs["intrinsic"], cameras, self.size)
+
+    @torch.no_grad()
+    def forward(self, begin: TensorDict, seen: InView, c2w: Tensor, intrinsic: Tensor) -> list[Tensor]:
+        """The frames to come.
+
+        Args:
+            begin: as prepared.
+            seen: objects at the frames to come, [B, V, K, S].
+            c2w: [B, K, V, 4, 4] cameras then; intrinsic: [B, V, 3, 3] in pixels of full size.
+
+        Returns:
+            float [B, K, 3, h, w] in 0..1 for each view.
+        """
+        moving = self.moving.tolist()
+        return [self._view(view, moving[view], begin, seen.at(view, slice(None)), c2w[:, :, view], intrinsic[:, view]) for view in range(len(moving))]
+
+    def _view(self, view: int, moving: bool, begin: TensorDict, then: InView, c2w: Tensor, intrinsic: Tensor) -> Tensor:
         """The frames [B, K, 3, h, w] of one view from its own first picture, and the first camera's."""
-        mine, bare = sources[0].picture, sources[0].bare
-        height, width = mine.shape[-2:]
-        mounted = F.interpolate(self.mounted[view][None], size=(height, width), mode="area")
-        ground = torch.lerp(mine, bare, F.max_pool2d(mounted, 5, stride=1, padding=2))  # the edge is neither and goes too
-        for own in sources[0].covers:
-            ground = torch.lerp(ground, bare, own)
-        out = self._ground(ground, bare, intrinsic, c2w, grid).permute(0, 1, 3, 4, 2).contiguous()  # the three colours side by side, as pixels are picked
+        mine = begin[str(view)]
+        out = self._ground(mine, intrinsic, c2w) if moving else mine["ground"][:, None].repeat(1, c2w.shape[1], 1, 1, 1)
         # What stands higher lies over what it stands on; the data's order has movable things first.
-        for number in reversed(range(len(sources[0].covers))):
-            things = [(torch.cat((source.picture, source.covers[number]), 1), source.begin.where[:, number], source.begin.axes[:, number], source.begin.visible[:, number]) for source in sources]
-            _paste(out, things, then.where[:, :, number], then.axes[:, :, number], then.visible[:, :, number])
-        return torch.lerp(out.permute(0, 1, 4, 2, 3), mine[:, None], mounted[:, None])
+        for number in reversed(range(then.where.shape[2])):
+            _paste(out, mine.select("things", "where", "axes", "visible").apply(partial(torch.select, dim=1, index=number)), then.where[:, :, number], then.axes[:, :, number], then.visible[:, :, number])
+        if not moving:
+            return out
+        mounted = F.interpolate(self.mounted[view][None], size=out.shape[-2:], mode="area")
+        return torch.addcmul(mine["mounted"][:, None], out, 1 - mounted)
 
-    def _ground(self, picture: Tensor, bare: Tensor, intrinsic: Tensor, c2w: Tensor, grid: Tensor) -> Tensor:
-        """The plane z = 0 as it is in picture [B, 3, h, w], seen from the cameras to come: [B, K, 3, h, w]."""
+    def _ground(self, first: TensorDict, intrinsic: Tensor, c2w: Tensor) -> Tensor:
+        """The plane z = 0 as a first picture has it, from the cameras to come [B, K, 4, 4]: [B, K, 3, h, w]."""
+        picture, bare = first["ground"], first["bare"]
         half = torch.tensor([[2 / self.size[1], 0, -1], [0, 2 / self.size[0], -1], [0, 0, 1]], device=picture.device)
         # From the plane's (x, y, 1) to half-pictures, for every camera; of a camera in the plane the first picture stays.
-        onto = (half @ intrinsic)[:, None] @ invert(c2w)[..., :3, :][..., [0, 1, 3]]
-        back, failed = torch.linalg.inv_ex(onto[:, 2:])
+        onto = (half @ intrinsic)[:, None] @ invert(torch.cat((first["c2w"][:, None], c2w), 1))[..., :3, :][..., [0, 1, 3]]
+        back, failed = torch.linalg.inv_ex(onto[:, 1:])
         through = torch.where(failed[..., None, None] > 0, torch.eye(3, device=back.device), onto[:, :1] @ back)
-        if bool((through - torch.eye(3, device=through.device)).abs().amax() < 1e-5):
-            return picture[:, None].repeat(1, through.shape[1], 1, 1, 1)  # a camera that stands still
-        homogeneous = torch.cat((grid, torch.ones_like(grid[..., :1])), -1)
-        at = torch.einsum("bkij,hwj->bkhwi", through, homogeneous)
-        where = torch.where(at[..., 2:] <= 1e-6, 3.0, at[..., :2] / at[..., 2:].clamp(min=1e-6))
+        height, width = picture.shape[-2:]
+        across, down = middles(width, picture.device), middles(height, picture.device)[:, None]
+        u, v, depth = ((row[..., :1, None] * across + (row[..., 1:2, None] * down + row[..., 2:, None])) for row in through.unbind(2))
+        where = torch.stack((u, v), -1) / depth.clamp(min=1e-6)[..., None]
+        where = where.masked_fill_((depth <= 1e-6)[..., None], 3.0)
         # Beyond the first picture the ground has its usual colour.
-        out = F.grid_sample(picture - bare, where.flatten(1, 2), align_corners=False).unflatten(2, (-1, grid.shape[0])).transpose(1, 2)
-        return out + bare[:, None]
+        out = F.grid_sample(picture - bare, where.flatten(1, 2), align_corners=False).unflatten(2, (-1, height)).transpose(1, 2)
+        return (out + bare[:, None]).contiguous()
 
 
-def _paste(out: Tensor, things: list[tuple[Tensor, Tensor, Tensor, Tensor]], where: Tensor, axes: Tensor, visible: Tensor) -> None:
-    """Lay a thing over frames out [B, K, h, w, 3], in place, where it is [B, K, 2] and as it is turned [B, K, 2, 2] there.
-
-    Args:
-        things: pictures with a fourth channel that covers it [B, 4, h, w], where [B, 2] and with which axes [B, 2, 2] it is in them,
-            and whether, bool [B]; where the first picture ends, or has it not, the second is taken.
-        visible: bool [B, K].
-    """
-    (batch, steps, height, width, _), device = out.shape, out.device
-    back = torch.linalg.inv(regular(axes))
+def _paste(out: Tensor, thing: TensorDict, where: Tensor, axes: Tensor, visible: Tensor) -> None:
+    """Lay a thing, as prepared, over frames out [B, K, 3, h, w], in place, where it is [B, K, 2] and as it is turned [B, K, 2, 2] there, if it is visible, bool [B, K]."""
+    (_, steps, _, height, width), device = out.shape, out.device
+    visible = visible & thing["visible"][:, None]
     # Only around the thing; a frame in which it is small is for the most part left alone.
-    reach = (_HALF * axes.abs().sum(-1) * visible[..., None]).amax((0, 1)) * torch.tensor([width, height], device=device)
+    size = torch.tensor([width, height], device=device)
+    reach = (_HALF * axes.abs().sum(-1) * visible[..., None]).amax((0, 1)) * size
     wide, high = (min(most, int(extent) + 3) for extent, most in zip(reach.tolist(), (width, height), strict=True))
-    room = torch.tensor([width - wide, height - high], device=device)
-    corner = torch.minimum((((where + 1) * torch.tensor([width, height], device=device) - torch.tensor([wide, high], device=device)) / 2).round().long().clamp(min=0), room)
+    room = torch.tensor([wide, high], device=device)
+    corner = torch.minimum((((where + 1) * size - room) / 2).round().long().clamp(min=0), size - room)
     columns, rows = corner[..., :1] + torch.arange(wide, device=device), corner[..., 1:] + torch.arange(high, device=device)
-    grid = torch.stack(((columns[:, :, None].expand(-1, -1, high, -1) * 2 + 1) / width - 1, (rows[..., None].expand(-1, -1, -1, wide) * 2 + 1) / height - 1), -1)
-    carried: Tensor | None = None
-    for picture, begin, turned, shown in reversed(things):
-        move = turned[:, None] @ back  # from this frame's half-pictures to that picture's
-        at = begin[:, None, None, None] + torch.einsum("bkij,bkhwj->bkhwi", move, grid - where[:, :, None, None])
-        there = F.grid_sample(picture, at.flatten(1, 2), align_corners=False).unflatten(2, (steps, high)).permute(0, 2, 3, 4, 1)
-        inside = (at.abs().amax(-1, keepdim=True) < 1) & shown[:, None, None, None, None]
-        carried = there if carried is None else torch.where(inside, there, carried)
-    assert carried is not None
-    index = (torch.arange(batch, device=device)[:, None, None, None], torch.arange(steps, device=device)[None, :, None, None], rows[..., None], columns[:, :, None])
-    out[index] = torch.lerp(out[index], carried[..., :3], carried[..., 3:] * visible[..., None, None, None])
+    u = (columns * 2 + 1) / width - 1 - where[..., :1]
+    v = (rows * 2 + 1) / height - 1 - where[..., 1:]
+    move = (thing["axes"][:, None] @ torch.linalg.inv(regular(axes)))[:, :, None, None]  # from this frame's half-pictures to that picture's
+    at = torch.addcmul(thing["where"][:, None, None, None] + v[:, :, :, None, None] * move[..., 1], u[:, :, None, :, None], move[..., 0])
+    carried = F.grid_sample(thing["things"], at.flatten(1, 2), align_corners=False).unflatten(2, (steps, high)).flatten(3).transpose(1, 2)  # [B, K, 4, n]
+    index = (rows[..., None] * width + columns[:, :, None]).flatten(2)[:, :, None].expand(-1, -1, 3, -1)
+    pixels = out.flatten(3)
+    pixels.scatter_(3, index, torch.lerp(pixels.gather(3, index), carried[:, :, :3], carried[:, :, 3:] * visible[..., None, None]))
 
 
-class _Source:
-    """A first picture [B, 3, h, w] and what is in it: the ground's colour bare [B, 3, 1, 1], and for each thing in view [B, S] which pixels are its own, covers of [B, 1, h, w]."""
+def _with_picture(covers: Tensor, picture: Tensor) -> Tensor:
+    """Covers [B, S, 1, h, w] as fourth channels of the picture [B, 3, h, w] they are of: [B, S, 4, h, w]."""
+    return torch.cat((picture[:, None].expand(-1, covers.shape[1], -1, -1, -1), covers), 2)
 
-    def __init__(self, picture: Tensor, begin: InView, grid: Tensor):
-        self.picture, self.begin = picture, begin
-        # A look at every third row and column tells what most of it shows.
-        self.bare = picture[..., ::3, ::3].flatten(2).median(-1).values[..., None, None]
-        self._from_bare, self._tints = _apart(picture, self.bare), _tint(picture)
-        self._tint_from_bare = _apart(self._tints, _tint(self.bare))
-        self.covers = [self._cover(number, grid) for number in range(begin.where.shape[1])]
 
-    def _cover(self, number: int, grid: Tensor) -> Tensor:
-        """A pixel is a thing's if it is near it, and more of its colour than of the ground's, in light or in shade."""
-        where, axes = self.begin.where[:, number], self.begin.axes[:, number]
+def _covers(picture: Tensor, bare: Tensor, begin: InView) -> Tensor:
+    """Which pixels [B, S, 1, h, w] of a picture [B, 3, h, w] are a thing's own: those near it, and more of its colour than of the ground's, in light or in shade."""
+    grid = pixel_grid(picture.shape[-2], picture.shape[-1], picture.device)
+    from_bare, tints = _apart(picture, bare), _tint(picture)
+    tint_from_bare = _apart(tints, _tint(bare))
+    covers = torch.zeros((*begin.visible.shape, 1, *picture.shape[-2:]), device=picture.device)
+    for number in range(begin.where.shape[1]):
+        where, axes = begin.where[:, number], begin.axes[:, number]
         u, v = on_thing(where, axes, grid).unbind(-1)
         window = ((_HALF - (u.square() + v.square()).sqrt()) / _SOFT).clamp(0, 1)
         points = where[:, None] + torch.einsum("bij,nj->bni", axes, 0.01 * torch.tensor([[0.0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], device=where.device))
-        colour = F.grid_sample(self.picture, points[:, None], padding_mode="border", align_corners=False)[:, :, 0].median(-1).values[..., None, None]
-        lit, tinted = self._from_bare - _apart(self.picture, colour), self._tint_from_bare - _apart(self._tints, _tint(colour))
-        return (window * (0.5 + _LIKE * torch.maximum(lit, 2 * tinted)).clamp(0, 1) * self.begin.visible[:, number, None, None])[:, None]
+        colour = F.grid_sample(picture, points[:, None], padding_mode="border", align_corners=False)[:, :, 0].median(-1).values[..., None, None]
+        lit, tinted = from_bare - _apart(picture, colour), tint_from_bare - _apart(tints, _tint(colour))
+        covers[:, number, 0] = window * (0.5 + _LIKE * torch.maximum(lit, 2 * tinted)).clamp(0, 1) * begin.visible[:, number, None, None]
+    return covers
 
 
 def _apart(one: Tensor, other: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from envs.simulators.augment import chosen_clips, spoil_latents, spoil_pictures
 from envs.simulators.autoencoder import STRIDE, Codec
-from envs.simulators.base import Simulator, WorldShape, foreground_weight, noise_generator
+from envs.simulators.base import Simulator, WorldShape, foreground_weight, noise_generator, to_bytes
 from envs.simulators.dit import MultiViewDiT
 from envs.simulators.sampling import Sampler
 
@@ -117,11 +117,11 @@ class LatentWorld(Simulator):
         latents, fused, setting = self._denoise(inputs)
         frames = self.decode(latents)
         if setting.draft is None or setting.base is None:
-            return frames, fused
+            return to_bytes(frames), fused
         # Where the draft needs no correction, what the autoencoder blurs is put back.
         blurred = self.decode(setting.base)
         keep = (1 - (frames - blurred).abs().amax(3, keepdim=True) / _CHANGED).clamp(min=0)
-        return frames + keep * (setting.draft - blurred), fused
+        return to_bytes(frames + keep * (setting.draft - blurred)), fused
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is decoded to pixels."""
@@ -164,11 +164,13 @@ class LatentWorld(Simulator):
         whole = clip["future", "valid"].any(0).unflatten(0, (-1, chunk)).any(1)
         chosen = int(torch.randint(max(1, int(whole.long().sum())), (1,), generator=generator))
         drawn: Tensor | None = None
+        begin: TensorDict | None = None
         for number in range(chosen):
             with torch.no_grad():
-                pictures = (self.predict(self.asked(clip, number, drawn, generator))[0].clamp(0, 1) * 255).round().to(torch.uint8)
+                inputs = self.asked(clip, number, drawn, generator, begin)
+                begin, pictures = inputs["begin"], self.predict(inputs)[0]
             drawn = pictures if drawn is None else torch.cat([drawn, pictures], 1)
-        inputs, part = self.asked(clip, chosen, drawn, generator), slice(chosen * chunk, (chosen + 1) * chunk)
+        inputs, part = self.asked(clip, chosen, drawn, generator, begin), slice(chosen * chunk, (chosen + 1) * chunk)
         truth = unit(clip["future", "frames"][:, part])
         spoilt = chosen_clips(len(truth), self.augment, generator)
         memory = spoil_latents(self.remember(spoil_pictures(unit(inputs["memory", "frames"]), spoilt, generator)), spoilt, generator)

@@ -229,7 +229,7 @@ class RemoteSimulator(Simulator):
         jobs = [self._pool.submit(self._connections[number].step, sent[0][row], sent[1][row], sent[2][row], self._places[number][1]) for row, number in enumerate(self._rows)]
         answers = [job.result() for job in jobs]
         frames, states = (torch.from_numpy(np.stack(values)) for values in zip(*answers, strict=True))
-        return frames.float() / 255, states
+        return frames, states
 
     def close(self) -> None:
         """End all sessions."""

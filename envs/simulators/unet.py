@@ -17,9 +17,11 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from envs.conditioning import render_ray_map
+from envs.precision import working_dtype
 from envs.schema import ACTION_DIM, to_relative
-from envs.simulators.base import Simulator, WorldShape, foreground_weight
+from envs.simulators.base import Simulator, WorldShape, foreground_weight, to_bytes
 from envs.simulators.draft import Draft
+from envs.simulators.folding import at_detail, fold, unfold
 from envs.simulators.in_view import pixel_grid, place_map
 
 
@@ -67,6 +69,35 @@ class _Block(nn.Module):
         return x + h
 
 
+class _Embed(nn.Module):
+    """Looks at one view, square by square.
+
+    Args:
+        pictures, maps: channels that are bytes, and those that are floats.
+        width: of what comes out.
+        shrink: how much larger the bytes' pictures are than the maps; of each of their pixels only the mean counts.
+    """
+
+    def __init__(self, pictures: int, maps: int, width: int, shrink: int):
+        super().__init__()
+        self.shrink = shrink
+        bound = (pictures + maps) ** -0.5 / _FOLD
+        self.pictures = nn.Parameter(torch.empty(width, pictures, _FOLD, _FOLD).uniform_(-bound, bound))
+        self.maps = nn.Parameter(torch.empty(width, maps * _FOLD**2).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(width).uniform_(-bound, bound))
+
+    def forward(self, pictures: Tensor, maps: Tensor) -> Tensor:
+        """[B, width, h / 4, w / 4] from pictures uint8 [B, C, shrink h, shrink w] and maps in -1..1 [B, D, h, w]."""
+        dtype = working_dtype(pictures.device, self.maps.dtype)
+        weight: Tensor = self.pictures
+        if self.shrink > 1:
+            weight = weight.repeat_interleave(self.shrink, 2).repeat_interleave(self.shrink, 3) / self.shrink**2
+        # Bytes stay what they are; that they are meant as -1..1 is left to the weights.
+        weight = weight.flatten(1)
+        x = F.linear(fold(pictures, _FOLD * self.shrink).to(dtype), weight / 127.5, self.bias - weight.sum(1))
+        return (x + F.linear(fold(maps, _FOLD).to(dtype), self.maps)).permute(0, 3, 1, 2)
+
+
 def _head(width: int, chunk: int, channels: int) -> nn.Sequential:
     """Output layer of one view; it starts from the draft, for random output takes hundreds of steps to unlearn."""
     last = nn.Conv2d(width, channels * chunk * _FOLD**2, 1)
@@ -83,22 +114,12 @@ def _compose(drawn: Tensor, draft: Tensor, last: Tensor) -> Tensor:
     # Split, not sliced: the gradient of a slice is a full map of zeros.
     logits, flow, colour = drawn.split((_SOURCES, 2, 3), 2)
     drafted, still, moves, fresh = logits.softmax(2).split(1, 2)
-    grid = pixel_grid(height, width, drawn.device) + (2 * _REACH * flow).permute(0, 1, 3, 4, 2) / torch.tensor([width, height], device=drawn.device)
+    step = 2 * _REACH / torch.tensor([width, height], device=drawn.device)
+    grid = torch.addcmul(pixel_grid(height, width, drawn.device), flow.permute(0, 1, 3, 4, 2), step)
     # All frames of a chunk are sampled from one picture: stack them as rows of one tall grid.
     moved = F.grid_sample(last, grid.flatten(1, 2), padding_mode="border", align_corners=False).unflatten(2, (chunk, height)).transpose(1, 2)
-    return drafted * draft + still * last[:, None] + moves * moved + fresh * (0.5 + 0.5 * colour)
-
-
-def _halve(pictures: Tensor) -> Tensor:
-    """Pictures [..., H, W] at half the detail, the mean of each four pixels; four sums are faster than torch's pooling."""
-    return (pictures[..., ::2, ::2] + pictures[..., 1::2, ::2] + pictures[..., ::2, 1::2] + pictures[..., 1::2, 1::2]) / 4
-
-
-def _unfold(maps: Tensor) -> Tensor:
-    """[B, C * 16, h, w] -> [B, C, 4 h, 4 w], squares of 4x4 pixels out of channels; its gradient is one copy, where that of torch's pixel_shuffle is slow."""
-    batch, channels, height, width = maps.shape
-    squares = maps.view(batch, channels // _FOLD**2, _FOLD, _FOLD, height, width)
-    return squares.permute(0, 1, 4, 2, 5, 3).reshape(batch, channels // _FOLD**2, height * _FOLD, width * _FOLD)
+    out = torch.addcmul(drafted * draft, still, last[:, None])
+    return torch.addcmul(torch.addcmul(out, moves, moved), fresh, 0.5 + 0.5 * colour)
 
 
 class UNetSimulator(Simulator):
@@ -117,14 +138,13 @@ class UNetSimulator(Simulator):
         if not set(config.shrink) <= {1, 2}:
             raise ValueError(f"simulator.shrink={list(config.shrink)} may hold 1 (full detail) and 2 (half) only")
         wide = 2 * config.width
-        # Memory frames and pose maps, future pose maps and drafts, and spots of the objects now and in future.
-        pictures = 3 * (2 * shape.memory + 2 * shape.chunk) + shape.objects * (1 + shape.chunk)
-        self.channels = _SOURCES + 2 + 3
-        self.draft = Draft(shape.views, shape.size)
+        pictures = 3 * (2 * shape.memory + shape.chunk)  # memory frames and pose maps, future pose maps
+        maps = 3 * shape.chunk + shape.objects * (1 + shape.chunk)  # drafts, and spots of the objects now and in future
+        self.draft = Draft(shape.views, shape.size, config.shrink)
         cond = 256
         self.feature_shape = (wide + cond,)
         self.actions = nn.Sequential(nn.Linear((shape.chunk + 1) * ACTION_DIM, cond), nn.SiLU(), nn.Linear(cond, cond))
-        self.embed = nn.ModuleList(nn.Conv2d(pictures, config.width if s == 1 else wide, _FOLD, stride=_FOLD) for s in config.shrink)
+        self.embed = nn.ModuleList(_Embed(pictures, maps, config.width if s == 1 else wide, s) for s in config.shrink)
         self.rays = nn.Conv2d(12 * shape.views, wide, 1)
         self.down = nn.Conv2d(config.width, wide, 2, stride=2)
         self.up = nn.Conv2d(wide, config.width * 4, 1)
@@ -133,7 +153,7 @@ class UNetSimulator(Simulator):
         self.fine_in = nn.ModuleList(_Block(config.width, cond) for _ in range(fine))
         self.deep = nn.ModuleList(_Block(wide, cond) for _ in range(deep))
         self.fine_out = nn.ModuleList(_Block(config.width, cond) for _ in range(fine))
-        self.heads = nn.ModuleList(_head(config.width if s == 1 else wide, shape.chunk, self.channels) for s in config.shrink)
+        self.heads = nn.ModuleList(_head(config.width if s == 1 else wide, shape.chunk, _SOURCES + 2 + 3) for s in config.shrink)
 
     def glance(self, frames: Tensor, c2w: Tensor) -> None:
         """See Simulator.glance."""
@@ -144,12 +164,17 @@ class UNetSimulator(Simulator):
         views, features = self.views(inputs)
         return self._enlarge(views), features
 
+    def prepare(self, frames: Tensor, places: Tensor, intrinsic: Tensor, c2w: Tensor) -> TensorDict:
+        """See Simulator.prepare."""
+        return self.draft.prepare(frames, places, intrinsic, c2w)
+
     def _enlarge(self, views: list[Tensor]) -> Tensor:
+        """Frames uint8 [B, K, V, 3, H, W] of all views at full size."""
         full = [
             view if s == 1 else F.interpolate(view.flatten(0, 1), scale_factor=s, mode="bilinear", align_corners=False).unflatten(0, view.shape[:2])
             for s, view in zip(self.config.shrink, views, strict=True)
         ]
-        return torch.stack(full, 2)
+        return torch.stack([to_bytes(view) for view in full], 2)
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is drawn."""
@@ -159,27 +184,18 @@ class UNetSimulator(Simulator):
     def _encode(self, inputs: TensorDict) -> tuple[Tensor, Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
         """Fine and coarse maps, the action embedding, and each view's drafts [B, K, 3, h, w] and last frame as it is looked at."""
         memory, future = inputs["memory"], inputs["future"]
-        stack = torch.cat([memory["frames"], memory["pose_map"], future["pose_map"]], 1)  # uint8 [B, 2M+K, V, 3, H, W]
         relative = to_relative(future["commands"], inputs["now", "command"]) * 10.0  # decimetres
         cond = self.actions(torch.cat([relative.flatten(1), inputs["now", "command"]], 1))
         fine: list[Tensor] = []
         deep = [self.rays(self._rays(inputs))]
         ends: list[tuple[Tensor, Tensor]] = []
-        seen, cameras = self.draft.look(inputs)
-        firsts = memory["frames"][:, 0].float() / 255
-        drafts: dict[int, Tensor] = {}
-        for shrink in set(self.config.shrink):
-            some = [view for view, s in enumerate(self.config.shrink) if s == shrink]
-            drafts |= zip(some, self.draft(some, firsts if shrink == 1 else _halve(firsts), seen, cameras, inputs["intrinsic"]), strict=True)
-        for view, (shrink, embed) in enumerate(zip(self.config.shrink, self.embed, strict=True)):
-            pictures = stack[:, :, view].flatten(1, 2).float().div_(255.0)
-            if shrink > 1:
-                pictures = _halve(pictures)
-            latest = 3 * (self.shape.memory - 1)
-            spots = place_map(seen.at(view, slice(1, None)), *pictures.shape[-2:])
-            ends.append((drafts[view], pictures[:, latest : latest + 3]))
-            shown = torch.cat((pictures * 2 - 1, drafts[view].flatten(1, 2) * 2 - 1, spots.flatten(1, 2)), 1)
-            (fine if shrink == 1 else deep).append(embed(shown))
+        seen = self.draft.look(inputs)
+        drafts = self.draft(inputs["begin"], seen.at(slice(None), slice(1, None)), future["c2w"], inputs["intrinsic"])
+        for view, (shrink, embed, draft) in enumerate(zip(self.config.shrink, self.embed, drafts, strict=True)):
+            pictures = torch.cat([part[:, :, view].flatten(1, 2) for part in (memory["frames"], memory["pose_map"], future["pose_map"])], 1)
+            spots = place_map(seen.at(view, slice(None)), *draft.shape[-2:])
+            (fine if shrink == 1 else deep).append(embed(pictures, torch.cat((draft.flatten(1, 2) * 2 - 1, spots.flatten(1, 2)), 1)))
+            ends.append((draft, at_detail(memory["frames"][:, -1, view], shrink)))
         x = torch.stack(fine).sum(0)
         for block in self.fine_in:
             x = block(x, cond)
@@ -196,7 +212,7 @@ class UNetSimulator(Simulator):
             x = block(x, cond)
         views: list[Tensor] = []
         for shrink, head, (draft, last) in zip(self.config.shrink, self.heads, ends, strict=True):
-            drawn = _unfold(head(x if shrink == 1 else z).float().contiguous()).unflatten(1, (self.shape.chunk, self.channels))
+            drawn = unfold(head(x if shrink == 1 else z).float(), _FOLD).unflatten(1, (self.shape.chunk, -1))
             views.append(_compose(drawn, draft, last))
         return views, torch.cat([z.float().mean((-2, -1)), cond.float()], 1)
 
@@ -213,17 +229,17 @@ class UNetSimulator(Simulator):
         """
         chunk, chunks = self.shape.chunk, clip["memory", "index"].shape[1]
         drawn: Tensor | None = None
+        begin: TensorDict | None = None
         losses = []
         for number in range(chunks):
             part = slice(number * chunk, (number + 1) * chunk)
-            inputs = self.asked(clip, number, drawn)
+            inputs = self.asked(clip, number, drawn, begin=begin)
+            begin = inputs["begin"]
             views, _ = self.views(inputs)
             valid = clip["future", "valid"][:, part, None, None, None]
             error, norm = torch.zeros(()), torch.zeros(())
             for view, (frames, shrink, emphasis) in enumerate(zip(views, self.config.shrink, self.config.emphasis, strict=True)):
-                truth = clip["future", "frames"][:, part, view].float() / 255
-                if shrink > 1:
-                    truth = _halve(truth)
+                truth = at_detail(clip["future", "frames"][:, part, view].flatten(0, 1), shrink).unflatten(0, (-1, chunk))
                 weight = foreground_weight(truth, self.config.foreground) * valid * emphasis
                 # An absolute error alone never leaves "nothing moves", the median of sparse change; squares do.
                 gap = frames - truth
@@ -232,6 +248,6 @@ class UNetSimulator(Simulator):
             losses.append(error / norm.clamp(min=1))
             if number + 1 < chunks:
                 with torch.no_grad():
-                    pictures = (self._enlarge(views).clamp(0, 1) * 255).round().to(torch.uint8)
+                    pictures = self._enlarge(views)
                 drawn = pictures if drawn is None else torch.cat([drawn, pictures], 1)
         return torch.stack(losses).mean(), {"first_chunk": losses[0].detach(), "last_chunk": losses[-1].detach()}

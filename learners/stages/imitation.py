@@ -54,14 +54,14 @@ class Cloning:
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
         """Random observations with the knots their chunks have under the policy's units."""
         pick = torch.randint(len(self.rows), (count,), generator=generator)
-        out = TensorDict({STATE: self.store.arrays["states"][self.rows[pick]]}, pick.shape)
+        out = TensorDict({STATE: self.store.arrays["states"][self.rows[pick]]}, [])
         if self.seen is None:
             out[IMAGE], out[TOKENS] = self.store.frames(self.rows[pick]), self.tokens[pick]
         else:
             out[SEEN] = self.seen[pick]
         if self.generated is not None:
-            made = self.generated[torch.randint(len(self.generated), (count,), generator=generator)]
-            out["pair"] = TensorDict({"made": made["frames"], "true": self.store.frames(made["row"]), STATE: self.store.arrays["states"][made["row"]], TOKENS: made["tokens"]}, pick.shape)
+            made = self.generated[torch.randint(len(self.generated), (max(1, count // 2),), generator=generator)]  # each brings its true one
+            out["pair"] = TensorDict({"made": made["frames"], "true": self.store.frames(made["row"]), STATE: self.store.arrays["states"][made["row"]], TOKENS: made["tokens"]}, made.shape)
         out["target"] = self.policy.head.target(self.targets[pick])
         return out
 

@@ -75,12 +75,12 @@ def train_judge(
             made = imagined[torch.randint(len(imagined), (options.part - real,), generator=generator)]
             made["label"] = labels[made["row"]]
             out = torch.cat([out, made.exclude("row")])
-        out["first"] = store.frames(out["begin"])
+        out["first"] = store.frames(out["begin"])[:, :1]
         return out
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         views = data["frames"].shape[1]  # the same colours for both, as one camera would give them
-        pictures, first = augment(to_signed(torch.cat((data["frames"], data["first"]), 1)), generator).split(views, 1)
+        pictures, first = augment(to_signed(torch.cat((data["frames"], data["first"]), 1)), generator).split((views, 1), 1)
         return judge.loss(pictures, first, data["tokens"], data["label"], data["progress"], data["where"], max(share, 0.3), generator)
 
     return fit("judge", judge, batch, loss, options, folder, watch="frame_accuracy")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from envs.episodes.clips import ClipSpec, ClipStore
@@ -20,10 +21,15 @@ def _drafts(store: ClipStore, episode: int, move: Tensor | None = None) -> tuple
         inputs["future", "c2w"] = inputs["memory", "c2w"][:, :1].expand(-1, 12, -1, -1, -1).clone()
     draft = Draft(3, store.size)
     draft.learn(store.frames(store.start), store.arrays["c2w"][store.start])
-    firsts = inputs["memory", "frames"][:, 0].float() / 255
-    seen, cameras = draft.look(inputs)
-    made = torch.stack(draft(range(3), firsts, seen, cameras, inputs["intrinsic"]), 2)[0]
-    return made, clip["future", "frames"][0].float() / 255, firsts[0]
+    made = torch.stack(_drawn(draft, inputs), 2)[0]
+    return made, clip["future", "frames"][0].float() / 255, inputs["memory", "frames"][0, 0].float() / 255
+
+
+def _drawn(draft: Draft, inputs: TensorDict) -> list[Tensor]:
+    """Drafts [1, K, 3, H, W] of all views."""
+    memory = inputs["memory"]
+    begin = draft.prepare(memory["frames"][:, 0], memory["places"][:, 0], inputs["intrinsic"], memory["c2w"][:, 0])
+    return draft(begin, draft.look(inputs).at(slice(None), slice(1, None)), inputs["future", "c2w"], inputs["intrinsic"])
 
 
 def test_where_nothing_happens_the_first_frame_stays(store: ClipStore) -> None:
@@ -61,6 +67,5 @@ def test_cameras_nobody_placed_keep_the_first_frame(store: ClipStore) -> None:
     for part in ("memory", "future"):
         inputs[part, "c2w"] = torch.eye(4).expand_as(inputs[part, "c2w"]).clone()
     draft = Draft(3, store.size)
-    firsts = inputs["memory", "frames"][:, 0].float() / 255
-    (made,) = draft([0], firsts, *draft.look(inputs), inputs["intrinsic"])
-    assert torch.allclose(made[0, 2], firsts[0, 0], atol=1e-4)
+    first = inputs["memory", "frames"][0, 0, 0].float() / 255
+    assert torch.allclose(_drawn(draft, inputs)[0][0, 2], first, atol=1e-4)
