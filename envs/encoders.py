@@ -29,7 +29,7 @@ class SpatialEncoder(nn.Module):
         self.fine = nn.Conv2d(width, width, 1)
         self.heat = nn.Conv2d(2 * width, points, 1)
         self.lift = nn.Conv2d(2 * width, width, 1)
-        self.heat_fine = nn.Conv2d(width, points, 3, padding=1)
+        self.heat_fine = nn.Conv2d(width, points, 1)
         # Sharp from the start: over a near-uniform softmax, key-points sit in the middle and hardly learn.
         self.temperature = nn.Parameter(torch.full((points,), 2.3))
         self.grid = nn.Sequential(nn.Conv2d(2 * width, width, 4, stride=4), nn.SiLU(), nn.AdaptiveAvgPool2d(4), nn.Flatten())

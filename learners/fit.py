@@ -115,7 +115,7 @@ def fit(
         {"params": [p for p in trained.values() if p.ndim >= 2], "weight_decay": config.weight_decay},
         {"params": [p for p in trained.values() if p.ndim < 2], "weight_decay": 0.0},
     ]
-    optimiser = torch.optim.AdamW(groups, lr=config.lr, betas=(0.9, 0.99), fused=device.type == "cuda")
+    optimiser = torch.optim.AdamW(groups, lr=config.lr, betas=(0.9, 0.99), fused=True)
     average = twin(trained)
     first, spent = 0, {"data": 0.0, "compute": 0.0}
 

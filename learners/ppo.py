@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -31,6 +32,7 @@ class PPOConfig:
         entropy: weight of the entropy bonus.
         critic: weight of the value loss.
         critic_width, critic_lr: hidden size and learning rate of the value network.
+        acquaintance: passes of the critic over recorded episodes before the first iteration, see PPO.acquaint.
     """
 
     gamma: float = 0.97
@@ -40,6 +42,7 @@ class PPOConfig:
     critic: float = 1.0
     critic_width: int = 256
     critic_lr: float = 1e-3
+    acquaintance: int = 6
 
 
 class Value(nn.Module):
@@ -91,10 +94,31 @@ class PPO:
         with torch.no_grad():
             self.gae(batch)
         value, target = batch["state_value"], batch["value_target"]
-        explained = 1 - (target - value).var() / target.var().clamp(min=1e-8)
         extra = {"advantage": batch["advantage"], "value_target": target, "state_value": value}
         data = transitions(batch, sound(batch), {*self.policy.in_keys, SEEN, STATE}, **extra)
-        return data, {"explained_variance": float(explained.clamp(min=-10.0)), "advantage_std": float(batch["advantage"].std())}
+        return data, {"explained_variance": _explained(value, target), "advantage_std": float(batch["advantage"].std())}
+
+    def acquaint(self, rollout: TensorDict, seed: int, minibatch: int = 256) -> float:
+        """Let the critic learn from a rollout [N, T] of learners.remembered; a critic that begins from nothing spoils the first iterations.
+
+        Returns:
+            The share of the targets' variance that it explains before the last pass.
+        """
+        optimiser = torch.optim.Adam(self.critic.parameters(), lr=self.config.critic_lr)
+        shuffle = torch.Generator().manual_seed(seed)
+        valid, explained = rollout["valid"].flatten(), 0.0
+        for _ in range(self.config.acquaintance):
+            with torch.no_grad():
+                self.gae(rollout)
+            data = rollout.flatten(0, 1)[valid]
+            explained = _explained(data["state_value"], data["value_target"])
+            targets = data["value_target"].clone()
+            for pick in torch.randperm(len(data), generator=shuffle).split(minibatch):
+                optimiser.zero_grad(set_to_none=True)
+                said = self.critic(data[pick].select(SEEN, STATE))["state_value"]
+                F.smooth_l1_loss(said, targets[pick]).backward()
+                optimiser.step()
+        return explained
 
     def loss(self, minibatch: TensorDict) -> tuple[Tensor, dict[str, float]]:
         """The clipped objective, the value loss and the entropy bonus."""
@@ -105,3 +129,8 @@ class PPO:
             total = total + out["loss_entropy"]
             figures["entropy"] = float(out["entropy"])
         return total, figures
+
+
+def _explained(value: Tensor, target: Tensor) -> float:
+    """Share of the targets' variance that values explain; negative where they are worse than the mean."""
+    return float((1 - (target - value).var() / target.var().clamp(min=1e-8)).clamp(min=-10.0))

@@ -33,12 +33,15 @@ from envs.episodes import Episode, LeRobotDataset, LeRobotWriter
 from envs.episodes.behind import WriteBehind
 from envs.episodes.clips import ClipStore
 from envs.physics.pool import BenchPool, Track
+from envs.schema import Rewards
 from envs.simulators.replay import replay
 from envs.world import Starts
 from learners.algorithm import RLConfig
 from learners.factory import build_algorithm
 from learners.fit import FitConfig
 from learners.parallel import leads
+from learners.ppo import PPO
+from learners.remembered import remembered
 from learners.rl import train_rl
 from learners.stages.generated import generated_frames
 from learners.stages.imitation import Cloning, train_imitation
@@ -263,6 +266,12 @@ def rl(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str,
         actor.freeze_perception()
         anchor.look()
     algorithm = build_algorithm(cfg, actor)
+    if isinstance(algorithm, PPO):
+        # Of a deployed policy whose perception stays: of another the critic would know pictures that nobody sees any more.
+        past = store.select([f"policy-{number}"])
+        past = past[torch.isin(past, split(store)[0])]
+        if settings.freeze_perception and len(past):
+            algorithm.acquaint(remembered(actor.perception, store, past, options(Rewards, cfg["judge"]["rewards"], "judge.rewards"), cfg["task"]["chunk"]), settings.seed)
     weights = [str((found[name] / "weights.safetensors").resolve()) for name in (policy, vision, state, judge)]
     datasets = tuple(str((found[name] / "dataset").resolve()) for name in data)
     recipe = Recipe(cfg, settings.envs // settings.shards, weights[0], weights[1], weights[2], weights[3], datasets, settings.freeze_perception, algorithm.bootstraps, settings.rewards_later)

@@ -72,7 +72,10 @@ class ArmKinematics:
                 # Small-angle axis: exact direction, and the magnitude only has to vanish at the solution.
                 axis = 0.5 * np.array([delta[2, 1] - delta[1, 2], delta[0, 2] - delta[2, 0], delta[1, 0] - delta[0, 1]])
                 error[3:] = axis if np.trace(delta) > 0.0 else axis / (np.linalg.norm(axis) + 1e-9)
-                worst = max(worst, float(np.abs(error).max()))
+                off = float(np.abs(error).max())
+                worst = max(worst, off)
+                if off < tolerance:
+                    continue  # most of the time one arm rests
                 mujoco.mj_jacSite(self.model, self.data, self._jac[:3], self._jac[3:], site)
                 jac = self._jac[:, self.dofs[k]]
                 gram = np.linalg.inv(jac @ jac.T + _DAMPING * np.eye(6))
