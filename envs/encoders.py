@@ -65,7 +65,7 @@ class CloseUp(nn.Module):
         wander: standard deviation by which crops are misplaced in training, in half-pictures; the points come from nets that err less there than elsewhere.
     """
 
-    def __init__(self, points: int, out: int = 0, pictures: int = 1, reach: float = 0.25, cells: int = 20, width: int = 16, wander: float = 0.04):
+    def __init__(self, points: int, out: int = 0, pictures: int = 1, reach: float = 0.2, cells: int = 20, width: int = 16, wander: float = 0.04):
         super().__init__()
         self.reach, self.cells, self.wander = reach, cells, wander
         self.layers = nn.Sequential(

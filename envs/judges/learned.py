@@ -38,7 +38,7 @@ class LearnedJudge(Judge):
         self.margin, self.aims = margin, aims
         self.main = SpatialEncoder(points, width, pictures=2)
         self.sides = nn.ModuleList(PatchEncoder(16, 8) for _ in range(views - 1))
-        self.closer = CloseUp(aims, pictures=2, reach=0.2) if aims else None
+        self.closer = CloseUp(aims, pictures=2) if aims else None
         self.words = WordEncoder(16)
         self.sharpness = nn.Parameter(torch.tensor([2.0]))  # FSDP2 takes no scalars
         apart = 3 * (aims * (aims - 1) // 2)

@@ -33,7 +33,7 @@ class Sight(nn.Module):
             nn.SiLU(),
             nn.Conv2d(32, count, 3, padding=1),
         )
-        self.closer = CloseUp(count, out=2, reach=0.2, cells=24, width=24)
+        self.closer = CloseUp(count, out=2, cells=24, width=24)
         self.heights = nn.Parameter(torch.zeros(count))  # metres above the world's ground; objects stand on something
 
     def forward(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor, Tensor]:
