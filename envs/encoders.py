@@ -16,11 +16,12 @@ class SpatialEncoder(nn.Module):
         points: number of soft key-points.
         width: channels at half resolution; twice as many at a quarter.
         pictures: how many are looked at as one, pixel on pixel.
+        near: rows and columns of half-resolution cells that decide how much a key-point lies on the middle one; odd.
 
     Forward takes float [B, 3 * pictures, H, W] in -1..1 and returns float32 [B, 2 * points + 16 * width]: coordinates, and a coarse grid of features.
     """
 
-    def __init__(self, points: int = 32, width: int = 32, pictures: int = 1):
+    def __init__(self, points: int = 32, width: int = 32, pictures: int = 1, near: int = 1):
         super().__init__()
         self.stem = nn.Conv2d(3 * pictures, width, 5, stride=2, padding=2)
         self.mid = nn.Conv2d(width, 2 * width, 3, stride=2, padding=1)
@@ -29,7 +30,7 @@ class SpatialEncoder(nn.Module):
         self.fine = nn.Conv2d(width, width, 1)
         self.heat = nn.Conv2d(2 * width, points, 1)
         self.lift = nn.Conv2d(2 * width, width, 1)
-        self.heat_fine = nn.Conv2d(width, points, 1)
+        self.heat_fine = nn.Conv2d(width, points, near, padding=near // 2)
         # Sharp from the start: over a near-uniform softmax, key-points sit in the middle and hardly learn.
         self.temperature = nn.Parameter(torch.full((points,), 2.3))
         self.grid = nn.Sequential(nn.Conv2d(2 * width, width, 4, stride=4), nn.SiLU(), nn.AdaptiveAvgPool2d(4), nn.Flatten())

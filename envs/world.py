@@ -119,7 +119,7 @@ class WorldEnv(ChunkedEnv):
         noise = start if self.shared_noise else seeds
         if self.session is not None:
             self.simulator.release(self.session, mask)
-        fresh = self.simulator.reset(**begin, seed=noise.to(self.device))
+        fresh = self.simulator.reset(**begin, seed=noise.to(self.device), room=self.horizon + 1)
         if self.session is None or mask.all():
             self.session = fresh
         else:

@@ -36,7 +36,7 @@ class LearnedJudge(Judge):
         if aims > points:
             raise ValueError(f"judge.aims={aims} cannot exceed judge.points={points}")
         self.margin, self.aims = margin, aims
-        self.main = SpatialEncoder(points, width, pictures=2)
+        self.main = SpatialEncoder(points, width, pictures=2, near=3)
         self.sides = nn.ModuleList(PatchEncoder(16, 8) for _ in range(views - 1))
         self.closer = CloseUp(aims, pictures=2) if aims else None
         self.words = WordEncoder(16)

@@ -140,7 +140,7 @@ class Simulator(nn.Module):
         )
 
     # -- the contract --------------------------------------------------------------------------------------------
-    def reset(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor, command: Tensor, state: Tensor, pose_map: Tensor, seed: Tensor, *, likeliest: bool = False) -> TensorDict:
+    def reset(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor, command: Tensor, state: Tensor, pose_map: Tensor, seed: Tensor, *, likeliest: bool = False, room: int = 1) -> TensorDict:
         """Begin sessions from first frames.
 
         Args:
@@ -150,6 +150,7 @@ class Simulator(nn.Module):
             pose_map: uint8 [B, V, 3, H, W] of that command.
             seed: int64 [B].
             likeliest: let objects go their likeliest way, for comparing with what happened; else the seed decides.
+            room: frames to keep room for, where it is known how long sessions last; longer ones make more as they go.
 
         Returns:
             The sessions' state, a TensorDict [B].
@@ -158,19 +159,10 @@ class Simulator(nn.Module):
         with torch.no_grad():
             places = self.places.find(frames[:, 0], intrinsic[:, 0].float(), c2w[:, 0].float())
             begin = self.prepare(frames, places, intrinsic.float(), c2w.float())
+        first = {"frames": frames, "pose_map": pose_map, "c2w": c2w.float(), "commands": command.float(), "states": state.float(), "places": places}
         return TensorDict(
             {
-                "history": TensorDict(
-                    {
-                        "frames": frames[:, None],
-                        "pose_map": pose_map[:, None],
-                        "c2w": c2w[:, None].float(),
-                        "commands": command[:, None].float(),
-                        "states": state[:, None].float(),
-                        "places": places[:, None],
-                    },
-                    [*size, 1],
-                ),
+                "history": _roomy(TensorDict({name: value[:, None] for name, value in first.items()}, [*size, 1]), room),
                 "begin": begin,
                 "length": torch.ones(size, dtype=torch.int64, device=frames.device),
                 "intrinsic": intrinsic.float(),
@@ -216,11 +208,8 @@ class Simulator(nn.Module):
         )
         pictures, features = self.predict(inputs)
         need = int(length.max()) + count
-        if need > history.shape[1]:  # room for twice as many chunks, so that long rollouts copy seldom
-            grown = history.new_empty(batch, max(need, 2 * history.shape[1]))  # rows past a session's length are never read
-            for name, value in history.items():
-                grown[name][:, : history.shape[1]] = value
-            history = grown
+        if need > history.shape[1]:
+            history = _roomy(history, max(need, 2 * history.shape[1]))  # for twice as many frames, so that long rollouts copy seldom
         at = length[:, None] + torch.arange(count, device=length.device)
         new = {"frames": pictures, "pose_map": pose_map, "c2w": c2w, "commands": commands, "states": now["states"][:, None].expand(-1, count, -1), "places": ahead}
         for name, value in new.items():
@@ -257,12 +246,8 @@ class Simulator(nn.Module):
         most = max(state["history"].shape[1] for state in states)
         parts = []
         for state in states:
-            part, history = state.copy(), state["history"]
-            if history.shape[1] < most:
-                longer = history.new_empty(len(state), most)
-                for name, value in history.items():
-                    longer[name][:, : history.shape[1]] = value
-                part["history"] = longer
+            part = state.copy()
+            part["history"] = _roomy(state["history"], most)
             parts.append(part)
         return torch.cat(parts)
 
@@ -287,6 +272,17 @@ class Simulator(nn.Module):
         for name in state["history"].keys():
             state["history", name][mask.nonzero().flatten(), 0] = fresh["history", name][:, 0]
         return state
+
+
+def _roomy(history: TensorDict, room: int) -> TensorDict:
+    """A history [B, N] as one of at least `room` frames; rows past a session's length hold anything and are never read."""
+    rows = history.shape[1]
+    if room <= rows:
+        return history
+    out = history.new_empty(len(history), room)
+    for name, value in history.items():
+        out[name][:, :rows] = value
+    return out
 
 
 def noise_generator(seed: int, chunk_index: int) -> torch.Generator:

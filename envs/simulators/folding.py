@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -20,10 +22,27 @@ def fold(pictures: Tensor, edge: int) -> Tensor:
 
 
 def unfold(maps: Tensor, edge: int) -> Tensor:
-    """[B, C * edge * edge, h, w] -> [B, C, edge h, edge w], channels into squares; its gradient is one copy, where that of torch's pixel_shuffle is slow."""
-    batch, channels, height, width = maps.shape
-    squares = maps.contiguous().view(batch, channels // edge**2, edge, edge, height, width)
-    return squares.permute(0, 1, 4, 2, 5, 3).reshape(batch, channels // edge**2, height * edge, width * edge)
+    """The reverse of fold, with gradient: [B, h, w, C * edge * edge] -> [B, C, edge h, edge w]; fastest where the channels lie side by side."""
+    out: Tensor = _Unfold.apply(maps, edge)
+    return out
+
+
+class _Unfold(torch.autograd.Function):
+    """See unfold; torch does not know the gradient of reading numbers as others."""
+
+    @staticmethod
+    def forward(ctx: Any, maps: Tensor, edge: int) -> Tensor:
+        """See unfold."""
+        ctx.edge = edge
+        batch, height, width, channels = maps.shape
+        rows = maps.contiguous().view(_WIDE[edge * maps.element_size()])
+        squares = rows.view(batch, height, width, channels // edge**2, edge).permute(0, 3, 1, 4, 2).contiguous()
+        return squares.view(maps.dtype).view(batch, channels // edge**2, height * edge, width * edge)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        """Squares of gradients as channels."""
+        return fold(gradient, ctx.edge), None
 
 
 def at_detail(pictures: Tensor, shrink: int) -> Tensor:

@@ -187,13 +187,13 @@ class RemoteSimulator(Simulator):
                 self._places += [(url, bool(health.get("repeatable", False)))] * int(health.get("sessions", 1))
         return [number for number in range(len(self._places)) if number not in self._connections]
 
-    def reset(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor, command: Tensor, state: Tensor, pose_map: Tensor, seed: Tensor, *, likeliest: bool = False) -> TensorDict:
+    def reset(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor, command: Tensor, state: Tensor, pose_map: Tensor, seed: Tensor, *, likeliest: bool = False, room: int = 1) -> TensorDict:
         """See Simulator; opens a session for every row.
 
         Raises:
             RemoteError: if the servers do not have that many places.
         """
-        fresh = super().reset(frames, intrinsic, c2w, command, state, pose_map, seed, likeliest=likeliest)
+        fresh = super().reset(frames, intrinsic, c2w, command, state, pose_map, seed, likeliest=likeliest, room=room)
         free = self._free()
         if len(free) < len(frames):
             raise RemoteError(f"{len(frames)} sessions are wanted, the servers at simulator.model.urls hold {len(free)}; add urls, or run fewer episodes side by side")

@@ -39,7 +39,7 @@ def replay(simulator: Simulator, store: ClipStore, episodes: Tensor, decoder: St
     for ids in episodes.split(batch):
         start, last = store.start[ids], store.length[ids][:, None] - 1
         first = [store.frames(start), store.intrinsic[ids], store.arrays["c2w"][start], store.arrays["commands"][start], store.arrays["states"][start], store.pose_maps(start), ids]
-        state = simulator.reset(*(value.to(device) for value in first), likeliest=True)
+        state = simulator.reset(*(value.to(device) for value in first), likeliest=True, room=1 + steps * chunk)
         frames, rows, valid, states, places = [], [], [], [], []
         for step in range(steps):
             ahead = step * chunk + torch.arange(1, chunk + 1)[None]

@@ -212,7 +212,7 @@ class UNetSimulator(Simulator):
             x = block(x, cond)
         views: list[Tensor] = []
         for shrink, head, (draft, last) in zip(self.config.shrink, self.heads, ends, strict=True):
-            drawn = unfold(head(x if shrink == 1 else z).float(), _FOLD).unflatten(1, (self.shape.chunk, -1))
+            drawn = unfold(head(x if shrink == 1 else z).permute(0, 2, 3, 1).float(), _FOLD).unflatten(1, (self.shape.chunk, -1))
             views.append(_compose(drawn, draft, last))
         return views, torch.cat([z.float().mean((-2, -1)), cond.float()], 1)
 

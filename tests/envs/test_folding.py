@@ -16,7 +16,14 @@ def test_folding_is_torchs_unshuffling(edge: int, dtype: torch.dtype) -> None:
     squares = fold(pictures, edge)
     assert squares.dtype == dtype
     assert torch.equal(squares.permute(0, 3, 1, 2).float(), F.pixel_unshuffle(pictures.float(), edge))
-    assert torch.equal(unfold(squares.permute(0, 3, 1, 2), edge), pictures)
+    assert torch.equal(unfold(squares, edge), pictures)
+
+
+def test_unfolding_passes_gradients_on() -> None:
+    maps = torch.randn(2, 3, 4, 32, dtype=torch.float64)[..., :16].float().requires_grad_()
+    wanted = torch.randn(2, 1, 12, 16)
+    (unfold(maps, 4) * wanted).sum().backward()
+    assert torch.equal(maps.grad, fold(wanted, 4))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("shrink", [1, 2])
