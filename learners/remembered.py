@@ -8,12 +8,17 @@ from torch import Tensor
 
 from actors.policies.vla import SEEN, Perception
 from envs.episodes.clips import ClipStore
-from envs.language import tokenize
 from envs.schema import STATE, Rewards
 
 
 @torch.no_grad()
-def remembered(perception: Perception, store: ClipStore, episodes: Tensor, rewards: Rewards, chunk: int, batch: int = 512) -> TensorDict:
+def looked_at(perception: Perception, store: ClipStore, rows: Tensor, tokens: Tensor, batch: int = 512) -> Tensor:
+    """What perception makes of frames of a store, rows [N], with instructions tokens [N, WORDS]: float32 [N, out_features]."""
+    return torch.cat([perception(store.frames(some), words) for some, words in zip(rows.split(batch), tokens.split(batch), strict=True)])
+
+
+@torch.no_grad()
+def remembered(perception: Perception, store: ClipStore, episodes: Tensor, rewards: Rewards, chunk: int) -> TensorDict:
     """Episodes of a store, decision by decision, as a rollout that GAE reads.
 
     Args:
@@ -29,9 +34,7 @@ def remembered(perception: Perception, store: ClipStore, episodes: Tensor, rewar
     steps = int((last.max() + chunk - 1) // chunk)
     at = torch.minimum(torch.arange(steps + 1) * chunk, last[:, None])  # [N, T + 1]; past the end the last frame stays
     rows = store.start[episodes][:, None] + at
-    tokens = torch.stack([tokenize(store.episodes[n]["instruction"]) for n in episodes.tolist()])
-    pairs = zip(rows.flatten().split(batch), tokens.repeat_interleave(steps + 1, 0).split(batch), strict=True)
-    seen = torch.cat([perception(store.frames(some), words) for some, words in pairs]).unflatten(0, rows.shape)
+    seen = looked_at(perception, store, rows.flatten(), store.tokens[episodes].repeat_interleave(steps + 1, 0)).unflatten(0, rows.shape)
     states, progress, success = (store.arrays[name][rows].float() for name in ("states", "progress", "success"))
     valid, over = at[:, :-1] < last[:, None], at[:, 1:] == last[:, None]
     won = (success[:, 1:] > 0.5) & over

@@ -11,7 +11,6 @@ from torch import Tensor
 from envs.episodes.clips import ClipStore
 from envs.geometry import on_plane, project
 from envs.judges import LearnedJudge
-from envs.language import tokenize
 from envs.locate import locate
 from envs.simulators.base import Simulator
 from envs.simulators.replay import Replay, replay
@@ -82,7 +81,7 @@ def share(flags: Tensor) -> float:
 def judge_frames(judge: LearnedJudge, frames: Tensor, store: ClipStore, episodes: Tensor, batch: int = 16) -> Tensor:
     """Success probabilities [N, T] of frames uint8 [N, T, V, 3, H, W] of these episodes."""
     device = next(judge.parameters()).device
-    tokens = torch.stack([tokenize(store.episodes[n]["instruction"]) for n in episodes.tolist()])
+    tokens = store.tokens[episodes]
     first = store.frames(store.start[episodes])
     pieces = zip(frames.split(batch), first.split(batch), tokens.split(batch), strict=True)
     return torch.cat([judge.score(*(value.to(device) for value in piece)).success.cpu() for piece in pieces])

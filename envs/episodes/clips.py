@@ -23,6 +23,7 @@ from envs.conditioning import CANVAS, PoseMapStyle, render_pose_map
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.lerobot import LeRobotDataset
 from envs.geometry import follow_hands, hands_of
+from envs.language import tokenize
 from envs.layouts import CommandLayout
 
 
@@ -83,6 +84,7 @@ class ClipStore:
         self.length = torch.tensor([row["length"] for row in self.episodes])
         self.start = torch.cat([torch.zeros(1, dtype=torch.int64), self.length.cumsum(0)])[:-1]
         self.intrinsic = torch.tensor([row["intrinsic"] for row in self.episodes])
+        self.tokens = torch.stack([tokenize(row["instruction"]) for row in self.episodes])  # int64 [episodes, WORDS]
         bounds = np.cumsum([0] + [len(part.frames) for part in self.parts])
         self._bounds = bounds
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import torch
 from tensordict import TensorDict
 from torch import Tensor
 
 from envs.episodes.clips import ClipStore
-from envs.language import tokenize
 from envs.simulators.base import Simulator
 from envs.simulators.replay import replay
 
@@ -30,14 +28,13 @@ def generated_frames(simulator: Simulator, store: ClipStore, episodes: Tensor, b
     astray = ((made.places - truth)[..., :2].norm(dim=-1) > within).any(-1)  # false for NaN, where nobody knows
     keep = (made.valid & ~astray).reshape(-1)
     rows, count = made.rows.reshape(-1)[keep], made.valid.shape[1]
-    tokens = torch.stack([tokenize(store.episodes[n]["instruction"]) for n in episodes.tolist()])
     return TensorDict(
         {
             "frames": made.frames.flatten(0, 1)[keep],
             "row": rows,
             "places": made.places.flatten(0, 1)[keep],
             "begin": store.start[episodes].repeat_interleave(count, 0)[keep],
-            "tokens": tokens.repeat_interleave(count, 0)[keep],
+            "tokens": store.tokens[episodes].repeat_interleave(count, 0)[keep],
             "progress": store.arrays["progress"][rows].float(),
         },
         [int(keep.sum())],

@@ -12,9 +12,9 @@ from torch import Tensor
 from actors.policies.vla import SEEN, ChunkPolicy
 from envs.encoders import to_signed
 from envs.episodes.clips import ClipStore
-from envs.language import tokenize
 from envs.schema import IMAGE, STATE, TOKENS, to_relative
 from learners.fit import FitConfig, fit
+from learners.remembered import looked_at
 from learners.stages.judge import augment
 
 # Spread below which a command dimension is a constant: a millimetre, a hundredth of a radian, a twentieth of a grip.
@@ -41,15 +41,12 @@ class Cloning:
         ahead = torch.minimum(self.rows[:, None] + torch.arange(1, chunk + 1), last[:, None])
         commands = store.arrays["commands"]
         self.targets = to_relative(commands[ahead], commands[self.rows])  # [N, K, 14]
-        words = torch.stack([tokenize(row["instruction"]) for row in store.episodes])
-        self.tokens = words[every[0]]
+        self.tokens = store.tokens[every[0]]
         self.seen: Tensor | None = None
 
-    @torch.no_grad()
-    def look(self, batch: int = 512) -> None:
+    def look(self) -> None:
         """Encode every frame once, for a policy whose perception stays as it is."""
-        pairs = zip(self.rows.split(batch), self.tokens.split(batch), strict=True)
-        self.seen = torch.cat([self.policy.perception(self.store.frames(rows), tokens) for rows, tokens in pairs])
+        self.seen = looked_at(self.policy.perception, self.store, self.rows, self.tokens)
 
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
         """Random observations with the knots their chunks have under the policy's units."""

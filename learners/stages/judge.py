@@ -14,7 +14,6 @@ from envs.episodes.clips import ClipStore
 from envs.geometry import project
 from envs.judges.base import Judge, frame_labels
 from envs.judges.learned import LearnedJudge
-from envs.language import tokenize
 from learners.fit import FitConfig, fit
 
 
@@ -54,7 +53,6 @@ def train_judge(
     rows = torch.cat([torch.arange(int(store.start[n]), int(store.start[n] + store.length[n])) for n in episodes.tolist()])
     begin = torch.repeat_interleave(store.start, store.length)
     owner = torch.repeat_interleave(torch.arange(len(store)), store.length)
-    tokens = torch.stack([tokenize(row["instruction"]) for row in store.episodes])
     seen = sights(store, store.arrays["objects"], torch.arange(len(labels)), judge.aims)
     if imagined is not None:
         imagined = imagined.clone(recurse=False).set("where", sights(store, imagined["places"], imagined["row"], judge.aims)).exclude("places")
@@ -69,7 +67,7 @@ def train_judge(
         if wanted:
             at.append(positive[torch.randint(len(positive), (wanted,), generator=generator)])
         chosen = torch.cat(at)
-        known = {"tokens": tokens[owner[chosen]], "label": labels[chosen], "progress": store.arrays["progress"][chosen].float(), "where": seen[chosen]}
+        known = {"tokens": store.tokens[owner[chosen]], "label": labels[chosen], "progress": store.arrays["progress"][chosen].float(), "where": seen[chosen]}
         out = TensorDict({"frames": store.frames(chosen), "begin": begin[chosen], **known}, [len(chosen)])
         if imagined is not None:
             made = imagined[torch.randint(len(imagined), (options.part - real,), generator=generator)]
