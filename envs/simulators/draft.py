@@ -70,29 +70,21 @@ class Draft(nn.Module):
             them [B, S, 4, h, w], `where` [B, S, 2] and with which `axes` [B, S, 2, 2] they are in them (InView), and whether, `visible`.
         """
         seen = in_view(places[:, None], intrinsic, c2w[:, None], self.size).at(slice(None), 0)
-        return TensorDict({str(view): TensorDict({"c2w": c2w[:, view], **self._cut(frames, seen, view)}, frames.shape[:1]) for view in range(len(self.shrink))}, frames.shape[:1])
-
-    def _cut(self, frames: Tensor, seen: InView, view: int) -> dict[str, Tensor]:
-        """One view as `prepare` gives it."""
-        shrink = self.shrink[view]
-        picture = at_detail(frames[:, view], shrink)
-        # A look at every third row and column tells what most of it shows.
-        bare = picture[..., ::3, ::3].flatten(2).median(-1).values[..., None, None]
-        begin = InView(*(value[:, view] for value in seen))
-        covers = _covers(picture, bare, begin)
-        mounted = F.interpolate(self.mounted[view][None], size=picture.shape[-2:], mode="area")
-        mine = F.max_pool2d(mounted, 5, stride=1, padding=2)  # the edge is neither and goes too
-        ground = torch.lerp(picture, bare, 1 - (1 - mine) * (1 - covers).prod(1))
-        out = {"bare": bare, "ground": ground, "mounted": picture * mounted}
-        things = {"things": _with_picture(covers, picture), "where": begin.where, "axes": begin.axes, "visible": begin.visible}
-        if view:
-            # What a camera does not see the whole of at first, the first camera may.
-            other, first = InView(*(value[:, 0] for value in seen)), at_detail(frames[:, 0], shrink)
-            there = _covers(first, first[..., ::3, ::3].flatten(2).median(-1).values[..., None, None], other)
-            whole = begin.visible & (begin.where.abs() + _HALF * begin.axes.abs().sum(-1) < 1).all(-1) | ~other.visible
-            elsewhere = {"things": _with_picture(there, first), "where": other.where, "axes": other.axes, "visible": other.visible}
-            things = {name: torch.where(whole.view(*whole.shape, *[1] * (value.ndim - 2)), value, elsewhere[name]) for name, value in things.items()}
-        return out | things
+        # What a camera does not see the whole of at first, the first camera may.
+        other = {shrink: _things(at_detail(frames[:, 0], shrink), _of(seen, 0)) for shrink in sorted(set(self.shrink))}
+        out = {}
+        for view, shrink in enumerate(self.shrink):
+            picture, begin = at_detail(frames[:, view], shrink), _of(seen, view)
+            things = _things(picture, begin) if view else other[shrink]
+            mounted = F.interpolate(self.mounted[view][None], size=picture.shape[-2:], mode="area")
+            mine = F.max_pool2d(mounted, 5, stride=1, padding=2)  # the edge is neither and goes too
+            bare = _bare(picture)
+            ground = torch.lerp(picture, bare, 1 - (1 - mine) * (1 - things["things"][:, :, 3:]).prod(1))
+            if view:
+                whole = begin.visible & (begin.where.abs() + _HALF * begin.axes.abs().sum(-1) < 1).all(-1) | ~other[shrink]["visible"]
+                things = {name: torch.where(whole.view(*whole.shape, *[1] * (value.ndim - 2)), value, other[shrink][name]) for name, value in things.items()}
+            out[str(view)] = TensorDict({"c2w": c2w[:, view], "bare": bare, "ground": ground, "mounted": picture * mounted, **things}, frames.shape[:1])
+        return TensorDict(out, frames.shape[:1])
 
     def look(self, inputs: TensorDict) -> InView:
         """Objects in all views [B, V, 1 + K, S], at the last remembered frame and at the K to come; `inputs` are those of Simulator.predict."""
@@ -166,9 +158,21 @@ def _paste(out: Tensor, thing: TensorDict, where: Tensor, axes: Tensor, visible:
     pixels.scatter_(3, index, torch.lerp(pixels.gather(3, index), carried[:, :, :3], carried[:, :, 3:] * visible[..., None, None]))
 
 
-def _with_picture(covers: Tensor, picture: Tensor) -> Tensor:
-    """Covers [B, S, 1, h, w] as fourth channels of the picture [B, 3, h, w] they are of: [B, S, 4, h, w]."""
-    return torch.cat((picture[:, None].expand(-1, covers.shape[1], -1, -1, -1), covers), 2)
+def _of(seen: InView, view: int) -> InView:
+    """One view [B, S] of places [B, V, S]."""
+    return InView(*(value[:, view] for value in seen))
+
+
+def _bare(picture: Tensor) -> Tensor:
+    """The ground's colour [B, 3, 1, 1] in a picture [B, 3, h, w]: a look at every third row and column tells what most of it shows."""
+    return picture[..., ::3, ::3].flatten(2).median(-1).values[..., None, None]
+
+
+def _things(picture: Tensor, begin: InView) -> dict[str, Tensor]:
+    """Things as `prepare` gives them, from the picture [B, 3, h, w] they are in."""
+    covers = _covers(picture, _bare(picture), begin)
+    pictures = torch.cat((picture[:, None].expand(-1, covers.shape[1], -1, -1, -1), covers), 2)
+    return {"things": pictures, "where": begin.where, "axes": begin.axes, "visible": begin.visible}
 
 
 def _covers(picture: Tensor, bare: Tensor, begin: InView) -> Tensor:
