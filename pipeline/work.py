@@ -266,12 +266,13 @@ def rl(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str,
         actor.freeze_perception()
         anchor.look()
     algorithm = build_algorithm(cfg, actor)
+    knew: dict[str, float] = {}
     if isinstance(algorithm, PPO):
         # Of a deployed policy whose perception stays: of another the critic would know pictures that nobody sees any more.
         past = store.select([f"policy-{number}"])
         past = past[torch.isin(past, split(store)[0])]
         if settings.freeze_perception and len(past):
-            algorithm.acquaint(remembered(actor.perception, store, past, options(Rewards, cfg["judge"]["rewards"], "judge.rewards"), cfg["task"]["chunk"]), settings.seed)
+            knew["critic_knew"] = algorithm.acquaint(remembered(actor.perception, store, past, options(Rewards, cfg["judge"]["rewards"], "judge.rewards"), cfg["task"]["chunk"]), settings.seed)
     weights = [str((found[name] / "weights.safetensors").resolve()) for name in (policy, vision, state, judge)]
     datasets = tuple(str((found[name] / "dataset").resolve()) for name in data)
     recipe = Recipe(cfg, settings.envs // settings.shards, weights[0], weights[1], weights[2], weights[3], datasets, settings.freeze_perception, algorithm.bootstraps, settings.rewards_later)
@@ -282,7 +283,7 @@ def rl(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str,
         if fleet is not None:
             fleet.close()
     save_weights(actor, folder)
-    return {**{k: v for k, v in stats.items() if k != "last"}, **{f"last_{k}": v for k, v in stats["last"].items()}}
+    return {**knew, **{k: v for k, v in stats.items() if k != "last"}, **{f"last_{k}": v for k, v in stats["last"].items()}}
 
 
 def load_world(cfg: Cfg, found: Found, store: ClipStore, vision: str, state: str, judge: str, batch: int, episodes: Tensor | None = None) -> Any:

@@ -20,7 +20,7 @@ def test_folding_is_torchs_unshuffling(edge: int, dtype: torch.dtype) -> None:
 
 
 def test_unfolding_passes_gradients_on() -> None:
-    maps = torch.randn(2, 3, 4, 32, dtype=torch.float64)[..., :16].float().requires_grad_()
+    maps = torch.randn(2, 3, 4, 16, requires_grad=True)
     wanted = torch.randn(2, 1, 12, 16)
     (unfold(maps, 4) * wanted).sum().backward()
     assert torch.equal(maps.grad, fold(wanted, 4))  # type: ignore[arg-type]
