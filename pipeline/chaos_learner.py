@@ -22,7 +22,7 @@ from learners.factory import build_algorithm
 from learners.rl import train_rl
 from pipeline.config import load_config
 from pipeline.demo_world import demo_recipe
-from pipeline.work import rl_options
+from pipeline.work.given import rl_options
 
 
 def plague(fleet: RayFleet, section: dict[str, Any], seed: int, events: Path) -> None:

@@ -22,10 +22,10 @@ from envs.simulators.gesim_fixture import FixtureError
 from envs.simulators.gesim_folder import CheckpointError
 from envs.simulators.remote import RemoteError
 from learners.fit import TrainingDiverged
-from pipeline import work
 from pipeline.config import load_config
 from pipeline.loop import build_loop
 from pipeline.statistics import rate_entry
+from pipeline.work.given import EVALUATE, load_world, open_store, seeds_of
 
 
 def _root(cfg: dict[str, Any]) -> Path:
@@ -93,14 +93,14 @@ def evaluate(words: list[str]) -> None:
     world = own.get("world", "physics")
     if world == "physics":
         env: Any = build_physics(cfg, cfg["evaluate"]["envs"])
-        seeds = work.seeds_of(cfg, work.EVALUATE, cfg["evaluate"]["episodes"])
+        seeds = seeds_of(cfg, EVALUATE, cfg["evaluate"]["episodes"])
     elif world == "imagined":
         last = cfg["rounds"]["count"]
         data = ("collect", *(f"deploy-{n}" for n in range(1, last + 1)))
         found = {stage: graph.folder(stage) for stage in graph.stages}
-        store = work.open_store(cfg, found, data)
+        store = open_store(cfg, found, data)
         seeds = list(range(min(cfg["evaluate"]["imagined"], len(store))))
-        env = work.load_world(cfg, found, store, f"vision-{last}", f"state-{last}", f"judge-{last}", min(64, len(seeds)))
+        env = load_world(cfg, found, store, f"vision-{last}", f"state-{last}", f"judge-{last}", min(64, len(seeds)))
     else:
         raise ConfigError(f"world={world!r} must be physics or imagined")
     try:

@@ -16,11 +16,11 @@ from actors.recipe import Recipe
 from learners.factory import build_algorithm
 from learners.rl import train_rl
 from learners.stages.imitation import train_imitation
-from pipeline import work
 from pipeline.artefact import save_weights, write_text
 from pipeline.graph import Graph, Stage
 from pipeline.loop import build_loop
 from pipeline.statistics import mcnemar, rate_entry
+from pipeline.work.given import EVALUATE, fit_options, rl_options, seeds_of
 
 CONTROL = 6_000_000  # episode seeds of RL in physics
 
@@ -52,7 +52,7 @@ def run_controls(cfg: Mapping[str, Any], root: Path) -> None:
         demos = store.select(["expert"], succeeded=True)[: cfg["imitation"]["demos"]]
         mine = store.select(["policy-*"], succeeded=True)
         policy = build_policy(cfg)
-        train_imitation(policy, store, torch.cat([demos, mine]), work.fit_options(cfg, cfg["imitation"]["fit"], "imitation.fit"), folder)
+        train_imitation(policy, store, torch.cat([demos, mine]), fit_options(cfg, cfg["imitation"]["fit"], "imitation.fit"), folder)
         save_weights(policy, folder)
         return {"demos": len(demos), "own_successes": len(mine), **_judge(cfg, policy, folder)}
 
@@ -60,14 +60,14 @@ def run_controls(cfg: Mapping[str, Any], root: Path) -> None:
         policy = build_policy(cfg, loop.folder("imitation") / "weights.safetensors")
         envs = min(cfg["rl"]["envs"], 64)
         iterations = max(1, round(budget / envs))
-        settings = work.rl_options(cfg, envs=envs, iterations=iterations, seed=cfg["seed"])
+        settings = rl_options(cfg, envs=envs, iterations=iterations, seed=cfg["seed"])
         if settings.freeze_perception:
             policy.freeze_perception()
         algorithm = build_algorithm(cfg, policy)
         start = str((loop.folder("imitation") / "weights.safetensors").resolve())
         fleet = build_fleet(Recipe(cfg, envs // settings.shards, start, freeze_perception=settings.freeze_perception, bootstrap=algorithm.bootstraps))
         try:
-            stats = train_rl(fleet, policy, algorithm, settings, folder, name="rl-physics", seed_pool=work.seeds_of(cfg, CONTROL, 4 * budget))
+            stats = train_rl(fleet, policy, algorithm, settings, folder, name="rl-physics", seed_pool=seeds_of(cfg, CONTROL, 4 * budget))
         finally:
             fleet.close()
         save_weights(policy, folder)
@@ -90,7 +90,7 @@ def run_controls(cfg: Mapping[str, Any], root: Path) -> None:
 def _judge(cfg: Mapping[str, Any], policy: Any, folder: Path) -> dict[str, Any]:
     env = build_physics(cfg, cfg["evaluate"]["envs"])
     try:
-        outcome = evaluate(env, policy, work.seeds_of(cfg, work.EVALUATE, cfg["evaluate"]["episodes"]), label="physics")
+        outcome = evaluate(env, policy, seeds_of(cfg, EVALUATE, cfg["evaluate"]["episodes"]), label="physics")
     finally:
         env.close()
     torch.save({"success": outcome.success}, folder / "outcomes.pt")

@@ -17,7 +17,7 @@ from learners.stages.state import train_state
 from learners.stages.vision import VisionConfig, train_vision
 from pipeline.artefact import save_weights
 from pipeline.graph import Graph, Stage
-from pipeline.work import fit_options
+from pipeline.work.given import fit_options
 
 Cfg = Mapping[str, Any]
 

@@ -1,6 +1,6 @@
 """The whole loop as a graph: collect, imitate, then rounds of deploy -> refresh the world -> RL in it, then the proof.
 
-Reading this file top to bottom is reading the method. What each stage does is in pipeline/work.py.
+Reading this file top to bottom is reading the method. What each stage does is in pipeline/work.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ EVALUATORS = ("gap", "evaluate_physics", "evaluate_imagined", "measure")
 
 
 def run_stage(function: str, cfg: Mapping[str, Any], folder: Path, found: Mapping[str, Path], known: Mapping[str, Any]) -> dict[str, Any]:
-    """Run a function of pipeline/work.py where the config wants it: in this process, on Ray's evaluator, or in launch.learners processes.
+    """Run a stage of pipeline/work where the config wants it: in this process, on Ray's evaluator, or in launch.learners processes.
 
     Raises:
         ConfigError: if the processes cannot be placed, or failed.
@@ -50,7 +50,7 @@ def learners_of(cfg: Mapping[str, Any]) -> int:
 
 
 def run_shared(function: str, cfg: Mapping[str, Any], folder: Path, found: Mapping[str, Path], known: Mapping[str, Any]) -> dict[str, Any]:
-    """Run a function of pipeline/work.py in launch.learners processes; returns what the leading one returned.
+    """Run a stage of pipeline/work in launch.learners processes; returns what the leading one returned.
 
     Raises:
         ConfigError: if the processes cannot be placed, or failed more than launch.patience.retries times.
@@ -89,7 +89,7 @@ def run_shared(function: str, cfg: Mapping[str, Any], folder: Path, found: Mappi
 
 
 def run_placed(function: str, cfg: Mapping[str, Any], folder: Path, found: Mapping[str, Path], known: Mapping[str, Any]) -> dict[str, Any]:
-    """Run a function of pipeline/work.py as a Ray task with the evaluator's resources; a lost node only costs a second try.
+    """Run a stage of pipeline/work as a Ray task with the evaluator's resources; a lost node only costs a second try.
 
     Raises:
         ConfigError: if the task cannot be placed.
