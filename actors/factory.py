@@ -204,7 +204,7 @@ def build_policy(cfg: Mapping[str, Any], weights: Path | None = None) -> ChunkPo
         head = partial(ChunkTokenHead, chunk=chunk, bins=section["bins"])
     else:
         raise ConfigError(f"policy.head={section['head']!r} is unknown; choose gaussian or tokens")
-    return load(ChunkPolicy(len(cfg["task"]["views"]), head, section["width"], section["points"], channels=section["channels"]), weights)
+    return load(ChunkPolicy(len(cfg["task"]["views"]), head, section["width"], section["points"], channels=section["channels"], aims=section["aims"]), weights)
 
 
 def build_openpi(cfg: Mapping[str, Any], url: str) -> OpenPIPolicy:

@@ -16,12 +16,11 @@ class SpatialEncoder(nn.Module):
         points: number of soft key-points.
         width: channels at half resolution; twice as many at a quarter.
         pictures: how many are looked at as one, pixel on pixel.
-        near: rows and columns of half-resolution cells that decide how much a key-point lies on the middle one; odd.
 
-    Forward takes float [B, 3 * pictures, H, W] in -1..1 and returns float32 [B, 2 * points + 16 * width]: coordinates, and a coarse grid of features.
+    Forward takes float [B, 3 * pictures, H, W] in -1..1 and returns float32: the key-points [B, points, 2] as (u, v) in half-pictures from the middle, and a coarse grid of features [B, 16 * width].
     """
 
-    def __init__(self, points: int = 32, width: int = 32, pictures: int = 1, near: int = 1):
+    def __init__(self, points: int = 32, width: int = 32, pictures: int = 1):
         super().__init__()
         self.stem = nn.Conv2d(3 * pictures, width, 5, stride=2, padding=2)
         self.mid = nn.Conv2d(width, 2 * width, 3, stride=2, padding=1)
@@ -30,18 +29,12 @@ class SpatialEncoder(nn.Module):
         self.fine = nn.Conv2d(width, width, 1)
         self.heat = nn.Conv2d(2 * width, points, 1)
         self.lift = nn.Conv2d(2 * width, width, 1)
-        self.heat_fine = nn.Conv2d(width, points, near, padding=near // 2)
+        self.heat_fine = nn.Conv2d(width, points, 3, padding=1)
         # Sharp from the start: over a near-uniform softmax, key-points sit in the middle and hardly learn.
         self.temperature = nn.Parameter(torch.full((points,), 2.3))
         self.grid = nn.Sequential(nn.Conv2d(2 * width, width, 4, stride=4), nn.SiLU(), nn.AdaptiveAvgPool2d(4), nn.Flatten())
-        self.out_features = 2 * points + 16 * width
 
-    def forward(self, pictures: Tensor) -> Tensor:
-        points, grid = self.look(pictures)
-        return torch.cat((*points.unbind(-1), grid), -1)
-
-    def look(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
-        """The key-points [B, points, 2] as (u, v) in half-pictures from the middle, and the grid of features [B, 16 * width]."""
+    def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
         x = F.silu(self.norm1(self.stem(pictures.contiguous(memory_format=torch.channels_last))))
         y = F.silu(self.norm2(self.mid(x)))
         y = y + F.silu(self.norm3(self.deep(y)))
@@ -95,6 +88,49 @@ class CloseUp(nn.Module):
         x = self.layers(crops.transpose(1, 2).flatten(0, 1)).unflatten(0, begin.shape[:2])
         said = torch.einsum("bsk,sko->bso", F.silu(torch.einsum("bsi,sik->bsk", x, self.first)), self.last).float()
         return begin + self.reach * said[..., :2].tanh(), said[..., 2:]
+
+
+class Gaze(nn.Module):
+    """What judges and policies see in a first view: key-points, some of them taught to lie on objects and looked at closely, and how far those lie apart.
+
+    Args:
+        points, width, pictures: of SpatialEncoder.
+        aims: key-points, the first ones, that are taught to lie on the objects of the data, in their order.
+
+    Attributes:
+        out_features: numbers said of a picture.
+    """
+
+    GAIN = 4.0  # on where objects are seen and how far apart: small differences that decide
+
+    def __init__(self, points: int, width: int, aims: int, pictures: int = 1):
+        super().__init__()
+        if aims > points:
+            raise ValueError(f"aims={aims} cannot exceed points={points}")
+        self.aims = aims
+        self.encoder = SpatialEncoder(points, width, pictures)
+        self.closer = CloseUp(aims, pictures=pictures) if aims else None
+        self.out_features = 2 * points + 16 * width + 2 * aims + 3 * (aims * (aims - 1) // 2)
+
+    def forward(self, pictures: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """What is said of pictures float [B, C, H, W] in -1..1, float32 [B, out_features], and where objects are seen, [B, 2, aims, 2].
+
+        The latter at a first look and closely, in half-pictures from the middle. `generator` see CloseUp.
+        """
+        points, grid = self.encoder(pictures)
+        aimed = points[:, : self.aims]
+        close = aimed if self.closer is None else self.closer(pictures, aimed, generator)[0]
+        one, other = torch.triu_indices(self.aims, self.aims, 1, device=points.device)
+        apart = close[:, one] - close[:, other]
+        apart = torch.cat((apart, apart.norm(dim=-1, keepdim=True)), -1)
+        return torch.cat((points.flatten(1), grid, self.GAIN * close.flatten(1), self.GAIN * apart.flatten(1)), -1), torch.stack((aimed, close), 1)
+
+    @staticmethod
+    def missed(aimed: Tensor, where: Tensor) -> Tensor:
+        """Mean distances [2] at a first look and closely, in half-pictures, between where objects are seen [B, 2, aims, 2] and are [B, aims, 2]; NaN where nobody knows."""
+        known = torch.isfinite(where).all(-1)
+        off = (aimed - torch.nan_to_num(where)[:, None]).norm(dim=-1) * known[:, None]
+        return off.sum((0, 2)) / known.sum().clamp(min=1)
 
 
 class PatchEncoder(nn.Module):

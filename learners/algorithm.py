@@ -31,7 +31,7 @@ class RLConfig:
         lr: learning rate of the policy.
         clip: largest gradient norm.
         kl_stop: mean KL to the behaviour policy at which an iteration's epochs end early.
-        anchor: weight of cloning what is known to have worked in physics (demonstrations and the policy's own true
+        anchor: weight of cloning what is known to have worked in physics (the newest deployed policy's true
             successes) beside the algorithm's loss; it keeps RL from wandering where only the simulator says it works.
         anchor_batch: frames of that per update.
         rewards_later: let rollouts go on without waiting for the judge, whose verdicts are filled in at their end.

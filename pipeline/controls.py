@@ -52,7 +52,7 @@ def run_controls(cfg: Mapping[str, Any], root: Path) -> None:
         demos = store.select(["expert"], succeeded=True)[: cfg["imitation"]["demos"]]
         mine = store.select(["policy-*"], succeeded=True)
         policy = build_policy(cfg)
-        train_imitation(policy, store, torch.cat([demos, mine]), fit_options(cfg, cfg["imitation"]["fit"], "imitation.fit"), folder)
+        train_imitation(policy, store, torch.cat([demos, mine]), fit_options(cfg, cfg["imitation"]["fit"], "imitation.fit"), folder, watched=torch.arange(len(store)))
         save_weights(policy, folder)
         return {"demos": len(demos), "own_successes": len(mine), **_judge(cfg, policy, folder)}
 

@@ -49,7 +49,7 @@ def build_loop(cfg: Cfg, root: Path) -> Graph:
         judge = add(f"judge-{number}", (*data, vision, *((judge,) if judge else ())), settings, work.judge, data=tuple(data), vision=vision, warm=judge, steps=steps)
         settings = {**settings, "policy": cfg["policy"]}
         gap = add(f"gap-{number}", (*data, vision, state, judge, policy, held_out), {**settings, "measure": cfg["measure"]}, work.gap, data=tuple(data), vision=vision, state=state, judge=judge, policy=policy, number=number)
-        cloned = add(f"clone-{number}", (*data, policy, vision), {**learned, "policy": cfg["policy"], "imitation": cfg["imitation"], "clone": cfg["clone"]}, work.clone, data=tuple(data), policy=policy, vision=vision)
+        cloned = add(f"clone-{number}", (*data, policy, vision), {**learned, "policy": cfg["policy"], "imitation": cfg["imitation"], "clone": cfg["clone"]}, work.clone, data=tuple(data), policy=policy, vision=vision, number=number)
         iterations = cfg["rounds"]["iterations"][min(number, len(cfg["rounds"]["iterations"])) - 1]
         settings = {**settings, "algorithm": cfg["algorithm"], "rl": cfg["rl"], "iterations": iterations}
         policy = add(f"rl-{number}", (*data, vision, state, judge, cloned, gap), settings, work.rl, data=tuple(data), vision=vision, state=state, judge=judge, policy=cloned, iterations=iterations, number=number)

@@ -12,7 +12,7 @@ from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDict
 from torch import Tensor, nn
 
 from actors.policies.heads import Head
-from envs.encoders import PatchEncoder, SpatialEncoder, WordEncoder, to_signed
+from envs.encoders import Gaze, PatchEncoder, WordEncoder, to_signed
 from envs.schema import CHUNK, IMAGE, LOG_PROB, STATE, STATE_DIM, TOKENS
 
 SEEN = ("policy", "seen")  # float32 [B, S]: what perception makes of pictures and words, for heads and critics
@@ -26,11 +26,12 @@ class Perception(nn.Module):
         views: number of cameras.
         points: soft key-points of the first view.
         channels: of its features.
+        aims: key-points that are taught to lie on the objects of the data, in their order.
     """
 
-    def __init__(self, views: int = 3, points: int = 32, channels: int = 32):
+    def __init__(self, views: int = 3, points: int = 32, channels: int = 32, aims: int = 0):
         super().__init__()
-        self.main = SpatialEncoder(points, channels)
+        self.main = Gaze(points, channels, aims)
         self.sides = nn.ModuleList(PatchEncoder(32) for _ in range(views - 1))
         self.words = WordEncoder(16)
         self.out_features = self.main.out_features + 32 * (views - 1) + 16
@@ -38,11 +39,14 @@ class Perception(nn.Module):
     def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
         """uint8 or float (-1..1) [B, V, 3, H, W], int64 [B, WORDS] -> float32 [B, out_features]; leading dimensions may be more."""
         lead = image.shape[:-4]
-        pictures = to_signed(image.reshape(-1, *image.shape[-4:]))
-        parts = [self.main(pictures[:, 0])]
-        parts += [side(pictures[:, k + 1]) for k, side in enumerate(self.sides)]
-        parts += [self.words(tokens.reshape(-1, tokens.shape[-1]))]
-        return torch.cat(parts, -1).reshape(*lead, -1)
+        seen, _ = self.look(image.reshape(-1, *image.shape[-4:]), tokens.reshape(-1, tokens.shape[-1]))
+        return seen.reshape(*lead, -1)
+
+    def look(self, image: Tensor, tokens: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """The same of one leading dimension, and where objects are seen in the first view, [B, 2, aims, 2]; see Gaze."""
+        pictures = to_signed(image)
+        first, aimed = self.main(pictures[:, 0], generator)
+        return torch.cat([first, *(side(pictures[:, k + 1]) for k, side in enumerate(self.sides)), self.words(tokens)], -1), aimed
 
 
 class Fusion(nn.Module):
@@ -80,6 +84,7 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         points: soft key-points of the first view.
         states: numbers of the joint state.
         channels: of the first view's features.
+        aims: see Perception.
 
     Reads image, state and instruction tokens; writes ("vla_action", "chunk") and its log-probability.
 
@@ -89,8 +94,8 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         "('vla_action', 'log_probs')"
     """
 
-    def __init__(self, views: int, head: Callable[[int], Head], width: int = 256, points: int = 32, states: int = STATE_DIM, channels: int = 32):
-        eyes = Perception(views, points, channels)
+    def __init__(self, views: int, head: Callable[[int], Head], width: int = 256, points: int = 32, states: int = STATE_DIM, channels: int = 32, aims: int = 0):
+        eyes = Perception(views, points, channels, aims)
         perception = TensorDictModule(eyes, in_keys=[IMAGE, TOKENS], out_keys=[SEEN])
         fusion = TensorDictModule(Fusion(eyes.out_features, width, states), in_keys=[SEEN, STATE], out_keys=[HIDDEN])
         speaker = head(width)

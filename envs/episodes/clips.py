@@ -173,6 +173,12 @@ class ClipStore:
             size,
         )
 
+    def rows(self, episodes: Tensor) -> Tensor:
+        """Rows int64 [N] of all frames of some episodes, one episode after the other."""
+        length = self.length[episodes]
+        before = length.cumsum(0) - length
+        return torch.repeat_interleave(self.start[episodes] - before, length) + torch.arange(int(length.sum()))
+
     def whole(self, episodes: Tensor) -> tuple[Tensor, Tensor]:
         """Rows int64 [N, T] of all frames but the first of some episodes, the last repeated up to the longest, and which are no repeats, bool [N, T]."""
         ahead = torch.arange(1, int(self.length[episodes].max()))

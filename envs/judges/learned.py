@@ -13,11 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from envs.encoders import CloseUp, PatchEncoder, SpatialEncoder, WordEncoder, to_signed
+from envs.encoders import Gaze, PatchEncoder, WordEncoder, to_signed
 from envs.judges.base import Judge, Verdict, ok_status
 from envs.schema import Status
-
-_GAIN = 4.0  # on the distances between key-points, small numbers that decide
 
 
 class LearnedJudge(Judge):
@@ -33,16 +31,12 @@ class LearnedJudge(Judge):
 
     def __init__(self, views: int = 3, hold: int = 4, margin: float = 0.0, width: int = 24, points: int = 24, aims: int = 2):
         super().__init__(0.5, hold)
-        if aims > points:
-            raise ValueError(f"judge.aims={aims} cannot exceed judge.points={points}")
         self.margin, self.aims = margin, aims
-        self.main = SpatialEncoder(points, width, pictures=2, near=3)
+        self.main = Gaze(points, width, aims, pictures=2)
         self.sides = nn.ModuleList(PatchEncoder(16, 8) for _ in range(views - 1))
-        self.closer = CloseUp(aims, pictures=2) if aims else None
         self.words = WordEncoder(16)
         self.sharpness = nn.Parameter(torch.tensor([2.0]))  # FSDP2 takes no scalars
-        apart = 3 * (aims * (aims - 1) // 2)
-        self.head = nn.Sequential(nn.Linear(self.main.out_features + 16 * views + apart, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU(), nn.Linear(128, 2))
+        self.head = nn.Sequential(nn.Linear(self.main.out_features + 16 * views, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU(), nn.Linear(128, 2))
 
     def forward(self, frames: Tensor, first: Tensor, tokens: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Logits of success and of progress, float32 [N], and where it sees the objects, at a first look and closely, [N, 2, aims, 2] in half-pictures from the middle.
@@ -53,16 +47,11 @@ class LearnedJudge(Judge):
         """
         pictures = to_signed(frames)
         pair = torch.cat((pictures[:, 0], to_signed(first[:, 0])), 1)
-        points, grid = self.main.look(pair)
-        aimed = points[:, : self.aims]
-        close = aimed if self.closer is None else self.closer(pair, aimed, generator)[0]
-        one, other = torch.triu_indices(self.aims, self.aims, 1, device=points.device)
-        apart = _GAIN * (close[:, one] - close[:, other])
-        apart = torch.cat((apart, apart.norm(dim=-1, keepdim=True)), -1).flatten(1)
-        parts = [points.flatten(1), grid, apart, *(side(pictures[:, k + 1]) for k, side in enumerate(self.sides))]
+        seen, aimed = self.main(pair, generator)
+        parts = [seen, *(side(pictures[:, k + 1]) for k, side in enumerate(self.sides))]
         out = self.head(torch.cat([*parts, self.words(tokens)], -1)).float()
         # Success is for the most part progress beyond some point, and progress is taught by every frame.
-        return out[:, 0] + self.sharpness * out[:, 1], out[:, 1], torch.stack((aimed, close), 1)
+        return out[:, 0] + self.sharpness * out[:, 1], out[:, 1], aimed
 
     @torch.no_grad()
     def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
@@ -91,7 +80,6 @@ class LearnedJudge(Judge):
         # Cross-entropy hardly minds a few hundredths of progress, which are the centimetre that decides.
         shaped = (towards.sigmoid() - progress).abs().mean()
         right = ((logit > 0) == (label > 0.5)).float().mean()
-        known = torch.isfinite(where).all(-1)
-        off = ((aimed - torch.nan_to_num(where)[:, None]).norm(dim=-1) * known[:, None]).sum((0, 2)) / known.sum().clamp(min=1)
+        off = Gaze.missed(aimed, where)
         figures = {"success": success.detach(), "frame_accuracy": right, "progress_error": shaped.detach(), "aim_error": off[1].detach()}
         return success + 10.0 * shaped + 48.0 * off.sum(), figures

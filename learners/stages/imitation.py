@@ -10,15 +10,16 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from actors.policies.vla import SEEN, ChunkPolicy
-from envs.encoders import to_signed
+from envs.encoders import Gaze, to_signed
 from envs.episodes.clips import ClipStore
 from envs.schema import IMAGE, STATE, TOKENS, to_relative
 from learners.fit import FitConfig, fit
 from learners.remembered import looked_at
-from learners.stages.judge import augment
+from learners.stages.pictures import augment, sights
 
 # Spread below which a command dimension is a constant: a millimetre, a hundredth of a radian, a twentieth of a grip.
 ACTIVE_FLOOR = (1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2, 5e-2)
+_AIM = 16.0  # on how far off objects are seen, beside the error of what is done
 
 
 class Cloning:
@@ -29,19 +30,23 @@ class Cloning:
     Args:
         generated: frames of generated.py. On these the policy is asked to do what it does on the true ones: what it
             learns in imagination is of use only as far as it sees both alike.
+        watched: episodes whose frames, without their actions, teach the policy's perception where objects are seen, as
+            far as the data say so.
     """
 
-    def __init__(self, policy: ChunkPolicy, store: ClipStore, episodes: Tensor, generated: TensorDict | None = None):
+    def __init__(self, policy: ChunkPolicy, store: ClipStore, episodes: Tensor, generated: TensorDict | None = None, watched: Tensor | None = None):
         self.policy, self.store = policy, store
+        self.aims = policy.perception.main.aims
         self.generated = generated if generated is not None and len(generated) else None  # a bad simulator leaves none
+        self.watched = store.rows(watched) if watched is not None and self.aims else None
         chunk = policy.head.chunk
-        every = torch.cat([torch.stack([torch.full((int(store.length[n]),), n), torch.arange(int(store.length[n]))]) for n in episodes.tolist()], 1)
-        self.rows = store.start[every[0]] + every[1]
-        last = store.start[every[0]] + store.length[every[0]] - 1
+        self.rows = store.rows(episodes)
+        owner = torch.searchsorted(store.start, self.rows, right=True) - 1
+        last = store.start[owner] + store.length[owner] - 1
         ahead = torch.minimum(self.rows[:, None] + torch.arange(1, chunk + 1), last[:, None])
         commands = store.arrays["commands"]
         self.targets = to_relative(commands[ahead], commands[self.rows])  # [N, K, 14]
-        self.tokens = store.tokens[every[0]]
+        self.tokens = store.tokens[owner]
         self.seen: Tensor | None = None
 
     def look(self) -> None:
@@ -59,6 +64,10 @@ class Cloning:
         if self.generated is not None:
             made = self.generated[torch.randint(len(self.generated), (max(1, count // 2),), generator=generator)]  # each brings its true one
             out["pair"] = TensorDict({"made": made["frames"], "true": self.store.frames(made["row"]), STATE: self.store.arrays["states"][made["row"]], TOKENS: made["tokens"]}, made.shape)
+            out["pair", "where"] = sights(self.store, made["places"], made["row"], self.aims)
+        if self.watched is not None:
+            shown = self.watched[torch.randint(len(self.watched), (count,), generator=generator)]
+            out["shown"] = TensorDict({"frames": self.store.frames(shown)[:, :1], "where": sights(self.store, self.store.arrays["objects"][shown], shown, self.aims)}, [count])
         out["target"] = self.policy.head.target(self.targets[pick])
         return out
 
@@ -70,18 +79,26 @@ class Cloning:
         policy, state = self.policy, data[STATE]
         seen = data[SEEN] if self.seen is not None else policy.perception(augment(to_signed(data[IMAGE]), generator), data[TOKENS])
         noise = torch.randn(state.shape, generator=generator).to(state.device) * 0.05 * policy.fusion.state_std
-        cloned = policy.head.error(policy.fusion(seen, state + noise), data["target"])
+        total = policy.head.error(policy.fusion(seen, state + noise), data["target"])
+        if "shown" in data.keys():
+            shown = data["shown"]
+            _, aimed = policy.perception.main(augment(to_signed(shown["frames"]), generator)[:, 0], generator)
+            total = total + _AIM * Gaze.missed(aimed, shown["where"]).sum()
         if "pair" not in data.keys():
-            return cloned
+            return total
         pair = data["pair"]
-        made, true = (policy.fusion(policy.perception(pair[name], pair[TOKENS]), pair[STATE]) for name in ("made", "true"))
+        made, aimed = policy.perception.look(pair["made"], pair[TOKENS])
+        true = policy.perception(pair["true"], pair[TOKENS])
         # Seen alike from both sides: neither picture is the right one to be wrong about.
-        return cloned + policy.head.apart(made, true)
+        total = total + policy.head.apart(policy.fusion(made, pair[STATE]), policy.fusion(true, pair[STATE]))
+        return total + _AIM * Gaze.missed(aimed, pair["where"]).sum()
 
 
-def train_imitation(policy: ChunkPolicy, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path, fresh: bool = True, generated: TensorDict | None = None) -> dict[str, float]:
-    """Clone the given episodes; a `fresh` policy gets its units from them first, one that can act already keeps its own."""
-    cloning = Cloning(policy, store, episodes, generated)
+def train_imitation(
+    policy: ChunkPolicy, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path, fresh: bool = True, generated: TensorDict | None = None, watched: Tensor | None = None
+) -> dict[str, float]:
+    """Clone the given episodes; a `fresh` policy gets its units from them first, one that can act already keeps its own. The rest: see Cloning."""
+    cloning = Cloning(policy, store, episodes, generated, watched)
     if fresh:
         policy.normalise(cloning.targets, store.arrays["states"][cloning.rows], torch.tensor(ACTIVE_FLOOR * 2))
     for parameter in policy.head.exploration():

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from envs.encoders import to_signed
 from envs.episodes.clips import ClipStore
-from envs.geometry import project
 from envs.judges.base import Judge, frame_labels
 from envs.judges.learned import LearnedJudge
 from learners.fit import FitConfig, fit
+from learners.stages.pictures import augment, sights
 
 
 def episode_labels(store: ClipStore, hold: int) -> Tensor:
@@ -23,15 +23,6 @@ def episode_labels(store: ClipStore, hold: int) -> Tensor:
     for start, length in zip(store.start.tolist(), store.length.tolist(), strict=True):
         out[start : start + length] = frame_labels(store.arrays["success"][None, start : start + length].float(), hold)[0]
     return out
-
-
-def sights(store: ClipStore, objects: Tensor, rows: Tensor, count: int) -> Tensor:
-    """Where objects [N, S, 4] are in the first view at the cameras of `rows` [N]: [N, count, 2] in half-pictures from the middle, NaN where unknown or out of sight."""
-    owner = torch.searchsorted(store.start, rows, right=True) - 1
-    known = torch.nn.functional.pad(objects[:, :count], (0, 0, 0, max(0, count - objects.shape[1])), value=torch.nan)
-    pixels, depth = project(known[..., :3], store.intrinsic[owner, 0], store.arrays["c2w"][rows, 0])
-    where = pixels / (torch.tensor(store.size[::-1]) / 2) - 1
-    return torch.where(((depth > 0.02) & (where.abs() < 1).all(-1))[..., None], where, torch.nan)
 
 
 def unseen_by_judge(store: ClipStore) -> Tensor:
@@ -50,7 +41,7 @@ def train_judge(
     if imagined is not None and not len(imagined):
         imagined = None  # a simulator so bad that every frame went astray
     labels = episode_labels(store, judge.hold)
-    rows = torch.cat([torch.arange(int(store.start[n]), int(store.start[n] + store.length[n])) for n in episodes.tolist()])
+    rows = store.rows(episodes)
     begin = torch.repeat_interleave(store.start, store.length)
     owner = torch.repeat_interleave(torch.arange(len(store)), store.length)
     seen = sights(store, store.arrays["objects"], torch.arange(len(labels)), judge.aims)
@@ -82,12 +73,6 @@ def train_judge(
         return judge.loss(pictures, first, data["tokens"], data["label"], data["progress"], data["where"], max(share, 0.3), generator)
 
     return fit("judge", judge, batch, loss, options, folder, watch="frame_accuracy")
-
-
-def augment(pictures: Tensor, generator: torch.Generator, strength: float = 0.08) -> Tensor:
-    """Colour gain and offset per picture and channel, alike in all views; pictures float [N, V, 3, H, W] in -1..1."""
-    draw = torch.rand((2, len(pictures), 1, 3, 1, 1), generator=generator).mul(2).sub(1).to(pictures.device)
-    return pictures * (1 + strength * draw[0]) + strength * draw[1]
 
 
 def calibrate(judge: Judge, success: Tensor, rate: float) -> None:

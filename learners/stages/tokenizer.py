@@ -17,7 +17,7 @@ from learners.fit import FitConfig, fit
 
 def train_tokenizer(simulator: DiTSimulator, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path) -> dict[str, float]:
     """Train the simulator's autoencoder in place on single frames, then set its latents' units."""
-    rows = torch.cat([torch.arange(int(store.start[n]), int(store.start[n] + store.length[n])) for n in episodes.tolist()])
+    rows = store.rows(episodes)
     codec, gain = simulator.codec, simulator.foreground
     assert isinstance(codec, Autoencoder)
 

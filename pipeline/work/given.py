@@ -51,10 +51,15 @@ def split(store: ClipStore) -> tuple[Tensor, Tensor]:
     return numbers[~kept], numbers[kept]
 
 
-def worked(cfg: Cfg, store: ClipStore) -> Tensor:
-    """Episodes known to have worked in physics: the demonstrations, and the successes of deployed policies."""
-    known = torch.cat([store.select(["expert"], succeeded=True)[: cfg["imitation"]["demos"]], store.select(["policy-*"], succeeded=True)])
-    return known[torch.isin(known, split(store)[0])]
+def worked(cfg: Cfg, store: ClipStore, number: int) -> Tensor:
+    """Episodes known to have worked in physics: successes of the policy deployed in round `number`, and the demonstrations where those are fewer.
+
+    What older policies did pulls a better one back: cloned with theirs, one that succeeded in 44% was left with 38%,
+    on its own 44%.
+    """
+    own, demos = store.select([f"policy-{number}"], succeeded=True), store.select(["expert"], succeeded=True)[: cfg["imitation"]["demos"]]
+    own = own[torch.isin(own, split(store)[0])]
+    return own if len(own) >= len(demos) else torch.cat([demos, own])
 
 
 def load_world(cfg: Cfg, found: Found, store: ClipStore, vision: str, state: str, judge: str, batch: int, episodes: Tensor | None = None) -> Any:

@@ -34,23 +34,23 @@ def imitation(cfg: Cfg, folder: Path, found: Found) -> dict[str, Any]:
         raise ConfigError(f"imitation.demos={cfg['imitation']['demos']}, but the data hold {len(experts)} successful expert episodes; raise collect.episodes or collect.mix.expert")
     prepare_process(cfg["seed"])
     policy = build_policy(cfg)
-    stats = train_imitation(policy, store, experts, fit_options(cfg, cfg["imitation"]["fit"], "imitation.fit"), folder)
+    stats = train_imitation(policy, store, experts, fit_options(cfg, cfg["imitation"]["fit"], "imitation.fit"), folder, watched=split(store)[0])
     save_weights(policy, folder)
     return {**stats, "demos": len(experts)}
 
 
-def clone(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], policy: str, vision: str) -> dict[str, Any]:
+def clone(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], policy: str, vision: str, number: int) -> dict[str, Any]:
     """The deployed policy, perception and all, learns from what worked in physics, and to see generated pictures as it sees true ones; RL then leaves its perception as it is."""
     store = open_store(cfg, found, data)
     prepare_process(cfg["seed"])
     actor = build_policy(cfg, found[policy] / "weights.safetensors")
-    episodes = worked(cfg, store)
+    episodes = worked(cfg, store, number)
     section = dict(cfg["clone"])
     own = store.select(["policy-*"])
     own = own[torch.isin(own, split(store)[0])].flip(0)[: section.pop("imagined")]  # the newest first
     simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
     made = generated_frames(simulator, store, own, cfg["simulator"]["bf16"])
-    stats = train_imitation(actor, store, episodes, fit_options(cfg, section, "clone"), folder, fresh=False, generated=made)
+    stats = train_imitation(actor, store, episodes, fit_options(cfg, section, "clone"), folder, fresh=False, generated=made, watched=split(store)[0])
     save_weights(actor, folder)
     return {**stats, "episodes": len(episodes), "generated_frames": len(made)}
 
@@ -92,8 +92,7 @@ def state(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
     simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
     decoder = build_state_decoder(cfg, simulator, found[warm] / "weights.safetensors" if warm else None)
     if not warm and not decoder.normalised:
-        rows = torch.cat([torch.arange(int(store.start[n]), int(store.start[n] + store.length[n])) for n in train.tolist()])
-        decoder.normalise(store.arrays["states"][rows])
+        decoder.normalise(store.arrays["states"][store.rows(train)])
     stats = train_state(decoder, simulator, store, train, fit_options(cfg, cfg["state"][steps], f"state.{steps}"), folder)
     save_weights(decoder, folder)
     return stats
@@ -129,7 +128,7 @@ def rl(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: str,
     store = open_store(cfg, found, data)
     actor = build_policy(cfg, found[policy] / "weights.safetensors")
     settings = rl_options(cfg, iterations=iterations, seed=cfg["seed"] * 100 + number)
-    anchor = Cloning(actor, store, worked(cfg, store))
+    anchor = Cloning(actor, store, worked(cfg, store, number))
     if settings.freeze_perception:
         actor.freeze_perception()
         anchor.look()

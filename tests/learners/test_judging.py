@@ -11,7 +11,8 @@ from envs.episodes.clips import ClipStore
 from envs.judges import LearnedJudge
 from envs.simulators.in_view import in_view
 from learners.fit import FitConfig
-from learners.stages.judge import sights, train_judge, unseen_by_judge
+from learners.stages.judge import train_judge, unseen_by_judge
+from learners.stages.pictures import sights
 
 
 def test_sights_are_where_objects_are_drawn(store: ClipStore) -> None:
