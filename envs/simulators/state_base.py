@@ -17,9 +17,11 @@ class StateDecoder(nn.Module):
 
     Attributes:
         normalised: whether its units came with its weights, so that data need not set them.
+        steady: whether `look` says the same whatever the decoder has learned, so that it need look only once.
     """
 
     normalised = False
+    steady = False
 
     def __init__(self, memory: int):
         super().__init__()

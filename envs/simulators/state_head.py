@@ -18,13 +18,14 @@ class StateHead(StateDecoder):
         chunk: frames per chunk, K; memory: frames of history, M.
     """
 
+    steady = True
     state_mean: Tensor
     state_std: Tensor
 
-    def __init__(self, features: int, chunk: int, memory: int = 4, width: int = 256):
+    def __init__(self, features: int, chunk: int, memory: int = 4, width: int = 384):
         super().__init__(memory)
         self.chunk = chunk
-        size = features + (chunk + 1) * ACTION_DIM + memory * STATE_DIM
+        size = features + (chunk + memory + 1) * ACTION_DIM + memory * STATE_DIM
         self.register_buffer("state_mean", torch.zeros(STATE_DIM))
         self.register_buffer("state_std", torch.ones(STATE_DIM))
         self.norm = nn.LayerNorm(features)
@@ -36,9 +37,9 @@ class StateHead(StateDecoder):
     def decode(self, features: Tensor, commands: Tensor, past_commands: Tensor, past_states: Tensor, seed: Tensor, chunk_index: Tensor) -> Tensor:
         """See StateDecoder.decode; seed and chunk_index do not matter, there is no noise."""
         now = past_commands[:, -1]
-        relative = to_relative(commands, now) * 10.0
+        relative = to_relative(torch.cat((past_commands, commands), 1), now) * 10.0
         past = (past_states - self.state_mean) / self.state_std
-        inputs = torch.cat([self.norm(features), relative.flatten(1), now, past.flatten(1)], 1)
+        inputs = torch.cat([self.norm(features), relative.flatten(1), now * 3.0, past.flatten(1)], 1)
         change = self.layers(inputs).float().unflatten(1, (self.chunk, STATE_DIM))
         return past_states[:, -1:] + change * self.state_std
 

@@ -8,27 +8,48 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from tqdm import tqdm
 
 from envs.episodes.clips import ClipSpec, ClipStore
+from envs.precision import mixed_precision
 from envs.simulators.base import Simulator
 from envs.simulators.state_base import StateDecoder
 from envs.simulators.state_flow import StateExpert
-from learners.fit import FitConfig, fit
+from learners.fit import FitConfig, fit, step_generator
 from learners.lora import low_rank
+
+_GLIMPSES = 6000  # clips that a simulator is shown for a decoder that need look only once
 
 
 def train_state(decoder: StateDecoder, simulator: Simulator, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path, lora: int = 0) -> dict[str, float]:
-    """Train `decoder` in place; the simulator only looks on. With `lora` only adapters of that rank learn, of a StateExpert."""
+    """Train `decoder` in place; the simulator only looks on. With `lora` only adapters of that rank learn, of a StateExpert.
+
+    A step of the U-Net's head takes a thousandth of the time that the U-Net takes to look at its clips, and arms are
+    followed to a hundredth of a radian only after thousands; so what a steady decoder reads is looked at once.
+    """
     shape = simulator.shape
+    spec = ClipSpec(shape.memory, shape.chunk)
     simulator.eval().requires_grad_(False)
 
+    def seen(clip: TensorDict, generator: torch.Generator) -> TensorDict:
+        features = decoder.look(simulator, simulator.asked(clip, 0, generator=generator))
+        return TensorDict({"features": features, "future": clip["future"].select("commands", "states", "valid"), "history": clip["history"]}, clip.shape)
+
+    if decoder.steady:
+        device, drawn = next(simulator.parameters()).device, step_generator(options.seed, options.steps)
+        with mixed_precision(device, options.bf16):
+            glimpses = [seen(store.sample(episodes, 50, spec, drawn).to(device), drawn).cpu() for _ in tqdm(range(_GLIMPSES // 50), desc="state: looking", unit="batch", dynamic_ncols=True, leave=False)]
+        known = torch.cat(glimpses)
+
     def batch(step: int, generator: torch.Generator) -> TensorDict:
-        return store.sample(episodes, options.part, ClipSpec(shape.memory, shape.chunk), generator)
+        if decoder.steady:
+            return known[torch.randint(len(known), (options.part,), generator=generator)]
+        return store.sample(episodes, options.part, spec, generator)
 
     def loss(clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
-        features = decoder.look(simulator, simulator.asked(clip, 0, generator=generator))
-        future, history = clip["future"], clip["history"]
-        value = decoder.loss(features, future["commands"], history["commands"], history["states"], future["states"], future["valid"].float(), generator)
+        shown = clip if decoder.steady else seen(clip, generator)
+        future, history = shown["future"], shown["history"]
+        value = decoder.loss(shown["features"], future["commands"], history["commands"], history["states"], future["states"], future["valid"].float(), generator)
         return value, {}
 
     if lora and not isinstance(decoder, StateExpert):
