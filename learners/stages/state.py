@@ -18,7 +18,8 @@ from envs.simulators.state_flow import StateExpert
 from learners.fit import FitConfig, fit, step_generator
 from learners.lora import low_rank
 
-_GLIMPSES = 6000  # clips that a simulator is shown for a decoder that need look only once
+# Clips that a simulator is shown, so many at once, for a decoder that need look only once; a short training needs fewer.
+_GLIMPSES, _AT_ONCE, _PER_STEP = 6000, 50, 6
 
 
 def train_state(decoder: StateDecoder, simulator: Simulator, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path, lora: int = 0) -> dict[str, float]:
@@ -38,7 +39,9 @@ def train_state(decoder: StateDecoder, simulator: Simulator, store: ClipStore, e
     if decoder.steady:
         device, drawn = next(simulator.parameters()).device, step_generator(options.seed, options.steps)
         with mixed_precision(device, options.bf16):
-            glimpses = [seen(store.sample(episodes, 50, spec, drawn).to(device), drawn).cpu() for _ in tqdm(range(_GLIMPSES // 50), desc="state: looking", unit="batch", dynamic_ncols=True, leave=False)]
+            count = -(-min(_GLIMPSES, _PER_STEP * options.steps) // _AT_ONCE)
+            looks = tqdm(range(count), desc="state: looking", unit="batch", dynamic_ncols=True, leave=False)
+            glimpses = [seen(store.sample(episodes, _AT_ONCE, spec, drawn).to(device), drawn).cpu() for _ in looks]
         known = torch.cat(glimpses)
 
     def batch(step: int, generator: torch.Generator) -> TensorDict:
