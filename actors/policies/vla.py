@@ -42,10 +42,10 @@ class Perception(nn.Module):
         seen, _ = self.look(image.reshape(-1, *image.shape[-4:]), tokens.reshape(-1, tokens.shape[-1]))
         return seen.reshape(*lead, -1)
 
-    def look(self, image: Tensor, tokens: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+    def look(self, image: Tensor, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """The same of one leading dimension, and where objects are seen in the first view, [B, 2, aims, 2]; see Gaze."""
         pictures = to_signed(image)
-        first, aimed = self.main(pictures[:, 0], generator)
+        first, aimed = self.main(pictures[:, 0])
         return torch.cat([first, *(side(pictures[:, k + 1]) for k, side in enumerate(self.sides)), self.words(tokens)], -1), aimed
 
 
