@@ -44,13 +44,13 @@ def clone(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], policy: s
     store = open_store(cfg, found, data)
     prepare_process(cfg["seed"])
     actor = build_policy(cfg, found[policy] / "weights.safetensors")
-    episodes = worked(cfg, store, number)
+    episodes, (train, _) = worked(cfg, store, number), split(store)
     section = dict(cfg["clone"])
     own = store.select(["policy-*"])
-    own = own[torch.isin(own, split(store)[0])].flip(0)[: section.pop("imagined")]  # the newest first
+    own = own[torch.isin(own, train)].flip(0)[: section.pop("imagined")]  # the newest first
     simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
     made = generated_frames(simulator, store, own, cfg["simulator"]["bf16"])
-    stats = train_imitation(actor, store, episodes, fit_options(cfg, section, "clone"), folder, fresh=False, generated=made, watched=split(store)[0])
+    stats = train_imitation(actor, store, episodes, fit_options(cfg, section, "clone"), folder, fresh=False, generated=made, watched=train)
     save_weights(actor, folder)
     return {**stats, "episodes": len(episodes), "generated_frames": len(made)}
 
