@@ -25,8 +25,8 @@ _GLIMPSES, _AT_ONCE, _PER_STEP = 6000, 50, 6
 def train_state(decoder: StateDecoder, simulator: Simulator, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path, lora: int = 0) -> dict[str, float]:
     """Train `decoder` in place; the simulator only looks on. With `lora` only adapters of that rank learn, of a StateExpert.
 
-    A step of the U-Net's head takes a thousandth of the time that the U-Net takes to look at its clips, and arms are
-    followed to a hundredth of a radian only after thousands; so what a steady decoder reads is looked at once.
+    The U-Net's head follows arms to a hundredth of a radian only after thousands of steps, in which the U-Net would look
+    at each clip many times over; so what a steady decoder reads is looked at once.
     """
     shape = simulator.shape
     spec = ClipSpec(shape.memory, shape.chunk)
