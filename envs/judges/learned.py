@@ -2,7 +2,8 @@
 
 The first frame says where things were before an arm stood in front of them or a block lay upon the target. Whether
 it is done is a matter of millimetres between things, so some of the judge's key-points are taught to lie on them, as
-far as the data say where they are; it looks closely there, and is told how far they lie apart.
+far as the data say where they are; it looks closely there, and how far they lie apart on the ground is all that one
+of its two opinions rests on. The other takes in all that is seen.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+from tensordict import TensorDict
 from torch import Tensor, nn
 
 from envs.encoders import Gaze, PatchEncoder, WordEncoder, to_signed
@@ -35,23 +37,29 @@ class LearnedJudge(Judge):
         self.main = Gaze(points, width, aims, pictures=2)
         self.sides = nn.ModuleList(PatchEncoder(16, 8) for _ in range(views - 1))
         self.words = WordEncoder(16)
+        self.apart = nn.Sequential(nn.Linear(self.main.gaps + 16, 64), nn.SiLU(), nn.Linear(64, 64), nn.SiLU(), nn.Linear(64, 1))
+        self.look = nn.Sequential(nn.Linear(self.main.out_features + 16 * views, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU(), nn.Linear(128, 1))
         self.sharpness = nn.Parameter(torch.tensor([2.0]))  # FSDP2 takes no scalars
-        self.head = nn.Sequential(nn.Linear(self.main.out_features + 16 * views, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU(), nn.Linear(128, 2))
+        self.enough = nn.Linear(16, 1)
 
     def forward(self, frames: Tensor, first: Tensor, tokens: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Logits of success and of progress, float32 [N], and where it sees the objects, at a first look and closely, [N, 2, aims, 2] in half-pictures from the middle.
 
         Args:
             frames, first: uint8 or float (-1..1) [N, V, 3, H, W]; tokens: int64 [N, WORDS].
-            generator: see CloseUp.
+            generator: draws what is left out in training; see also CloseUp.
         """
         pictures = to_signed(frames)
         pair = torch.cat((pictures[:, 0], to_signed(first[:, 0])), 1)
         seen, aimed = self.main(pair, generator)
         parts = [seen, *(side(pictures[:, k + 1]) for k, side in enumerate(self.sides))]
-        out = self.head(torch.cat([*parts, self.words(tokens)], -1)).float()
-        # Success is for the most part progress beyond some point, and progress is taught by every frame.
-        return out[:, 0] + self.sharpness * out[:, 1], out[:, 1], aimed
+        words = self.words(tokens)
+        look = self.look(torch.cat([*parts, words], -1)).float()
+        if generator is not None:  # what is seen can be learned by heart: half of the time the gaps must do without it
+            look = look * (torch.rand((len(look), 1), generator=generator) < 0.5).to(look.device)
+        progress = (self.apart(torch.cat((seen[:, seen.shape[1] - self.main.gaps :], words), -1)).float() + look)[:, 0]
+        # Success is progress beyond what the words call enough: progress is taught by every frame, and by centimetres.
+        return self.sharpness * progress + self.enough(words)[:, 0].float(), progress, aimed
 
     @torch.no_grad()
     def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
@@ -65,21 +73,25 @@ class LearnedJudge(Judge):
             status = torch.where(near, Status.ABSTAIN.value, status)
         return Verdict(success, progress.sigmoid().unflatten(0, (batch, count)), status)
 
-    def loss(self, frames: Tensor, first: Tensor, tokens: Tensor, label: Tensor, progress: Tensor, where: Tensor, share: float, generator: torch.Generator | None = None) -> tuple[Tensor, dict[str, Any]]:
+    def loss(self, data: TensorDict, share: float, generator: torch.Generator | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Class-balanced cross-entropy of success plus the absolute errors of progress and of where things are seen.
 
         Args:
-            label: float [N] in {0, 1}; progress: float [N] in 0..1.
-            where: float [N, aims, 2], half-pictures from the middle of the first view, NaN where nobody knows.
+            data: TensorDict [N] with frames, first and tokens as in `forward`, label float in {0, 1} and progress float in 0..1, both NaN
+                where nobody knows, where float [aims, 2], half-pictures from the middle of the first view, NaN where nobody knows, and
+                drill, pictures [2, 3, H, W] of the first view now and at first, with drilled [aims, 2], where things are in them.
             share: fraction of positive frames in the data, by which the classes are balanced.
-            generator: see CloseUp.
+            generator: see `forward`.
         """
-        logit, towards, aimed = self(frames, first, tokens, generator)
-        weight = torch.where(label > 0.5, 0.5 / max(share, 1e-3), 0.5 / max(1 - share, 1e-3))
-        success = (F.binary_cross_entropy_with_logits(logit, label, reduction="none") * weight).mean()
+        logit, towards, aimed = self(data["frames"], data["first"], data["tokens"], generator)
+        known = torch.isfinite(data["label"])
+        count, label = known.sum().clamp(min=1), torch.nan_to_num(data["label"])
+        weight = torch.where(label > 0.5, 0.5 / max(share, 1e-3), 0.5 / max(1 - share, 1e-3)) * known
+        success = (F.binary_cross_entropy_with_logits(logit, label, reduction="none") * weight).sum() / count
         # Cross-entropy hardly minds a few hundredths of progress, which are the centimetre that decides.
-        shaped = (towards.sigmoid() - progress).abs().mean()
-        right = ((logit > 0) == (label > 0.5)).float().mean()
-        off = Gaze.missed(aimed, where)
+        shaped = ((towards.sigmoid() - torch.nan_to_num(data["progress"])).abs() * known).sum() / count
+        right = (((logit > 0) == (label > 0.5)) & known).sum() / count
+        off = Gaze.missed(aimed, data["where"])
+        more = self.main.drill(data["drill"].flatten(1, 2), data["drilled"], generator)
         figures = {"success": success.detach(), "frame_accuracy": right, "progress_error": shaped.detach(), "aim_error": off[1].detach()}
-        return success + 10.0 * shaped + 48.0 * off.sum(), figures
+        return success + 10.0 * shaped + 48.0 * (off.sum() + more), figures

@@ -17,6 +17,7 @@ from envs.simulators.sight import mean_gap, turn
 _REACH = 0.13  # m between fingertip and thing beyond which nothing happens
 _EDGE = 0.02  # m over which a push fades out there
 _PAST = 3  # commands before the one to come that a push depends on: arms lag behind
+_WILD = 2.0  # log of how many centimetres (tenths of a radian) a frame is at most in doubt by; exp() of more would overflow
 _LEVER = 0.03  # m, what a wrong heading counts beside a wrong place: a radian is as bad as this far off
 
 
@@ -104,7 +105,7 @@ class Contact(nn.Module):
             open_ = gate[row, number, hand][:, None]
             place = _rotated(torch.stack((out[:, 0], mirror * out[:, 1]), -1), front)
             moves = moves.index_put((row, number, hand), open_ * torch.cat((0.05 * place, 0.3 * mirror[:, None] * out[:, 2:3]), -1))
-            doubts = doubts.index_put((row, number, hand), open_ * torch.tensor([0.01, 0.1], device=gate.device) * (out[:, 3:] - 2).exp().clamp(max=8.0))
+            doubts = doubts.index_put((row, number, hand), open_ * torch.tensor([0.01, 0.1], device=gate.device) * (out[:, 3:] - 2).clamp(max=_WILD).exp())
         return moves.sum(2), doubts.sum(2)
 
     def loss(self, objects: Tensor, motion: TensorDict) -> tuple[Tensor, dict[str, Tensor]]:

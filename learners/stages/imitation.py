@@ -15,7 +15,7 @@ from envs.episodes.clips import ClipStore
 from envs.schema import IMAGE, STATE, TOKENS, to_relative
 from learners.fit import FitConfig, fit
 from learners.remembered import looked_at
-from learners.stages.pictures import augment, sights
+from learners.stages.pictures import augment, sights, survey
 
 # Spread below which a command dimension is a constant: a millimetre, a hundredth of a radian, a twentieth of a grip.
 ACTIVE_FLOOR = (1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2, 5e-2)
@@ -100,6 +100,8 @@ def train_imitation(
     """Clone the given episodes; a `fresh` policy gets its units from them first, one that can act already keeps its own. The rest: see Cloning."""
     cloning = Cloning(policy, store, episodes, generated, watched)
     if fresh:
+        if cloning.watched is not None:
+            survey(policy.perception.main, store, cloning.watched)
         policy.normalise(cloning.targets, store.arrays["states"][cloning.rows], torch.tensor(ACTIVE_FLOOR * 2))
     for parameter in policy.head.exploration():
         parameter.requires_grad_(False)

@@ -1,4 +1,4 @@
-"""Stage: teach the judge on real frames, and on generated ones labelled by physics under the same actions."""
+"""Stage: teach the judge on real frames, and how things look on generated ones."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -14,7 +15,7 @@ from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge, frame_labels
 from envs.judges.learned import LearnedJudge
 from learners.fit import FitConfig, fit
-from learners.stages.pictures import augment, sights
+from learners.stages.pictures import augment, sights, survey
 
 
 def episode_labels(store: ClipStore, hold: int) -> Tensor:
@@ -36,7 +37,8 @@ def train_judge(
     """Train `judge` in place.
 
     Args:
-        imagined: frames of generated.py, labelled by physics under the same actions; half of each batch.
+        imagined: frames of generated.py; half of each batch. Where the simulator knows its objects they teach how these look
+            when drawn; where it does not, they are labelled by physics under the same actions.
     """
     if imagined is not None and not len(imagined):
         imagined = None  # a simulator so bad that every frame went astray
@@ -45,8 +47,12 @@ def train_judge(
     begin = torch.repeat_interleave(store.start, store.length)
     owner = torch.repeat_interleave(torch.arange(len(store)), store.length)
     seen = sights(store, store.arrays["objects"], torch.arange(len(labels)), judge.aims)
+    survey(judge.main, store, rows)
     if imagined is not None:
-        imagined = imagined.clone(recurse=False).set("where", sights(store, imagined["places"], imagined["row"], judge.aims)).exclude("places")
+        drawn = torch.isfinite(imagined["places"][..., :2]).all(-1).any(-1)
+        # Half a centimetre off its true place a thing is drawn as surely as elsewhere, and decides otherwise.
+        known = {"label": labels[imagined["row"]].where(~drawn, torch.nan), "progress": imagined["progress"].where(~drawn, torch.nan)}
+        imagined = imagined.clone(recurse=False).update({**known, "where": sights(store, imagined["places"], imagined["row"], judge.aims)}).exclude("places", "row")
     share = float(labels[rows].mean().clamp(0.02, 0.98))
     positive, negative = rows[labels[rows] > 0.5], rows[labels[rows] <= 0.5]
 
@@ -61,31 +67,49 @@ def train_judge(
         known = {"tokens": store.tokens[owner[chosen]], "label": labels[chosen], "progress": store.arrays["progress"][chosen].float(), "where": seen[chosen]}
         out = TensorDict({"frames": store.frames(chosen), "begin": begin[chosen], **known}, [len(chosen)])
         if imagined is not None:
-            made = imagined[torch.randint(len(imagined), (options.part - real,), generator=generator)]
-            made["label"] = labels[made["row"]]
-            out = torch.cat([out, made.exclude("row")])
+            out = torch.cat([out, imagined[torch.randint(len(imagined), (options.part - real,), generator=generator)]])
         out["first"] = store.frames(out["begin"])[:, :1]
+        drill = rows[torch.randint(len(rows), (len(out),), generator=generator)]
+        out["drill"] = torch.stack((store.frames(drill)[:, 0], store.frames(begin[drill])[:, 0]), 1)
+        out["drilled"] = seen[drill]
         return out
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         views = data["frames"].shape[1]  # the same colours for both, as one camera would give them
-        pictures, first = augment(to_signed(torch.cat((data["frames"], data["first"]), 1)), generator).split((views, 1), 1)
-        return judge.loss(pictures, first, data["tokens"], data["label"], data["progress"], data["where"], max(share, 0.3), generator)
+        pictures, first, drill = augment(to_signed(torch.cat((data["frames"], data["first"], data["drill"]), 1)), generator).split((views, 1, 2), 1)
+        return judge.loss(data.clone(recurse=False).update({"frames": pictures, "first": first, "drill": drill}), max(share, 0.3), generator)
 
     return fit("judge", judge, batch, loss, options, folder, watch="frame_accuracy")
 
 
-def calibrate(judge: Judge, success: Tensor, rate: float) -> None:
-    """Set the judge's threshold so that as many episodes pass as succeeded.
+def calibrate(judge: Judge, success: Tensor, truth: Tensor) -> None:
+    """Set the judge's threshold where an episode is as likely to have failed as to have succeeded (Platt 1999).
 
     On real video, that is: on generated video the threshold would also make up for what the simulator gets wrong, and
     a judge made lenient for a pessimistic simulator is what a policy learns to exploit. And on video that it has not
-    learned from, of which it is too sure. Matching a rate uses all those episodes, where a threshold of best accuracy
-    jumps with a few of them.
+    learned from, of which it is too sure. A line through all those episodes moves less with any of them than a
+    threshold of best accuracy does. Where all of them ended alike, or where the judge knows nothing, it stays as it is.
 
     Args:
-        success: frame probabilities [N, T] of real episodes that it did not learn from, 0 where they are over; rate: their share of successes.
+        success: frame probabilities [N, T] of real episodes that it did not learn from, 0 where they are over; truth: bool [N].
     """
+    won, lost = int(truth.sum()), int((~truth).sum())
+    if not won or not lost:
+        return
     # An episode succeeds if its best run of `hold` frames lies above the threshold throughout.
-    best = success.unfold(1, judge.hold, 1).amin(-1).amax(1)
-    judge.threshold.fill_(float(best.quantile(1 - rate).clamp(0.02, 0.98)))
+    best = success.unfold(1, judge.hold, 1).amin(-1).amax(1).double().clamp(1e-6, 1 - 1e-6).logit()
+    goal = torch.where(truth, (won + 1) / (won + 2), 1 / (lost + 2)).double()  # Platt's, that keep a line through separable data from growing steep without end
+    middle, spread = best.mean(), best.std().clamp(min=1e-6)
+    line = torch.zeros(2, dtype=torch.float64, requires_grad=True)
+    solver = torch.optim.LBFGS([line], max_iter=100, line_search_fn="strong_wolfe")
+
+    def closure() -> Tensor:
+        solver.zero_grad()
+        error = F.binary_cross_entropy_with_logits(line[0] * (best - middle) / spread + line[1], goal)
+        error.backward()
+        return error
+
+    solver.step(closure)
+    slope, offset = line.detach()
+    if slope > 0:
+        judge.threshold.fill_(float((middle - spread * offset / slope).sigmoid().clamp(0.02, 0.98)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from envs.encoders import Gaze
 from envs.episodes.clips import ClipStore
 from envs.geometry import project
 
@@ -22,3 +23,10 @@ def sights(store: ClipStore, objects: Tensor, rows: Tensor, count: int) -> Tenso
     pixels, depth = project(known[..., :3], store.intrinsic[owner, 0], store.arrays["c2w"][rows, 0])
     where = pixels / (torch.tensor(store.size[::-1]) / 2) - 1
     return torch.where(((depth > 0.02) & (where.abs() < 1).all(-1))[..., None], where, torch.nan)
+
+
+def survey(gaze: Gaze, store: ClipStore, rows: Tensor) -> None:
+    """Teach `gaze` the ground of its objects by where they are and are seen in frames `rows` [N]."""
+    objects = store.arrays["objects"][rows]
+    known = torch.nn.functional.pad(objects[:, : gaze.aims, :2], (0, 0, 0, max(0, gaze.aims - objects.shape[1])), value=torch.nan)
+    gaze.survey(sights(store, objects, rows, gaze.aims), known)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -110,14 +111,12 @@ def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
     simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
     judge = build_judge(cfg, found[warm] / "weights.safetensors" if warm else None)
     pick = train[torch.randperm(len(train), generator=torch.Generator().manual_seed(cfg["seed"]))[: section["imagined"]]]
-    # Half a centimetre is what the judge is to tell apart; labels further off would blur that.
-    imagined = generated_frames(simulator, store, pick, cfg["simulator"]["bf16"], within=0.005) if len(pick) else None
+    imagined = generated_frames(simulator, store, pick, cfg["simulator"]["bf16"], within=math.inf) if len(pick) else None
     stats = train_judge(judge, store, train, fit_options(cfg, fit_section, f"judge_fit.{steps}.fit"), folder, imagined)
     if len(unseen):
         rows, valid = store.whole(unseen)
         success = measurement.judge_frames(judge, store.frames(rows), store, unseen)
-        rate = torch.tensor([store.episodes[n]["success"] for n in unseen.tolist()]).float().mean()
-        calibrate(judge, torch.where(valid, success, 0.0), float(rate))
+        calibrate(judge, torch.where(valid, success, 0.0), torch.tensor([store.episodes[n]["success"] for n in unseen.tolist()]))
     save_weights(judge, folder)
     return {**stats, "threshold": float(judge.threshold), "generated_frames": len(imagined) if imagined is not None else 0}
 
