@@ -126,12 +126,15 @@ class Gaze(nn.Module):
         points, grid = self.encoder(pictures)
         aimed = points[:, : self.aims]
         close = aimed if self.closer is None else self.closer(pictures, aimed, generator)[0]
-        one, other = torch.triu_indices(self.aims, self.aims, 1, device=points.device)
-        ground = torch.einsum("sij,bsj->bsi", self.plane, F.pad(close, (0, 1), value=1.0))
+        return torch.cat((points.flatten(1), grid, self.GAIN * close.flatten(1), self.gaps_between(close)), -1), torch.stack((aimed, close), 1)
+
+    def gaps_between(self, where: Tensor) -> Tensor:
+        """How far things seen at `where` [B, aims, 2] lie apart on the ground, pair by pair: x, y and length, GAIN times SPANs, [B, gaps]."""
+        ground = torch.einsum("sij,bsj->bsi", self.plane, F.pad(where, (0, 1), value=1.0))
         ground = ground[..., :2] / ground[..., 2:].clamp(min=0.1)
+        one, other = torch.triu_indices(self.aims, self.aims, 1, device=where.device)
         apart = ground[:, one] - ground[:, other]
-        apart = torch.cat((apart, apart.norm(dim=-1, keepdim=True)), -1)
-        return torch.cat((points.flatten(1), grid, self.GAIN * close.flatten(1), self.GAIN * apart.flatten(1)), -1), torch.stack((aimed, close), 1)
+        return self.GAIN * torch.cat((apart, apart.norm(dim=-1, keepdim=True)), -1).flatten(1)
 
     @torch.no_grad()
     def survey(self, where: Tensor, places: Tensor) -> None:

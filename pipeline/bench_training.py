@@ -102,7 +102,7 @@ def _normalise_latents(world: GESimulator, store: ClipStore) -> None:
 @torch.no_grad()
 def _state_error(world: GESimulator, expert: Any, store: ClipStore, begin: Tensor) -> float:
     clip = store.clips(torch.zeros_like(begin), begin, ClipSpec(world.shape.memory, world.shape.chunk))
-    features = expert.look(world, world.asked(clip, 0, generator=torch.Generator().manual_seed(1)))
+    features = expert.read(expert.look(world, world.asked(clip, 0, generator=torch.Generator().manual_seed(1))))
     history, zero = clip["history"], torch.zeros_like(begin)
     made = expert.eval().decode(features, clip["future", "commands"], history["commands"], history["states"], zero, zero)
     return float(((made - clip["future", "states"]) / expert.state_std).square().mean().sqrt())

@@ -17,11 +17,9 @@ class StateDecoder(nn.Module):
 
     Attributes:
         normalised: whether its units came with its weights, so that data need not set them.
-        steady: whether `look` says the same whatever the decoder has learned, so that it need look only once.
     """
 
     normalised = False
-    steady = False
 
     def __init__(self, memory: int):
         super().__init__()
@@ -31,10 +29,14 @@ class StateDecoder(nn.Module):
         """Set units from joint states [N, 16]."""
         raise NotImplementedError
 
+    @torch.no_grad()
     def look(self, simulator: Simulator, inputs: TensorDict) -> Tensor:
-        """Features [B, *feature_shape] of training inputs (Simulator.asked); the simulator is frozen, what the decoder owns is not."""
-        with torch.no_grad():
-            return simulator.features(inputs).float()
+        """What the frozen simulator makes of training inputs (Simulator.asked), [B, ...]: the same whatever the decoder has learned."""
+        return simulator.features(inputs).float()
+
+    def read(self, shown: Tensor) -> Tensor:
+        """Features [B, *feature_shape] from what `look` showed; here what the decoder owns does learn."""
+        return shown
 
     def attach(self, simulator: Simulator) -> None:
         """Tell the simulator what its features should be, if that is the decoder's to say."""

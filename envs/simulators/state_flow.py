@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -60,6 +61,8 @@ class StateExpert(StateDecoder):
         sampler, time_scale: as of the simulator.
         every: of the history of `memory` frames only every so many-th, counted from the end, is read; chunks that
             never were are filled with the first command to come (how the released code keeps its history).
+        tokens: of the trunk's, per view, that are read, the last ones; None reads all, as released.
+        direct: whether the network says the states themselves instead of their velocity, as released; see `_says` of LatentWorld.
     """
 
     state_mean: Tensor
@@ -67,8 +70,9 @@ class StateExpert(StateDecoder):
     action_mean: Tensor
     action_std: Tensor
 
-    def __init__(self, net: MultiViewDiT, views: int, chunk: int, memory: int, layout: CommandLayout, sampler: Sampler | None = None, time_scale: float = 1000.0, every: int = 1):
+    def __init__(self, net: MultiViewDiT, views: int, chunk: int, memory: int, layout: CommandLayout, sampler: Sampler | None = None, time_scale: float = 1000.0, every: int = 1, tokens: int | None = None, direct: bool = False):
         super().__init__(memory * every)
+        self.tokens, self.direct = slice(None if tokens is None else -tokens, None), direct
         self.net, self.views, self.chunk, self.layout, self.every = net, views, chunk, layout, every
         self.sampler: Sampler = sampler or Euler()
         self.time_scale = time_scale
@@ -82,12 +86,15 @@ class StateExpert(StateDecoder):
             getattr(self, f"{name}_mean").copy_(values.mean(0))
             getattr(self, f"{name}_std").copy_(values.std(0).clamp(min=0.02))
 
+    @torch.no_grad()
     def look(self, simulator: Simulator, inputs: TensorDict) -> Tensor:
-        """See StateDecoder; the mix of the trunk's blocks is the expert's own and is learned."""
+        """See StateDecoder; what every block of the trunk says, [B, layers, V, tokens, width], as far as it is read."""
         assert isinstance(simulator, LatentWorld)
-        with torch.no_grad():
-            layers = simulator.layers(inputs)
-        return self.net.fuse([layer.float() for layer in layers]).unflatten(0, (-1, self.views))
+        return torch.stack([layer[:, self.tokens].unflatten(0, (-1, self.views)) for layer in simulator.layers(inputs)], 1)
+
+    def read(self, shown: Tensor) -> Tensor:
+        """See StateDecoder; the mix of the trunk's blocks is the expert's own and is learned."""
+        return self.net.fuse([layer.float() for layer in shown.unbind(1)])
 
     @torch.no_grad()
     def attach(self, simulator: Simulator) -> None:
@@ -104,9 +111,10 @@ class StateExpert(StateDecoder):
             return torch.cat([moves, past], 1), torch.zeros_like(past[:, -1:])
         now = past_commands[:, -1]
         moves = torch.cat([to_relative(past_commands, now), to_relative(commands, now)], 1) * 10.0
-        return torch.cat([torch.nn.functional.pad(moves, (0, TOKEN - moves.shape[-1])), past], 1), past[:, -1:]
+        return torch.cat([F.pad(moves, (0, TOKEN - moves.shape[-1])), past], 1), past[:, -1:]
 
-    def _velocity(self, z: Tensor, level: Tensor, tokens: Tensor, features: Tensor | list[tuple[Tensor, Tensor]]) -> Tensor:
+    def _says(self, z: Tensor, level: Tensor, tokens: Tensor, features: Tensor | list[tuple[Tensor, Tensor]]) -> Tensor:
+        """What the network says of noisy future states [B, K, 16] at noise level [B]: their velocity, or where they flow from."""
         levels = torch.zeros(len(z), tokens.shape[1] + self.chunk, device=z.device)
         levels[:, tokens.shape[1] :] = self.time_scale * level[:, None]
         return self.net.decode_states(torch.cat([tokens, z], 1), levels, features, self.views)[:, -self.chunk :].float()
@@ -129,8 +137,13 @@ class StateExpert(StateDecoder):
             generator = torch.Generator().manual_seed((int(s) * 999_983 + int(c)) & 0x7FFF_FFFF_FFFF)
             rows.append(torch.randn(self.chunk, STATE_DIM, generator=generator))
         noise = torch.stack(rows).to(features.device)
-        known = self.net.feature_keys(features.flatten(0, 1), self.views)
-        z = self.sampler(lambda z, level: self._velocity(z, torch.full((len(z),), level, device=z.device), tokens, known), noise)
+        known = self.net.feature_keys(features[:, :, self.tokens].flatten(0, 1), self.views)
+
+        def velocity(z: Tensor, level: float) -> Tensor:
+            said = self._says(z, torch.full((len(z),), level, device=z.device), tokens, known)
+            return (z - said) / level if self.direct else said
+
+        z = self.sampler(velocity, noise)
         return (origin + z) * self.state_std + self.state_mean
 
     def loss(self, features: Tensor, commands: Tensor, past_commands: Tensor, past_states: Tensor, truth: Tensor, valid: Tensor, generator: torch.Generator) -> Tensor:
@@ -141,15 +154,19 @@ class StateExpert(StateDecoder):
         noise = torch.randn(target.shape, generator=generator).to(target.device)
         level = torch.rand(len(target), generator=generator).to(target.device)
         mixed = level[:, None, None]
-        velocity = self._velocity((1 - mixed) * target + mixed * noise, level, tokens, features.flatten(0, 1))
-        error = (velocity - (noise - target)).square() * valid[..., None]
+        said = self._says((1 - mixed) * target + mixed * noise, level, tokens, features.flatten(0, 1))
+        if self.direct:  # a few that are far off should not hide that most could be nearer
+            error = F.smooth_l1_loss(said, target, beta=0.05, reduction="none") * valid[..., None]
+        else:
+            error = (said - (noise - target)).square() * valid[..., None]
         return error.sum() / (valid.sum() * STATE_DIM).clamp(min=1)
 
 
 def untrained_expert(simulator: LatentWorld, config: StateExpertConfig) -> StateExpert:
-    """A state expert for the features of a simulator."""
+    """A state expert for the features of a simulator, of which it reads those of the chunk itself."""
     shape = simulator.shape
-    return StateExpert(MultiViewDiT(config.shape(simulator.net.shape), trunk=False), shape.views, shape.chunk, shape.memory, shape.layout, Euler(config.steps))
+    tokens = simulator.feature_shape[1] * simulator.ahead // (shape.memory + simulator.ahead)
+    return StateExpert(MultiViewDiT(config.shape(simulator.net.shape), trunk=False), shape.views, shape.chunk, shape.memory, shape.layout, Euler(config.steps), tokens=tokens, direct=True)
 
 
 def disturb_history(past: Tensor, generator: torch.Generator) -> Tensor:
@@ -160,7 +177,7 @@ def disturb_history(past: Tensor, generator: torch.Generator) -> Tensor:
     moved = past.gather(1, at[..., None].expand(-1, -1, width))
     if count < 3:
         return moved
-    coarse = torch.nn.functional.interpolate(moved.transpose(1, 2), size=count - 1, mode="linear", align_corners=True)
-    smooth = torch.nn.functional.interpolate(coarse, size=count, mode="linear", align_corners=True).transpose(1, 2)
+    coarse = F.interpolate(moved.transpose(1, 2), size=count - 1, mode="linear", align_corners=True)
+    smooth = F.interpolate(coarse, size=count, mode="linear", align_corners=True).transpose(1, 2)
     chosen = (torch.rand(batch, generator=generator) < 0.5).to(past.device)
     return torch.where(chosen[:, None, None], smooth, moved)

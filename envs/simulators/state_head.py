@@ -18,7 +18,6 @@ class StateHead(StateDecoder):
         chunk: frames per chunk, K; memory: frames of history, M.
     """
 
-    steady = True
     state_mean: Tensor
     state_std: Tensor
 

@@ -18,41 +18,46 @@ from envs.simulators.state_flow import StateExpert
 from learners.fit import FitConfig, fit, step_generator
 from learners.lora import low_rank
 
-# Clips that a simulator is shown, so many at once, for a decoder that need look only once; a short training needs fewer.
-_GLIMPSES, _AT_ONCE, _PER_STEP = 6000, 50, 6
+# Clips that a simulator is shown, so many at once, each to be learned from so many times; what it says of them must fit into so many bytes.
+_GLIMPSES, _AT_ONCE, _VISITS, _KEPT = 6000, 50, 16, 2 * 2**30
 
 
 def train_state(decoder: StateDecoder, simulator: Simulator, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path, lora: int = 0) -> dict[str, float]:
     """Train `decoder` in place; the simulator only looks on. With `lora` only adapters of that rank learn, of a StateExpert.
 
-    The U-Net's head follows arms to a hundredth of a radian only after thousands of steps, in which the U-Net would look
-    at each clip many times over; so what a steady decoder reads is looked at once.
+    Arms are followed to a hundredth of a radian only after thousands of steps, in which a simulator would look at each
+    clip many times over. So it looks once, and what it says is kept; one that says too much to be kept (of gigabytes a
+    clip) looks anew at every step.
     """
     shape = simulator.shape
     spec = ClipSpec(shape.memory, shape.chunk)
+    device, drawn = next(simulator.parameters()).device, step_generator(options.seed, options.steps)
     simulator.eval().requires_grad_(False)
 
     def seen(clip: TensorDict, generator: torch.Generator) -> TensorDict:
-        features = decoder.look(simulator, simulator.asked(clip, 0, generator=generator))
-        return TensorDict({"features": features, "future": clip["future"].select("commands", "states", "valid"), "history": clip["history"]}, clip.shape)
+        shown = decoder.look(simulator, simulator.asked(clip, 0, generator=generator))
+        return TensorDict({"shown": shown, "future": clip["future"].select("commands", "states", "valid"), "history": clip["history"]}, clip.shape)
 
-    if decoder.steady:
-        device, drawn = next(simulator.parameters()).device, step_generator(options.seed, options.steps)
+    def looked(count: int) -> TensorDict:
         with mixed_precision(device, options.bf16):
-            count = -(-min(_GLIMPSES, _PER_STEP * options.steps) // _AT_ONCE)
-            looks = tqdm(range(count), desc="state: looking", unit="batch", dynamic_ncols=True, leave=False)
-            glimpses = [seen(store.sample(episodes, _AT_ONCE, spec, drawn).to(device), drawn).cpu() for _ in looks]
-        known = torch.cat(glimpses)
+            return seen(store.sample(episodes, count, spec, drawn).to(device), drawn).cpu()
+
+    known = looked(1)
+    count = min(_GLIMPSES, options.steps * options.batch // _VISITS, _KEPT // known["shown"].nbytes)
+    keep = count >= options.part
+    if keep:
+        known = torch.cat([looked(_AT_ONCE) for _ in tqdm(range(-(-count // _AT_ONCE)), desc="state: looking", unit="batch", dynamic_ncols=True, leave=False)])
 
     def batch(step: int, generator: torch.Generator) -> TensorDict:
-        if decoder.steady:
+        if keep:
             return known[torch.randint(len(known), (options.part,), generator=generator)]
         return store.sample(episodes, options.part, spec, generator)
 
     def loss(clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
-        shown = clip if decoder.steady else seen(clip, generator)
+        shown = clip if keep else seen(clip, generator)
         future, history = shown["future"], shown["history"]
-        value = decoder.loss(shown["features"], future["commands"], history["commands"], history["states"], future["states"], future["valid"].float(), generator)
+        features = decoder.read(shown["shown"])
+        value = decoder.loss(features, future["commands"], history["commands"], history["states"], future["states"], future["valid"].float(), generator)
         return value, {}
 
     if lora and not isinstance(decoder, StateExpert):

@@ -112,6 +112,16 @@ def test_contact_knows_no_direction_no_side_and_no_hand(store: ClipStore) -> Non
     assert torch.allclose(mirrored, way[0, -1, 0] * torch.tensor([1.0, -1.0, 1.0, -1.0]), atol=1e-5)
 
 
+def test_however_doubtful_a_push_it_can_be_learned_from(store: ClipStore) -> None:
+    contact = Contact((4, 0))
+    motion = store.motions(torch.arange(len(store)), 64, 4, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        contact.layers[-1].bias[3:] = 200.0  # e to its power is no number
+    value, _ = contact.loss(torch.cat((motion["now", "objects"][:, None], motion["future", "objects"]), 1), motion)
+    value.backward()
+    assert all(bool(torch.isfinite(p.grad).all()) for p in contact.parameters())
+
+
 def test_turn_is_within_half_a_side() -> None:
     angles = torch.tensor([[math.pi / 2 + 0.1, 3.0], [-0.2, -3.0]])
     assert torch.allclose(turn(angles, torch.tensor([4, 0])), torch.tensor([[0.1, 0.0], [-0.2, 0.0]]), atol=1e-6)

@@ -6,13 +6,15 @@ import json
 from pathlib import Path
 
 import torch
+from tensordict import TensorDict
 
+from envs.encoders import Gaze, to_signed
 from envs.episodes.clips import ClipStore
 from envs.judges import LearnedJudge
 from envs.simulators.in_view import in_view
 from learners.fit import FitConfig
 from learners.stages.judge import train_judge, unseen_by_judge
-from learners.stages.pictures import sights
+from learners.stages.pictures import sights, survey
 
 
 def test_sights_are_where_objects_are_drawn(store: ClipStore) -> None:
@@ -22,6 +24,21 @@ def test_sights_are_where_objects_are_drawn(store: ClipStore) -> None:
     seen = in_view(objects[:, None], store.intrinsic, store.arrays["c2w"][rows][:, None], store.size)
     assert torch.allclose(where, seen.where[:, 0, 0], atol=1e-5)
     assert bool(torch.isnan(sights(store, objects * torch.nan, rows, 3)).all())
+
+
+def test_a_surveyed_gaze_tells_gaps_in_metres(store: ClipStore) -> None:
+    gaze, rows = Gaze(4, 8, 2), torch.arange(len(store.arrays["success"]))
+    survey(gaze, store, rows)
+    objects = store.arrays["objects"][rows]
+    where = sights(store, objects, rows, 2)
+    known = torch.isfinite(where).flatten(1).all(1)
+    gaps = gaze.gaps_between(where[known]) / Gaze.GAIN * Gaze.SPAN
+    truth = objects[known, 0, :2] - objects[known, 1, :2]
+    assert known.sum() > 20 and float((gaps[:, :2] - truth).norm(dim=-1).median()) < 2e-3  # a few were toppled
+    assert torch.allclose(gaps[:, 2], gaps[:, :2].norm(dim=-1), atol=1e-6)
+    before = gaze.plane.clone()
+    gaze.survey(where * torch.nan, objects[:, :2, :2])  # of data that know nothing nothing is learned
+    assert torch.equal(gaze.plane, before)
 
 
 def test_judge_learns_to_aim(store: ClipStore, tmp_path: Path) -> None:
@@ -35,11 +52,26 @@ def test_judge_learns_to_aim(store: ClipStore, tmp_path: Path) -> None:
 def test_objects_nobody_placed_leave_the_aims_alone() -> None:
     judge = LearnedJudge(hold=2, width=8, points=4)
     frames = torch.randint(0, 256, (4, 3, 3, 64, 64), dtype=torch.uint8)
-    tokens, label = torch.zeros(4, 12, dtype=torch.int64), torch.tensor([0.0, 1.0, 0.0, 1.0])
-    value, figures = judge.loss(frames, frames, tokens, label, label, torch.full((4, 2, 2), torch.nan), 0.5)
+    value, figures = judge.loss(batch_of(frames, torch.tensor([0.0, 1.0, 0.0, 1.0])), 0.5)
     value.backward()
     assert float(figures["aim_error"]) == 0.0
     assert all(bool(torch.isfinite(p.grad).all()) for p in judge.parameters() if p.grad is not None)
+
+
+def test_what_nobody_labelled_teaches_no_verdict() -> None:
+    judge = LearnedJudge(hold=2, width=8, points=4)
+    frames = torch.randint(0, 256, (4, 3, 3, 64, 64), dtype=torch.uint8)
+    value, figures = judge.loss(batch_of(frames, torch.full((4,), torch.nan), where=torch.zeros(4, 2, 2)), 0.5)
+    value.backward()
+    assert float(figures["success"]) == 0.0 and float(figures["aim_error"]) > 0.0
+    assert not bool(judge.apart[-1].weight.grad.any())
+
+
+def batch_of(frames: torch.Tensor, label: torch.Tensor, where: torch.Tensor | None = None) -> TensorDict:
+    """A training batch of a judge with progress like success, in which nobody knows where things are unless told."""
+    unknown = torch.full((len(frames), 2, 2), torch.nan)
+    pictures = {"frames": to_signed(frames), "first": to_signed(frames), "drill": to_signed(frames[:, :2])}
+    return TensorDict({**pictures, "tokens": torch.zeros(len(frames), 12, dtype=torch.int64), "label": label, "progress": label, "where": unknown if where is None else where, "drilled": unknown}, [len(frames)])
 
 
 def test_a_judge_without_aims_judges() -> None:
