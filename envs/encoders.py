@@ -98,7 +98,7 @@ class Gaze(nn.Module):
         aims: key-points, the first ones, that are taught to lie on the objects of the data, in their order.
 
     Attributes:
-        out_features: numbers said of a picture; the last `gaps` are how far objects lie apart.
+        out_features: numbers said of a picture; the last `gaps` are how far the objects of each pair lie apart.
         plane: per aim, the homography [aims, 3, 3] from half-pictures to the ground it moves over, in SPANs; see `survey`.
     """
 
@@ -115,8 +115,8 @@ class Gaze(nn.Module):
         self.encoder = SpatialEncoder(points, width, pictures)
         self.closer = CloseUp(aims, pictures=pictures) if aims else None
         self.register_buffer("plane", torch.eye(3).repeat(aims, 1, 1))
-        self.gaps = 3 * (aims * (aims - 1) // 2)
-        self.out_features = 2 * points + 16 * width + 2 * aims + self.gaps
+        self.gaps = aims * (aims - 1) // 2
+        self.out_features = 2 * points + 16 * width + 2 * aims + 3 * self.gaps
 
     def forward(self, pictures: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         """What is said of pictures float [B, C, H, W] in -1..1, float32 [B, out_features], and where objects are seen, [B, 2, aims, 2].
@@ -129,12 +129,12 @@ class Gaze(nn.Module):
         return torch.cat((points.flatten(1), grid, self.GAIN * close.flatten(1), self.gaps_between(close)), -1), torch.stack((aimed, close), 1)
 
     def gaps_between(self, where: Tensor) -> Tensor:
-        """How far things seen at `where` [B, aims, 2] lie apart on the ground, pair by pair: x, y and length, GAIN times SPANs, [B, gaps]."""
+        """How far things seen at `where` [B, aims, 2] lie apart on the ground, GAIN times SPANs: x and y of every pair, then the lengths, [B, 3 * gaps]."""
         ground = torch.einsum("sij,bsj->bsi", self.plane, F.pad(where, (0, 1), value=1.0))
         ground = ground[..., :2] / ground[..., 2:].clamp(min=0.1)
         one, other = torch.triu_indices(self.aims, self.aims, 1, device=where.device)
         apart = ground[:, one] - ground[:, other]
-        return self.GAIN * torch.cat((apart, apart.norm(dim=-1, keepdim=True)), -1).flatten(1)
+        return self.GAIN * torch.cat((apart.flatten(1), apart.norm(dim=-1)), -1)
 
     @torch.no_grad()
     def survey(self, where: Tensor, places: Tensor) -> None:

@@ -155,11 +155,9 @@ class StateExpert(StateDecoder):
         level = torch.rand(len(target), generator=generator).to(target.device)
         mixed = level[:, None, None]
         said = self._says((1 - mixed) * target + mixed * noise, level, tokens, features.flatten(0, 1))
-        if self.direct:  # a few that are far off should not hide that most could be nearer
-            error = F.smooth_l1_loss(said, target, beta=0.05, reduction="none") * valid[..., None]
-        else:
-            error = (said - (noise - target)).square() * valid[..., None]
-        return error.sum() / (valid.sum() * STATE_DIM).clamp(min=1)
+        # Said directly, a few that are far off should not hide that most could be nearer.
+        error = F.smooth_l1_loss(said, target, beta=0.05, reduction="none") if self.direct else (said - (noise - target)).square()
+        return (error * valid[..., None]).sum() / (valid.sum() * STATE_DIM).clamp(min=1)
 
 
 def untrained_expert(simulator: LatentWorld, config: StateExpertConfig) -> StateExpert:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -82,34 +81,17 @@ def train_judge(
     return fit("judge", judge, batch, loss, options, folder, watch="frame_accuracy")
 
 
-def calibrate(judge: Judge, success: Tensor, truth: Tensor) -> None:
-    """Set the judge's threshold where an episode is as likely to have failed as to have succeeded (Platt 1999).
+def calibrate(judge: Judge, success: Tensor, rate: float) -> None:
+    """Set the judge's threshold so that as many episodes pass as succeeded.
 
     On real video, that is: on generated video the threshold would also make up for what the simulator gets wrong, and
     a judge made lenient for a pessimistic simulator is what a policy learns to exploit. And on video that it has not
-    learned from, of which it is too sure. A line through all those episodes moves less with any of them than a
-    threshold of best accuracy does. Where all of them ended alike, or where the judge knows nothing, it stays as it is.
+    learned from, of which it is too sure. Matching a rate uses all those episodes, where a threshold of best accuracy
+    jumps with a few of them.
 
     Args:
-        success: frame probabilities [N, T] of real episodes that it did not learn from, 0 where they are over; truth: bool [N].
+        success: frame probabilities [N, T] of real episodes that it did not learn from, 0 where they are over; rate: their share of successes.
     """
-    won, lost = int(truth.sum()), int((~truth).sum())
-    if not won or not lost:
-        return
     # An episode succeeds if its best run of `hold` frames lies above the threshold throughout.
-    best = success.unfold(1, judge.hold, 1).amin(-1).amax(1).double().clamp(1e-6, 1 - 1e-6).logit()
-    goal = torch.where(truth, (won + 1) / (won + 2), 1 / (lost + 2)).double()  # Platt's, that keep a line through separable data from growing steep without end
-    middle, spread = best.mean(), best.std().clamp(min=1e-6)
-    line = torch.zeros(2, dtype=torch.float64, requires_grad=True)
-    solver = torch.optim.LBFGS([line], max_iter=100, line_search_fn="strong_wolfe")
-
-    def closure() -> Tensor:
-        solver.zero_grad()
-        error = F.binary_cross_entropy_with_logits(line[0] * (best - middle) / spread + line[1], goal)
-        error.backward()
-        return error
-
-    solver.step(closure)
-    slope, offset = line.detach()
-    if slope > 0:
-        judge.threshold.fill_(float((middle - spread * offset / slope).sigmoid().clamp(0.02, 0.98)))
+    best = success.unfold(1, judge.hold, 1).amin(-1).amax(1)
+    judge.threshold.fill_(float(best.quantile(1 - rate).clamp(0.02, 0.98)))

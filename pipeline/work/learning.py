@@ -116,7 +116,8 @@ def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
     if len(unseen):
         rows, valid = store.whole(unseen)
         success = measurement.judge_frames(judge, store.frames(rows), store, unseen)
-        calibrate(judge, torch.where(valid, success, 0.0), torch.tensor([store.episodes[n]["success"] for n in unseen.tolist()]))
+        rate = torch.tensor([store.episodes[n]["success"] for n in unseen.tolist()]).float().mean()
+        calibrate(judge, torch.where(valid, success, 0.0), float(rate))
     save_weights(judge, folder)
     return {**stats, "threshold": float(judge.threshold), "generated_frames": len(imagined) if imagined is not None else 0}
 

@@ -196,20 +196,12 @@ def test_frozen_perception_is_neither_trained_nor_run_again() -> None:
     assert changed and not any(name.startswith("module.0.") for name in changed)
 
 
-def test_threshold_lies_where_failures_and_successes_are_as_likely() -> None:
-    judge, generator = LearnedJudge(hold=2), torch.Generator().manual_seed(0)
-    truth = torch.arange(400) % 4 == 0
-    level = 0.5 + 0.1 * torch.randn(400, generator=generator) + 0.2 * truth
-    frames = level[:, None].expand(-1, 8).clamp(0, 1).clone()
-    frames[:, 3] = 1.0  # a single frame is no success
-    calibrate(judge, frames, truth)
-    right = (judge.episode(frames, torch.ones_like(frames).bool()) == truth).float().mean()
-    best = max(float(((level >= edge) == truth).float().mean()) for edge in torch.linspace(0.3, 0.9, 61))
-    assert float(right) > best - 0.015
-    before = float(judge.threshold)
-    calibrate(judge, frames, torch.ones(400).bool())
-    calibrate(judge, 1 - frames, truth)
-    assert float(judge.threshold) == before
+def test_threshold_lets_through_as_many_as_succeed() -> None:
+    judge = LearnedJudge(hold=2)
+    frames = torch.rand(200, 8, generator=torch.Generator().manual_seed(0))
+    calibrate(judge, frames, 0.25)
+    said = judge.episode(frames, torch.ones_like(frames).bool())
+    assert abs(float(said.float().mean()) - 0.25) <= 0.01
 
 
 def test_filtered_bc_keeps_successes_only() -> None:
