@@ -8,14 +8,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.arms import ArmKinematics, matrix_to_rpy
+from envs.physics.arms import ArmKinematics, matrix_to_rpy, rpy_to_matrix
 from envs.physics.render import offscreen_for
-from envs.physics.scene import ARMS, FINGER_TRAVEL, HOME, TOOL_OFFSET, VIEWS, build_mjcf
+from envs.physics.scene import ARMS, BASE, FINGER_TRAVEL, HOME, REACH, SHOULDER, TOOL_OFFSET, VIEWS, WRIST, build_mjcf
 from envs.physics.tasks import TASKS, Layout
 
 Array = NDArray[np.float64]
 TIP_HEIGHT = 0.020  # m above the table at which fingertips travel
-LOW = np.array([-0.04, -0.42, TIP_HEIGHT - 0.012])  # reachable fingertip box, metres
+LOW = np.array([-0.04, -0.42, TIP_HEIGHT - 0.012])  # box of the fingertips, metres; of it each arm reaches a part
 HIGH = np.array([0.46, 0.42, 0.35])
 GLIDE = 0.025  # s between joint targets: commands are interpolated, so that arms glide instead of jerking at the control rate
 MAX_SPEED = 0.6  # m/s a command may move a fingertip; faster commands are slowed down, not refused
@@ -117,12 +117,18 @@ class Bench:
         out = command.copy()
         reach = MAX_SPEED / self.config.control_hz
         offset = np.array([0.0, 0.0, TOOL_OFFSET])
-        for k in range(2):
+        for k, side in enumerate(ARMS):
             xyz = out[k * 7 : k * 7 + 3]
             move = xyz - self.command[k * 7 : k * 7 + 3]
             length = float(np.linalg.norm(move))
             xyz = self.command[k * 7 : k * 7 + 3] + move * min(1.0, reach / max(length, 1e-9))
-            out[k * 7 : k * 7 + 3] = np.clip(xyz, LOW + offset, HIGH + offset)
+            xyz = np.clip(xyz, LOW + offset, HIGH + offset)
+            # What lies too far away is reached for as far as the arm goes, at the height that was asked for.
+            wrist = xyz - WRIST * rpy_to_matrix(out[k * 7 + 3 : k * 7 + 6])[:, 2] - (*BASE[side], SHOULDER)
+            away = float(np.linalg.norm(wrist[:2]))
+            furthest = float(np.sqrt(max(REACH**2 - wrist[2] ** 2, 0.0)))
+            xyz[:2] -= wrist[:2] * max(0.0, 1 - furthest / max(away, 1e-9))
+            out[k * 7 : k * 7 + 3] = xyz
             out[k * 7 + 6] = np.clip(out[k * 7 + 6], 0.0, 1.0)
         return out
 

@@ -14,6 +14,9 @@ VIEWS = ("head", "hand_left", "hand_right")
 FINGER_TRAVEL = 0.035  # m each finger moves from closed (gripper = 1) to open (gripper = 0)
 HOME = np.array([0.0, -0.35, 0.0, 2.1, 0.0, np.pi - 1.75, 0.0])  # joint posture the IK null space prefers
 BASE = {"left": (-0.28, 0.36), "right": (-0.28, -0.36)}
+SHOULDER = 0.32  # m above the table at which an arm's second joint turns, over its base
+WRIST = 0.08  # m from the sixth joint to the flange, along the flange's z
+REACH = 0.78  # m from shoulder to wrist that commands may ask for; at 0.80 the elbow is straight, and arms jerk or jam
 
 # (name, offset from the parent body, hinge axis, range, actuator gain)
 _JOINTS = (

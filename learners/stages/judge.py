@@ -30,6 +30,12 @@ def unseen_by_judge(store: ClipStore) -> Tensor:
     return torch.tensor([number for number, row in enumerate(store.episodes) if row["seed"] % 8 == 4], dtype=torch.int64)
 
 
+def close_calls(labels: Tensor, progress: Tensor, rows: Tensor) -> Tensor:
+    """Those of `rows` [N] whose progress is within a tenth of where successes begin: there it matters most what is seen, and things hide each other."""
+    begins = rows[(labels[rows] > 0.5) & (labels[(rows - 1).clamp(min=0)] <= 0.5)]
+    return rows[(progress[rows] - progress[begins].median()).abs() < 0.1] if len(begins) else begins
+
+
 def train_judge(
     judge: LearnedJudge, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path, imagined: TensorDict | None = None
 ) -> dict[str, float]:
@@ -54,6 +60,7 @@ def train_judge(
         imagined = imagined.clone(recurse=False).update({**known, "where": sights(store, imagined["places"], imagined["row"], judge.aims)}).exclude("places", "row")
     share = float(labels[rows].mean().clamp(0.02, 0.98))
     positive, negative = rows[labels[rows] > 0.5], rows[labels[rows] <= 0.5]
+    close = close_calls(labels, store.arrays["progress"].float(), rows)
 
     def batch(step: int, generator: torch.Generator) -> TensorDict:
         real = options.part if imagined is None else options.part // 2
@@ -68,7 +75,8 @@ def train_judge(
         if imagined is not None:
             out = torch.cat([out, imagined[torch.randint(len(imagined), (options.part - real,), generator=generator)]])
         out["first"] = store.frames(out["begin"])[:, :1]
-        drill = rows[torch.randint(len(rows), (len(out),), generator=generator)]
+        some = 3 * len(out) // 4 if len(close) else 0
+        drill = torch.cat([pool[torch.randint(len(pool), (count,), generator=generator)] for pool, count in ((close, some), (rows, len(out) - some)) if count])
         out["drill"] = torch.stack((store.frames(drill)[:, 0], store.frames(begin[drill])[:, 0]), 1)
         out["drilled"] = seen[drill]
         return out

@@ -63,6 +63,21 @@ def test_arms_reach_their_commands() -> None:
     assert np.abs(bench.achieved() - command)[[0, 1, 2, 7, 8, 9]].max() < 0.008
 
 
+@pytest.mark.parametrize("arm", [0, 1])
+def test_arms_go_as_far_as_they_can_towards_what_lies_too_far_away(arm: int) -> None:
+    bench = Bench(BenchConfig(control_hz=5.0))
+    bench.reset(3)
+    place = slice(7 * arm, 7 * arm + 3)
+    for lateral in np.linspace(0.0, 0.3, 4) * (1 if arm else -1):  # across the middle, at the far edge
+        for _ in range(8):
+            command = bench.command.copy()
+            command[7 * (1 - arm)], command[7 * (1 - arm) + 1] = 0.0, 0.36 * (1 if arm else -1)
+            command[place] = 0.46, lateral, command[place][2]
+            bench.step(command)
+        assert np.abs(bench.achieved()[place] - bench.command[place]).max() < 0.004, lateral
+        assert bench.command[place][2] == command[place][2] and bench.command[place][0] > 0.25
+
+
 def test_block_is_seen_where_it_is() -> None:
     bench = Bench(BenchConfig(size=(128, 128)))
     bench.reset(5)

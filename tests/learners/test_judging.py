@@ -13,7 +13,7 @@ from envs.episodes.clips import ClipStore
 from envs.judges import LearnedJudge
 from envs.simulators.in_view import in_view
 from learners.fit import FitConfig
-from learners.stages.judge import train_judge, unseen_by_judge
+from learners.stages.judge import close_calls, train_judge, unseen_by_judge
 from learners.stages.pictures import sights, survey
 
 
@@ -47,6 +47,13 @@ def test_judge_learns_to_aim(store: ClipStore, tmp_path: Path) -> None:
     train_judge(judge, store, torch.arange(len(store)), FitConfig(steps=60, batch=16, lr=5e-3, bf16=False), tmp_path)
     rows = [json.loads(line)["judge/aim_error"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert sum(rows[-5:]) < 0.5 * sum(rows[:5])
+
+
+def test_close_calls_lie_around_where_successes_begin() -> None:
+    labels = torch.tensor([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+    progress = torch.tensor([0.1, 0.75, 0.81, 0.99, 0.0, 0.88, 0.5, 0.83])
+    assert close_calls(labels, progress, torch.arange(8)).tolist() == [1, 2, 5, 7]
+    assert close_calls(labels, progress, torch.tensor([0, 4, 6])).tolist() == []
 
 
 def test_objects_nobody_placed_leave_the_aims_alone() -> None:
