@@ -164,13 +164,12 @@ class Gaze(nn.Module):
         """
         if self.closer is None:
             return torch.zeros((), device=pictures.device)
-        known = torch.isfinite(where).all(-1)
         found, _ = self.closer(pictures, torch.nan_to_num(where), generator)
-        return ((found - torch.nan_to_num(where)).norm(dim=-1) * known).sum() / known.sum().clamp(min=1)
+        return self.missed(found[:, None], where)[0]
 
     @staticmethod
     def missed(aimed: Tensor, where: Tensor) -> Tensor:
-        """Mean distances [2] at a first look and closely, in half-pictures, between where objects are seen [B, 2, aims, 2] and are [B, aims, 2]; NaN where nobody knows."""
+        """Mean distances [looks], in half-pictures, between where objects are seen [B, looks, aims, 2] and are [B, aims, 2]; NaN where nobody knows."""
         known = torch.isfinite(where).all(-1)
         off = (aimed - torch.nan_to_num(where)[:, None]).norm(dim=-1) * known[:, None]
         return off.sum((0, 2)) / known.sum().clamp(min=1)
