@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -141,7 +142,7 @@ class Gaze(nn.Module):
         """Learn where on the ground things are that are seen somewhere in the picture, as far as anybody knows.
 
         How far things lie apart decides, and a picture shows it foreshortened. A camera that stays where it is sees
-        each thing's ground through one homography (Hartley & Zisserman, 4.1), found by least squares; of cameras that
+        each thing's ground through one homography (Hartley & Zisserman, 4.1), found by OpenCV; of cameras that
         move this is the one that fits them best.
 
         Args:
@@ -151,11 +152,9 @@ class Gaze(nn.Module):
             known = torch.isfinite(where[:, number]).all(-1) & torch.isfinite(places[:, number]).all(-1)
             if known.sum() < 16:
                 continue
-            (u, v), (x, y) = where[known, number].double().unbind(-1), (places[known, number].double() / self.SPAN).unbind(-1)
-            one, none = torch.ones_like(u), torch.zeros_like(u)
-            rows = torch.stack((torch.stack((u, v, one, none, none, none, -u * x, -v * x), -1), torch.stack((none, none, none, u, v, one, -u * y, -v * y), -1)), 1).flatten(0, 1)
-            found = torch.linalg.lstsq(rows, torch.stack((x, y), 1).flatten()[:, None]).solution[:, 0]
-            self.plane[number] = torch.cat((found, one[:1])).view(3, 3).float()
+            found, _ = cv2.findHomography(where[known, number].double().numpy(), (places[known, number] / self.SPAN).double().numpy())
+            if found is not None:  # points in a row tell no plane
+                self.plane[number] = torch.from_numpy(found)
 
     def drill(self, pictures: Tensor, where: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Mean distance, in half-pictures, by which close looks alone miss what they are to find; arguments as those of `forward` and `missed`.
