@@ -115,13 +115,13 @@ class Bench:
 
     def _limit(self, command: Array) -> Array:
         out = command.copy()
-        reach = MAX_SPEED / self.config.control_hz
+        stride = MAX_SPEED / self.config.control_hz
         offset = np.array([0.0, 0.0, TOOL_OFFSET])
         for k, side in enumerate(ARMS):
             xyz = out[k * 7 : k * 7 + 3]
             move = xyz - self.command[k * 7 : k * 7 + 3]
             length = float(np.linalg.norm(move))
-            xyz = self.command[k * 7 : k * 7 + 3] + move * min(1.0, reach / max(length, 1e-9))
+            xyz = self.command[k * 7 : k * 7 + 3] + move * min(1.0, stride / max(length, 1e-9))
             xyz = np.clip(xyz, LOW + offset, HIGH + offset)
             # What lies too far away is reached for as far as the arm goes, at the height that was asked for.
             wrist = xyz - WRIST * rpy_to_matrix(out[k * 7 + 3 : k * 7 + 6])[:, 2] - (*BASE[side], SHOULDER)
