@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torchrl.data.vla import ACTION_CHUNK_KEY, IMAGE_KEY, STATE_KEY
 
@@ -97,3 +98,9 @@ class Rewards:
     def __call__(self, before: Tensor, after: Tensor, success: Tensor) -> Tensor:
         """Reward float32 [..., 1] from progress before and after [..., 1] and success bool [..., 1]."""
         return self.progress * (after - before) + self.success * success.to(after.dtype)
+
+
+def first_objects(objects: Tensor, count: int) -> Tensor:
+    """The first `count` of objects [..., N, OBJECT_DIM], NaN where there are fewer, [..., count, OBJECT_DIM]."""
+    kept = objects[..., :count, :]
+    return F.pad(kept, (0, 0, 0, count - kept.shape[-2]), value=torch.nan)

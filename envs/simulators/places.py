@@ -9,10 +9,9 @@ places (NaN) teach nothing here, and a world without them does without.
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
-from envs.schema import OBJECT_DIM
+from envs.schema import OBJECT_DIM, first_objects
 from envs.simulators.contact import Contact
 from envs.simulators.sight import Sight
 
@@ -38,8 +37,7 @@ class Places(nn.Module):
 
     def of(self, objects: Tensor) -> Tensor:
         """The followed ones [..., S, 4] of recorded objects [..., N, 4], NaN where there are fewer."""
-        kept = objects[..., : self.count, :]
-        return F.pad(kept, (0, 0, 0, self.count - kept.shape[-2]), value=torch.nan)
+        return first_objects(objects, self.count)
 
     def find(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor) -> Tensor:
         """Places [B, S, 4] in pictures of one camera (Sight.find), NaN before it was taught."""

@@ -8,6 +8,7 @@ from torch import Tensor
 from envs.encoders import Gaze
 from envs.episodes.clips import ClipStore
 from envs.geometry import project
+from envs.schema import first_objects
 
 
 def augment(pictures: Tensor, generator: torch.Generator, strength: float = 0.08) -> Tensor:
@@ -19,8 +20,7 @@ def augment(pictures: Tensor, generator: torch.Generator, strength: float = 0.08
 def sights(store: ClipStore, objects: Tensor, rows: Tensor, count: int) -> Tensor:
     """Where objects [N, S, 4] are in the first view at the cameras of `rows` [N]: [N, count, 2] in half-pictures from the middle, NaN where unknown or out of sight."""
     owner = torch.searchsorted(store.start, rows, right=True) - 1
-    known = torch.nn.functional.pad(objects[:, :count], (0, 0, 0, max(0, count - objects.shape[1])), value=torch.nan)
-    pixels, depth = project(known[..., :3], store.intrinsic[owner, 0], store.arrays["c2w"][rows, 0])
+    pixels, depth = project(first_objects(objects, count)[..., :3], store.intrinsic[owner, 0], store.arrays["c2w"][rows, 0])
     where = pixels / (torch.tensor(store.size[::-1]) / 2) - 1
     return torch.where(((depth > 0.02) & (where.abs() < 1).all(-1))[..., None], where, torch.nan)
 
@@ -28,5 +28,4 @@ def sights(store: ClipStore, objects: Tensor, rows: Tensor, count: int) -> Tenso
 def survey(gaze: Gaze, store: ClipStore, rows: Tensor) -> None:
     """Teach `gaze` the ground of its objects by where they are and are seen in frames `rows` [N]."""
     objects = store.arrays["objects"][rows]
-    known = torch.nn.functional.pad(objects[:, : gaze.aims, :2], (0, 0, 0, max(0, gaze.aims - objects.shape[1])), value=torch.nan)
-    gaze.survey(sights(store, objects, rows, gaze.aims), known)
+    gaze.survey(sights(store, objects, rows, gaze.aims), first_objects(objects, gaze.aims)[..., :2])
