@@ -186,14 +186,14 @@ class ClipStore:
         return self.start[episodes][:, None] + torch.minimum(ahead, last), ahead <= last
 
     def shots(self, episodes: Tensor, count: int, generator: torch.Generator) -> TensorDict:
-        """`count` random pictures of the first view, every other one an episode's first.
+        """`count` random pictures of the first view, three of four an episode's first.
 
         Returns:
             TensorDict [count] with frames uint8 [3, H, W], objects [2, 4], intrinsic [3, 3] and c2w [4, 4].
         """
         chosen = episodes[torch.randint(len(episodes), (count,), generator=generator)]
         ahead = (torch.rand(count, generator=generator) * self.length[chosen]).long()
-        ahead[::2] = 0
+        ahead[torch.arange(count) % 4 > 0] = 0
         rows = self.start[chosen] + ahead
         arrays = {"objects": self.arrays["objects"][rows], "c2w": self.arrays["c2w"][rows, 0], "intrinsic": self.intrinsic[chosen, 0]}
         return TensorDict({"frames": self.frames(rows)[:, 0], **arrays}, [count])

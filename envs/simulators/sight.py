@@ -1,4 +1,4 @@
-"""Finds objects in an episode's first picture: where they stand, and which way they are turned."""
+"""Finds objects in an episode's first picture: where they stand, how high, and which way they are turned."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from envs.encoders import CloseUp, centres, to_signed
-from envs.geometry import on_plane
+from envs.encoders import CloseUp, Gaze, centres, to_signed
+from envs.geometry import on_plane, project
+
+_GLANCED = 4  # pictures for each of which one is looked at as a whole in training; a close look costs a tenth of that, and precision hangs on it
+_BIGGER = 0.01  # m by which one thing's middle may well be higher than another's of its kind
 
 
 class Sight(nn.Module):
@@ -33,44 +36,53 @@ class Sight(nn.Module):
             nn.SiLU(),
             nn.Conv2d(32, count, 3, padding=1),
         )
-        self.closer = CloseUp(count, out=2, cells=24, width=24)
+        self.closer = CloseUp(count, out=3, cells=24, width=24)
         self.heights = nn.Parameter(torch.zeros(count))  # metres above the world's ground; objects stand on something
-
-    def forward(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Coarse and close places [B, S, 3] in metres, and directions [B, S, 2], (cos, sin) of the heading times the sides.
-
-        Args:
-            frames: uint8 [B, 3, H, W] of one camera, intrinsic [B, 3, 3] in pixels, c2w [B, 4, 4].
-            generator: see CloseUp.
-        """
-        height, width = frames.shape[-2:]
-        pictures = to_signed(frames)
-        heat = self.finder(pictures)
-        coarse = centres(heat.flatten(2).mul(4.0).softmax(-1).unflatten(-1, heat.shape[-2:]))
-        close, turned = self.closer(pictures, coarse, generator)
-        half = torch.tensor([width, height], device=frames.device) / 2
-        count = len(self.sides)
-        metres = [on_plane((where[:, :count] + 1) * half, self.heights[:count, None], intrinsic, c2w) for where in (coarse, close)]
-        return metres[0], metres[1], turned[:, :count]
 
     @torch.autocast("cpu", enabled=False)
     @torch.autocast("cuda", enabled=False)  # positions need more than the eight bits of bfloat16
     def find(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor) -> Tensor:
-        """Places [B, S, 4] (schema.OBJECT_DIM), headings within one side; arguments as those of forward."""
-        _, place, turned = self(frames, intrinsic, c2w)
+        """Places [B, S, 4] (schema.OBJECT_DIM), headings within one side.
+
+        Args:
+            frames: uint8 [B, 3, H, W] of one camera, intrinsic [B, 3, 3] in pixels, c2w [B, 4, 4].
+        """
+        pictures = to_signed(frames)
+        place, turned = self._look(pictures, self._glimpse(pictures), intrinsic, c2w)
         sides = torch.tensor(self.sides, device=place.device)
         heading = torch.atan2(turned[..., 1], turned[..., 0]) / sides.clamp(min=1)
         return torch.cat((place, torch.where(sides > 0, heading, torch.nan)[..., None]), -1)
 
+    def _glimpse(self, pictures: Tensor) -> Tensor:
+        """Where objects seem to be in pictures float [B, 3, H, W]: [B, S, 2] in half-pictures from the middle."""
+        heat = self.finder(pictures)
+        return centres(heat.flatten(2).mul(4.0).softmax(-1).unflatten(-1, heat.shape[-2:]))
+
+    def _look(self, pictures: Tensor, where: Tensor, intrinsic: Tensor, c2w: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """Places [B, S, 3] in metres, and directions [B, S, 2], (cos, sin) of the heading times the sides, of what is seen about `where` [B, S, 2] in half-pictures."""
+        close, said = self.closer(pictures, where, generator)
+        half = torch.tensor(pictures.shape[:-3:-1], device=pictures.device) / 2
+        # Bigger things have their middle higher, and are pushed sooner.
+        place = on_plane((close + 1) * half, (self.heights + _BIGGER * said[..., 2])[..., None], intrinsic, c2w)
+        count = len(self.sides)
+        return place[:, :count], said[:, :count, :2]
+
     def loss(self, shown: TensorDict, objects: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, dict[str, Tensor]]:
-        """Centimetres by which objects [B, S, 4] are missed in the pictures of ClipStore.shots, and how wrongly they are seen turned."""
-        coarse, close, turned = self(shown["frames"], shown["intrinsic"], shown["c2w"], generator)
-        guessed, found = (mean_gap(place - objects[..., :3]) for place in (coarse, close))
+        """Pixels and centimetres by which objects [B, S, 4] are missed in the pictures of ClipStore.shots at a first and a close look, and how wrongly they are seen turned; `generator` see CloseUp."""
+        pictures = to_signed(shown["frames"])
+        half = torch.tensor(pictures.shape[:-3:-1], device=pictures.device) / 2
+        where = project(objects[..., :3], shown["intrinsic"], shown["c2w"])[0] / half - 1
+        inside = (where.abs() < 1).all(-1, keepdim=True)
+        where, objects = torch.where(inside, where, torch.nan), torch.where(inside, objects, torch.nan)
+        some = -(-len(pictures) // _GLANCED)
+        guessed = Gaze.missed(self._glimpse(pictures[:some])[:, None, : len(self.sides)], where[:some])[0]
+        place, turned = self._look(pictures, torch.nan_to_num(where), shown["intrinsic"], shown["c2w"], generator)
+        found = mean_gap(place - objects[..., :3])
         angle = objects[..., 3] * torch.tensor(self.sides, device=objects.device)
         wrong = turned - torch.nan_to_num(torch.stack((angle.cos(), angle.sin()), -1))
         known = torch.isfinite(angle) & (torch.tensor(self.sides, device=objects.device) > 0)
         askew = (wrong.square().sum(-1) * known).sum() / known.sum().clamp(min=1)
-        return guessed + found + 8 * askew, {"found_cm": found.detach(), "askew": askew.detach()}
+        return half.mean() * guessed + found + 8 * askew, {"found_cm": found.detach(), "askew": askew.detach()}
 
 
 def mean_gap(gap: Tensor) -> Tensor:
