@@ -178,6 +178,15 @@ def controls(words: list[str]) -> None:
     run_controls(cfg, _root(cfg))
 
 
+def compare(words: list[str]) -> None:
+    """finished runs side by side, as a Markdown table: worldloop compare runs/quickstart runs/quickstart_dit"""
+    from pipeline.compare import compare as table
+
+    if not words:
+        raise ConfigError("say which runs: worldloop compare runs/quickstart runs/quickstart_dit")
+    print(table([Path(word) for word in words]))
+
+
 def finetune(words: list[str]) -> None:
     """train a simulator on any LeRobot data: worldloop finetune simulator=gesim simulator.checkpoint=<folder> finetune.data=[<folder>]"""
     from pipeline.finetune import build_finetune
@@ -229,7 +238,7 @@ def inspect(words: list[str]) -> None:
         print(path)
 
 
-COMMANDS: dict[str, Callable[[list[str]], None]] = {f.__name__: f for f in (run, rl, stage, stages, evaluate, controls, finetune, serve, convert, inspect, bench, verify, submit, chaos, config, doctor)}
+COMMANDS: dict[str, Callable[[list[str]], None]] = {f.__name__: f for f in (run, rl, stage, stages, evaluate, controls, compare, finetune, serve, convert, inspect, bench, verify, submit, chaos, config, doctor)}
 
 
 def _help() -> str:

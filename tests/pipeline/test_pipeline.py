@@ -194,5 +194,9 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     assert set(result["rollout"]) >= {"expert", "noisy", "random", "on-policy"}
     page = (tmp_path / "smoke/report.html").read_text()
     assert "data:video/mp4" in page and "http" not in page.replace("http://www.w3.org", "").split("<h2>Config")[0]
+    table = worldloop("compare", str(tmp_path / "smoke"), str(tmp_path / "smoke")).stdout
+    assert "| engine; algorithm; seed | unet; ppo; 0 | unet; ppo; 0 |" in table
+    missing = worldloop("compare", str(tmp_path))
+    assert missing.returncode == 1 and "result.json is not there" in missing.stderr
     again = worldloop(*words)
     assert again.stdout.count("is finished, reused") + again.stderr.count("is finished, reused") == 23
