@@ -138,7 +138,7 @@ def _episodes(cfg: Mapping[str, Any], folder: Path, base: int, count: int) -> Cl
     bench = bench_config(cfg)
     pool = BenchPool(bench, 4, cfg["task"]["horizon"], cfg["launch"]["workers"])
     try:
-        tracks = pool.script([(base + n, (n % 4) / 3) for n in range(count)])
+        tracks = pool.script([(base + n, (n % 4) / 3) for n in range(count)], cfg["task"]["chunk"])
     finally:
         pool.close()
     LeRobotWriter(folder, bench.views, bench.size, cfg["task"]["control_hz"]).write([Episode.from_track(t, "noisy", bench.views, cfg["task"]["control_hz"]) for t in tracks])

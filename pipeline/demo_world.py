@@ -28,7 +28,7 @@ def demo_recipe(cfg: Mapping[str, Any], folder: Path, episodes: int, starts: int
         bench = bench_config(cfg)
         pool = BenchPool(bench, 1, cfg["task"]["horizon"], workers=1)
         try:
-            tracks = pool.script([(seed, (seed % 4) / 3) for seed in range(starts)])
+            tracks = pool.script([(seed, (seed % 4) / 3) for seed in range(starts)], cfg["task"]["chunk"])
         finally:
             pool.close()
         LeRobotWriter(data, bench.views, bench.size, cfg["task"]["control_hz"]).write(

@@ -27,7 +27,7 @@ class Episode:
         states: float32 [T, 16], see schema.STATE_DIM.
         intrinsic: float32 [V, 3, 3] pixels.
         c2w: float32 [T, V, 4, 4] camera to world, OpenCV convention.
-        success: bool [T], the task's condition has held long enough.
+        success: bool [T], true from the frame on at which the task's condition has held long enough.
         progress: float32 [T] in 0..1.
         objects: float32 [T, N, 4] true places (schema.OBJECT_DIM), NaN where nobody knows them, or a thing has no heading; simulators learn contact from them, judges and policies where to look; none is told them while it acts.
         instruction, seed, behaviour: words, the episode's seed, who acted ("expert", "noisy", "random", "policy-<n>", or a foreign source).

@@ -58,8 +58,9 @@ class LearnedJudge(Judge):
         if generator is not None:  # what is seen can be learned by heart: half of the time the gaps must do without it
             look = look * (torch.rand((len(look), 1), generator=generator) < 0.5).to(look.device)
         progress = (self.apart(torch.cat((seen[:, seen.shape[1] - self.main.gaps :], words), -1)).float() + look)[:, 0]
-        # Success is progress beyond what the words call enough: progress is taught by every frame, and by centimetres.
-        return self.sharpness * progress + self.enough(words)[:, 0].float(), progress, aimed
+        # Success is progress beyond what the words call enough; progress is taught by every frame, and by centimetres only:
+        # taught by successes too, it saw things closer together than they are.
+        return self.sharpness * progress.detach() + self.enough(words)[:, 0].float(), progress, aimed
 
     @torch.no_grad()
     def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:

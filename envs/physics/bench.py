@@ -71,6 +71,7 @@ class Bench:
         self.command: Array  # [14] the last absolute command
         self.joints: Array  # [2, 7] the last joint targets
         self.held = 0
+        self.success = False  # true from the step on at which the condition has held for the last `hold` control steps
 
     # -- episode ---------------------------------------------------------------------------------------------
     def reset(self, seed: int) -> None:
@@ -93,7 +94,7 @@ class Bench:
         self.data.qpos[self.ik.qpos] = self.joints
         self._set_targets(self.joints)
         mujoco.mj_forward(self.model, self.data)
-        self.held = 0
+        self.held, self.success = 0, False
 
     def step(self, command: Array) -> None:
         """Carry out one absolute 14-D command for one control period.
@@ -112,6 +113,7 @@ class Bench:
         self.joints = after
         mujoco.mj_forward(self.model, self.data)
         self.held = self.held + 1 if self.distance < self.task.radius else 0
+        self.success = self.success or self.held >= self.hold
 
     def _limit(self, command: Array) -> Array:
         out = command.copy()
@@ -142,11 +144,6 @@ class Bench:
     def distance(self) -> float:
         """Metres between block and target."""
         return self.task.distance(self.data.qpos[self._block : self._block + 2], self.layout.target)
-
-    @property
-    def success(self) -> bool:
-        """True once the condition has held for the last `hold` control steps."""
-        return self.held >= self.hold
 
     @property
     def block(self) -> Array:

@@ -86,25 +86,23 @@ class Worker:
         return out
 
     def step(self, chunks: dict[int, NDArray[Any]]) -> dict[int, dict[str, Any]]:
-        """Carry out chunks {slot: [K, 14] absolute}; an episode that is over stands still."""
+        """Carry out chunks {slot: [K, 14] absolute}, each to its end, as imagined worlds do; an episode that is over stands still."""
         out = {}
         for index, chunk in chunks.items():
             slot = self.slots[index]
-            for command in chunk:
-                if slot.over:
-                    break
+            for command in () if slot.over else chunk:
                 slot.bench.step(command)
                 slot.steps += 1
-                slot.over = slot.bench.success or slot.steps >= self.horizon
                 if slot.track is not None:
                     slot.track.add(slot.bench)
+            slot.over = slot.bench.success or slot.steps >= self.horizon
             out[index] = self._observe(slot)
             if slot.over and slot.track is not None:
                 out[index]["track"], slot.track = slot.track, None
         return out
 
-    def script(self, jobs: list[tuple[int, float]]) -> list[Track]:
-        """Whole episodes of scripted behaviours for (seed, dial) pairs; recorded to the horizon or to success."""
+    def script(self, jobs: list[tuple[int, float]], chunk: int = 1) -> list[Track]:
+        """Whole episodes of scripted behaviours for (seed, dial) pairs; recorded to the horizon, or to the end of the `chunk` steps in which they succeed."""
         from envs.physics.behaviours import Behaviour
 
         out = []
@@ -115,13 +113,13 @@ class Worker:
             near = bench.layout.arm * 7
             track = Track(seed, bench.layout.instruction, bench.cameras()[0])
             track.add(bench)
-            for _ in range(self.horizon):
+            for step in range(self.horizon):
+                if bench.success and step % chunk == 0:
+                    break
                 command = bench.command.copy()
                 command[near : near + 2] = behaviour.fingertip(bench.block[:2], command[near : near + 2])
                 bench.step(command)
                 track.add(bench)
-                if bench.success:
-                    break
             out.append(track)
         return out
 
@@ -237,13 +235,13 @@ class BenchPool:
         """Carry out chunks {slot: [K, 14]} and return the observations after them."""
         return self._scatter("step", chunks)
 
-    def script(self, jobs: list[tuple[int, float]]) -> list[Track]:
-        """Scripted episodes for (seed, dial) pairs, in the order of `jobs`."""
+    def script(self, jobs: list[tuple[int, float]], chunk: int = 1) -> list[Track]:
+        """Scripted episodes for (seed, dial) pairs, in the order of `jobs`; see Worker.script."""
         if self._inline is not None:
-            return self._inline.script(jobs)
+            return self._inline.script(jobs, chunk)
         count = len(self._pipes)
         for index, pipe in enumerate(self._pipes):
-            pipe.send(("script", (jobs[index::count],)))
+            pipe.send(("script", (jobs[index::count], chunk)))
         shares = [self._receive(index) for index in range(count)]
         return [shares[k % count][k // count] for k in range(len(jobs))]
 

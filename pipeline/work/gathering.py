@@ -43,7 +43,7 @@ def collect(cfg: Cfg, folder: Path, found: Found, part: str) -> dict[str, Any]:
         with tqdm(total=total, initial=done, desc=f"collect {part}", unit="ep", dynamic_ncols=True) as bar, WriteBehind(writer) as behind:
             for begin in range(done, total, size):
                 batch = jobs[begin : begin + size]
-                tracks = pool.script([(seed, dial) for seed, dial, _ in batch])
+                tracks = pool.script([(seed, dial) for seed, dial, _ in batch], task["chunk"])
                 behind.write([Episode.from_track(t, b, bench.views, task["control_hz"]) for t, (_, _, b) in zip(tracks, batch, strict=True)])
                 bar.update(len(batch))
     finally:

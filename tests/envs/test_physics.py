@@ -45,6 +45,17 @@ def test_success_must_be_held() -> None:
     assert bench.success is True
 
 
+def test_episodes_end_with_the_chunk_in_which_they_succeed() -> None:
+    pool = BenchPool(BenchConfig(control_hz=5.0), 1, 20, 1)
+    tracks = pool.script([(seed, 0.0) for seed in range(8)], 4)
+    pool.close()
+    early = [track for track in tracks if track.rows["success"].index(True) % 4]
+    assert early and all(len(track.rows["success"]) % 4 == 1 for track in tracks)
+    for track in early:
+        won = track.rows["success"]
+        assert won[-1] and won == sorted(won)
+
+
 def test_dial_is_checked() -> None:
     bench = Bench(BenchConfig())
     bench.reset(0)
