@@ -94,9 +94,9 @@ def video_rope(shape: DiTShape, frames: int, height: int, width: int, fps: float
 
 def rotate(x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
     """Apply rotary positions to x [..., L, head_dim], pairing the first half of the channels with the second."""
-    cos, sin = rope
-    first, second = x.chunk(2, -1)
-    return (x.float() * cos + torch.cat((-second, first), -1).float() * sin).to(x.dtype)
+    first, second = x.float().chunk(2, -1)
+    (cos, other_cos), (sin, other_sin) = (part.chunk(2, -1) for part in rope)
+    return torch.cat((first * cos - second * sin, second * other_cos + first * other_sin), -1).to(x.dtype)
 
 
 class RMSNorm(nn.Module):
@@ -113,7 +113,8 @@ class RMSNorm(nn.Module):
 
 def rms(x: Tensor, eps: float = 1e-6) -> Tensor:
     """Root-mean-square norm without a weight."""
-    return (x.float() * torch.rsqrt(x.float().square().mean(-1, keepdim=True) + eps)).to(x.dtype)
+    precise = x.float()
+    return (precise * torch.rsqrt(precise.square().mean(-1, keepdim=True) + eps)).to(x.dtype)
 
 
 class Attention(nn.Module):
@@ -142,6 +143,10 @@ class Attention(nn.Module):
             q, k = rotate(q, rope), rotate(k, rope)
         out = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype).expand(len(q), -1, -1, -1), v.expand(len(q), -1, -1, -1))
         return self.to_out[0](out.transpose(1, 2).flatten(2))
+
+    def alone(self, value: Tensor) -> Tensor:
+        """What everybody is told by a context of one token, from its value [B, heads, 1, head_dim]: the softmax over one key is 1, whoever asks. [B, 1, width]."""
+        return self.to_out[0](value.transpose(1, 2).flatten(2))
 
     def keys_of(self, context: Tensor) -> tuple[Tensor, Tensor]:
         """Keys and values [B, heads, L, head_dim] of a context [B, L, width]."""
@@ -181,11 +186,14 @@ class _AdaLN(nn.Module):
         self.linear_1 = nn.Linear(width, rank, bias=False)
         self.linear_2 = nn.Linear(rank, outputs * width, bias=False)
 
-    def forward(self, x: Tensor, embedded: Tensor, temb: Tensor) -> tuple[Tensor, Tensor | None]:
+    def parts(self, embedded: Tensor, temb: Tensor) -> list[Tensor]:
+        """Shift, scale (and gate), each [B, T, 1, width]: all tokens of a frame have its time step."""
         parts = self.linear_2(self.linear_1(F.silu(embedded))) + temb[..., : self.outputs * self.width]
-        # All tokens of a frame have its time step.
-        shift, scale, *gate = parts.repeat_interleave(x.shape[1] // parts.shape[1], 1).chunk(self.outputs, -1)
-        return F.layer_norm(x, (self.width,), eps=1e-6) * (1 + scale) + shift, gate[0] if gate else None
+        return list(parts[:, :, None].chunk(self.outputs, -1))
+
+    def forward(self, x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
+        """Tokens [B, L, width], normed and modulated."""
+        return torch.addcmul(shift, F.layer_norm(x, (self.width,), eps=1e-6).unflatten(1, (shift.shape[1], -1)), 1 + scale).flatten(1, 2)
 
 
 class VisionBlock(nn.Module):
@@ -201,18 +209,28 @@ class VisionBlock(nn.Module):
 
     def forward(self, x: Tensor, text: Tensor | tuple[Tensor, Tensor], embedded: Tensor, temb: Tensor, rope: tuple[Tensor, Tensor], views: int) -> Tensor:
         """Tokens [B * V, L, D], and the text or its keys and values; with `views` > 1 self-attention joins the tokens of all views."""
-        h, gate = self.norm1(x, embedded, temb)
+        shift, scale, gate = self.norm1.parts(embedded, temb)
+        h = self.norm1(x, shift, scale)
         if views > 1:
             joined = h.unflatten(0, (-1, views)).flatten(1, 2)
             cos, sin = (part.repeat(views, 1) for part in rope)
             h = self.attn1(joined, rope=(cos, sin)).unflatten(1, (views, -1)).flatten(0, 1)
         else:
             h = self.attn1(h, rope=rope)
-        x = x + gate * h
-        h, gate = self.norm2(x, embedded, temb)
-        x = x + gate * (self.attn2(h, text) if isinstance(text, Tensor) else self.attn2(h, known=text))
-        h, gate = self.norm3(x, embedded, temb)
-        return x + gate * self.ff(h)
+        x = _plus(x, gate, h)
+        shift, scale, gate = self.norm2.parts(embedded, temb)
+        known = self.attn2.keys_of(text) if isinstance(text, Tensor) else text
+        said = self.attn2.alone(known[1]) if known[1].shape[2] == 1 else self.attn2(self.norm2(x, shift, scale), known=known)
+        x = _plus(x, gate, said)
+        shift, scale, gate = self.norm3.parts(embedded, temb)
+        return _plus(x, gate, self.ff(self.norm3(x, shift, scale)))
+
+
+def _plus(x: Tensor, gate: Tensor, said: Tensor) -> Tensor:
+    """Tokens x [B, L, width] plus what is said to each, or to all, [B, L or 1, width], times the gate [B, T, 1, width] of its frame."""
+    frames = gate.shape[1]
+    each = said[:, None] if said.shape[1] == 1 else said.unflatten(1, (frames, -1))
+    return torch.addcmul(x.unflatten(1, (frames, -1)), gate, each).flatten(1, 2)
 
 
 class _TimestepMLP(nn.Module):
@@ -348,7 +366,7 @@ class MultiViewDiT(nn.Module):
                 fused = fused + self.video_buffer_weights[index] * x
             if layers is not None:
                 layers.append(x)
-        x, _ = self.norm_out(x, embedded, temb)
+        x = self.norm_out(x, *self.norm_out.parts(embedded, temb))
         x = self.proj_out(x).unflatten(2, (ph, pw, pt, -1)).unflatten(1, grid)
         video = x.permute(0, 7, 1, 6, 2, 4, 3, 5).flatten(6, 7).flatten(4, 5).flatten(2, 3)
         return video, self.video_buffer_norm(fused) if self.shape.pose_expert else fused
