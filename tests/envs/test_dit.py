@@ -7,7 +7,7 @@ import torch
 
 from envs.episodes.clips import ClipSpec, ClipStore
 from envs.simulators.base import WorldShape
-from envs.simulators.dit import DiTShape, MultiViewDiT
+from envs.simulators.dit import Attention, DiTShape, MultiViewDiT
 from envs.simulators.dit_world import DiTConfig, DiTSimulator
 from envs.simulators.replay import replay
 from envs.simulators.state_flow import StateExpertConfig, untrained_expert
@@ -90,3 +90,11 @@ def test_checkpointed_blocks_give_the_same_gradients(dit: DiTSimulator, store: C
         dit.loss(clip, torch.Generator().manual_seed(0))[0].backward()
         grads.append(dit.net.transformer_blocks[1].attn1.to_q.weight.grad.clone())
     assert torch.allclose(*grads, atol=1e-7)
+
+
+def test_one_token_tells_everybody_the_same() -> None:
+    torch.manual_seed(0)
+    attention = Attention(24, 2, 8, context=12)
+    asking, context = torch.randn(3, 5, 24), torch.randn(3, 1, 12)
+    said = attention.alone(attention.keys_of(context)[1])
+    assert said.shape == (3, 1, 24) and torch.allclose(attention(asking, context), said.expand(-1, 5, -1), atol=1e-6)
