@@ -9,7 +9,8 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from envs.encoders import CloseUp, Gaze, centres, to_signed
-from envs.geometry import on_plane, project
+from envs.geometry import on_plane
+from envs.simulators.in_view import in_view
 
 _GLANCED = 4  # pictures for each of which one is looked at as a whole in training; a close look costs a tenth of that, and precision hangs on it
 _BIGGER = 0.01  # m by which one thing's middle may well be higher than another's of its kind
@@ -71,8 +72,8 @@ class Sight(nn.Module):
         """Pixels and centimetres by which objects [B, S, 4] are missed in the pictures of ClipStore.shots at a first and a close look, and how wrongly they are seen turned; `generator` see CloseUp."""
         pictures = to_signed(shown["frames"])
         half = torch.tensor(pictures.shape[:-3:-1], device=pictures.device) / 2
-        where = project(objects[..., :3], shown["intrinsic"], shown["c2w"])[0] / half - 1
-        inside = (where.abs() < 1).all(-1, keepdim=True)
+        seen = in_view(objects[:, None], shown["intrinsic"][:, None], shown["c2w"][:, None, None], (pictures.shape[-2], pictures.shape[-1])).at(0, 0)
+        where, inside = seen.where, seen.visible[..., None] & (seen.where.abs() < 1).all(-1, keepdim=True)
         where, objects = torch.where(inside, where, torch.nan), torch.where(inside, objects, torch.nan)
         some = -(-len(pictures) // _GLANCED)
         guessed = Gaze.missed(self._glimpse(pictures[:some])[:, None, : len(self.sides)], where[:some])[0]
