@@ -24,7 +24,7 @@ from envs.simulators.remote import RemoteError
 from learners.fit import TrainingDiverged
 from pipeline.config import load_config
 from pipeline.loop import build_loop
-from pipeline.statistics import rate_entry
+from pipeline.statistics import rate_entry, rate_line
 from pipeline.work.given import EVALUATE, load_world, open_store, seeds_of
 
 
@@ -108,7 +108,7 @@ def evaluate(words: list[str]) -> None:
     finally:
         env.close()
     entry = rate_entry(outcome.success[outcome.judged])
-    print(f"{folder} in {world}: {entry['successes']}/{entry['episodes']} = {100 * outcome.rate:.1f}% [{100 * entry['low']:.1f}, {100 * entry['high']:.1f}], {int((~outcome.judged).sum())} dropped by the judge")
+    print(f"{folder} in {world}: {rate_line(entry)}, {int((~outcome.judged).sum())} dropped by the judge")
 
 
 def submit(words: list[str]) -> None:

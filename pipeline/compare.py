@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.factory import ConfigError
+from pipeline.statistics import rate_line
 
 Result = Mapping[str, Any]
 
@@ -34,7 +35,7 @@ def _percent(entry: Result) -> str:
 
 
 def _rate(key: str) -> Callable[[Result], str]:
-    return lambda r: f"{r[key]['successes']}/{r[key]['episodes']} = {_percent(r[key])} [{100 * r[key]['low']:.1f}, {100 * r[key]['high']:.1f}]"
+    return lambda r: rate_line(r[key])
 
 
 def _gain(result: Result) -> str:

@@ -19,7 +19,7 @@ from learners.stages.imitation import train_imitation
 from pipeline.artefact import save_weights, write_text
 from pipeline.graph import Graph, Stage
 from pipeline.loop import build_loop
-from pipeline.statistics import mcnemar, rate_entry
+from pipeline.statistics import mcnemar, rate_entry, rate_line
 from pipeline.work.given import EVALUATE, fit_options, rl_options, seeds_of
 
 CONTROL = 6_000_000  # episode seeds of RL in physics
@@ -82,9 +82,9 @@ def run_controls(cfg: Mapping[str, Any], root: Path) -> None:
         outcome = torch.load(graph.folder(name) / "outcomes.pt", weights_only=True)["success"]
         rows[name] = {**rate_entry(outcome), "paired": mcnemar(before, outcome), **{k: v for k, v in manifest["result"].items() if k in ("episodes_used", "own_successes", "demos")}}
     write_text(root / "controls.json", json.dumps({"before": result["physics_before"], **rows}, indent=1, default=float))
-    print(f"before               {_line(result['physics_before'])}")
+    print(f"before               {rate_line(result['physics_before'])}")
     for name, row in rows.items():
-        print(f"{name:<20} {_line(row)}, gained {row['paired']['gained']} lost {row['paired']['lost']} p {row['paired']['p']:.2g}")
+        print(f"{name:<20} {rate_line(row)}, gained {row['paired']['gained']} lost {row['paired']['lost']} p {row['paired']['p']:.2g}")
 
 
 def _judge(cfg: Mapping[str, Any], policy: Any, folder: Path) -> dict[str, Any]:
@@ -95,7 +95,3 @@ def _judge(cfg: Mapping[str, Any], policy: Any, folder: Path) -> dict[str, Any]:
         env.close()
     torch.save({"success": outcome.success}, folder / "outcomes.pt")
     return rate_entry(outcome.success)
-
-
-def _line(row: Mapping[str, Any]) -> str:
-    return f"{row['successes']}/{row['episodes']} = {100 * row['successes'] / row['episodes']:.1f}% [{100 * row['low']:.1f}, {100 * row['high']:.1f}]"

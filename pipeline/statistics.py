@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import comb, sqrt
 from typing import Any
 
@@ -23,6 +24,11 @@ def rate_entry(success: Tensor) -> dict[str, Any]:
     successes, episodes = int(success.sum()), len(success)
     low, high = wilson(successes, episodes)
     return {"successes": successes, "episodes": episodes, "low": round(low, 4), "high": round(high, 4)}
+
+
+def rate_line(entry: Mapping[str, Any]) -> str:
+    """A `rate_entry` in words: successes of episodes, the rate in percent, and its interval."""
+    return f"{entry['successes']}/{entry['episodes']} = {100 * entry['successes'] / max(1, entry['episodes']):.1f}% [{100 * entry['low']:.1f}, {100 * entry['high']:.1f}]"
 
 
 def mcnemar(before: Tensor, after: Tensor) -> dict[str, Any]:
