@@ -56,6 +56,17 @@ def test_episodes_end_with_the_chunk_in_which_they_succeed() -> None:
         assert won[-1] and won == sorted(won)
 
 
+def test_a_chunk_is_carried_out_to_its_end() -> None:
+    pool = BenchPool(BenchConfig(control_hz=5.0), 1, 20, 1)
+    command = pool.reset({0: 1}, record=True)[0]["command"]
+    bench = pool._inline.slots[0].bench
+    bench.data.qpos[bench._block : bench._block + 2] = bench.layout.target
+    after = pool.step({0: np.stack([command] * 4)})[0]
+    assert after["over"] and after["track"].rows["success"] == [False, False, True, True, True]
+    assert "track" not in pool.step({0: np.stack([command] * 4)})[0]  # over: it stands still
+    pool.close()
+
+
 def test_dial_is_checked() -> None:
     bench = Bench(BenchConfig())
     bench.reset(0)
