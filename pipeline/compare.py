@@ -47,13 +47,14 @@ def _minutes(*stages: str) -> Callable[[Result], str]:
     return lambda r: f"{sum(s for name, s in r['stage_seconds'].items() if name.startswith(stages)) / 60:.1f}"
 
 
-def _error(key: str, digits: int) -> Callable[[Result], str]:
-    """Median and 90th percentile of a rollout's error, for each group of episodes."""
-    return lambda r: "; ".join(f"{r['rollout'][group][key]['median']:.{digits}f} / {r['rollout'][group][key]['p90']:.{digits}f}" for group in _GROUPS)
-
-
 def _figure(form: Callable[[Result], str]) -> Callable[[Result], str]:
+    """Figures of the rollouts of each group of episodes."""
     return lambda r: "; ".join(form(r["rollout"][group]) for group in _GROUPS)
+
+
+def _error(key: str, digits: int) -> Callable[[Result], str]:
+    """Median and 90th percentile of a rollout's error."""
+    return _figure(lambda d: f"{d[key]['median']:.{digits}f} / {d[key]['p90']:.{digits}f}")
 
 
 def _verdicts(source: str) -> Callable[[Result], str]:
