@@ -42,7 +42,8 @@ class Graph:
     """
 
     root: Path
-    stages: dict[str, Stage] = field(default_factory=dict)
+    stages: dict[str, Stage] = field(default_factory=dict, init=False)
+    _keys: dict[str, str] = field(default_factory=dict, init=False, repr=False)
 
     def add(self, stage: Stage) -> str:
         """Add a stage and return its name."""
@@ -51,14 +52,14 @@ class Graph:
         unknown = [parent for parent in stage.parents if parent not in self.stages]
         if unknown:
             raise ValueError(f"stage {stage.name} comes before its parents {unknown}")
-        self.stages[stage.name] = stage
+        # Worked out once: by way of all its parents again, the ways through a graph multiply with every round.
+        text = json.dumps([stage.name, stage.config, [self.key(parent) for parent in stage.parents]], sort_keys=True, default=str)
+        self.stages[stage.name], self._keys[stage.name] = stage, hashlib.sha256(text.encode()).hexdigest()[:12]
         return stage.name
 
     def key(self, name: str) -> str:
-        """Hash of the stage's config and of its ancestors' keys."""
-        stage = self.stages[name]
-        text = json.dumps([name, stage.config, [self.key(parent) for parent in stage.parents]], sort_keys=True, default=str)
-        return hashlib.sha256(text.encode()).hexdigest()[:12]
+        """Hash of the stage's config, as it was when the stage was added, and of its ancestors' keys."""
+        return self._keys[name]
 
     def folder(self, name: str) -> Path:
         """Where the stage's artefact lies or will lie."""
@@ -108,8 +109,9 @@ class Graph:
         if name not in self.stages:
             raise KeyError(f"no stage {name}; this graph has {list(self.stages)}")
         out = {name}
-        for parent in self.stages[name].parents:
-            out |= self._needs(parent)
+        for earlier in reversed(self.stages):  # parents come first, so that every child was met before
+            if earlier in out:
+                out.update(self.stages[earlier].parents)
         return out
 
 

@@ -314,6 +314,7 @@ class MultiViewDiT(nn.Module):
         self.transformer_blocks = nn.ModuleList(VisionBlock(shape) for _ in range(shape.num_layers))
         self.norm_out = _AdaLN(width, shape.adaln_lora_dim, 2)
         self.proj_out = nn.Linear(width, patch * shape.out_channels, bias=False)
+
     def _build_mix(self, shape: DiTShape) -> None:
         self.video_buffer_weights = nn.Parameter(torch.ones(shape.num_layers))
         self.video_buffer_norm = nn.LayerNorm(shape.width, eps=1e-6)

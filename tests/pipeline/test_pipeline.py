@@ -108,6 +108,17 @@ def test_keys_change_with_what_matters_only(tmp_path: Path) -> None:
     assert seeded.key("collect") != base.key("collect")
 
 
+def test_many_rounds_are_keyed_and_followed_at_once(tmp_path: Path) -> None:
+    """Every round has all earlier ones as ancestors by many ways; a graph that went them all would not end."""
+    log: list[str] = []
+    graph = Graph(tmp_path)
+    for number in range(40):
+        graph.add(stage(f"s{number}", tuple(graph.stages), {}, log))
+    graph.add(stage("beside", (), {}, log))
+    assert len({graph.key(name) for name in graph.stages}) == 41
+    assert len(graph.run("s39")) == 40 and "beside" not in log
+
+
 @pytest.mark.parametrize(
     ("words", "match"),
     [
