@@ -14,7 +14,7 @@ from envs.episodes.episode import EpisodeError
 
 
 def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, crf: int = 10, browser: bool = False) -> None:
-    """Write frames uint8 [H, W, 3] RGB as H.264.
+    """Write frames uint8 [H, W, 3] RGB as H.264; the same frames give the same bytes.
 
     Args:
         path: the mp4 file; parents must exist.
@@ -30,7 +30,8 @@ def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, crf
                 stream = container.add_stream("libx264", rate=round(fps))
                 stream.height, stream.width = frame.shape[:2]
                 stream.pix_fmt = "yuv420p" if browser else "yuv444p"
-                stream.options = {"crf": str(crf), "preset": "veryfast", "g": "20", "threads": "1"}
+                # x264's macroblock tree reads memory that nobody wrote (with AVX-512): the same frames gave other bytes, and pictures, each time.
+                stream.options = {"crf": str(crf), "preset": "veryfast", "g": "20", "threads": "1", "mbtree": "0"}
             for packet in stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")):
                 container.mux(packet)
         if stream is not None:
