@@ -13,6 +13,7 @@ import torch
 
 from envs.episodes import Episode, EpisodeError, LeRobotDataset, LeRobotWriter
 from envs.episodes.clips import ClipSpec, ClipStore, memory_indices
+from envs.episodes.video import write_video
 
 
 def test_round_trip(episodes: list[Episode], dataset: Path) -> None:
@@ -133,3 +134,18 @@ def test_objects_without_headings_are_refused_by_name(dataset: Path, tmp_path: P
     (root / "meta/info.json").write_text(json.dumps(info))
     with pytest.raises(EpisodeError, match="heading"):
         LeRobotDataset(root)
+
+
+def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
+    """A coder that reads memory nobody wrote gives other pictures each time, and with them other worlds, judges and policies."""
+    rng, frames = np.random.default_rng(5), np.full((40, 64, 64, 3), (155, 122, 108), np.uint8)
+    for frame in frames:  # arms that jump
+        for x, y, aside in zip((10, 44), rng.integers(40, 56, 2), rng.integers(-6, 7, 2), strict=True):
+            frame[y : y + 4, x + aside : x + aside + 10] = (230, 120, 30)
+            frame[y + 4 :, x + aside + 3 : x + aside + 7] = (200, 200, 205)
+    path, found, held = tmp_path / "video.mp4", set(), []
+    for _ in range(20):
+        held = [*held[-4:], rng.integers(0, 255, int(rng.integers(1_000, 3_000_000)), dtype=np.uint8)]  # memory changes hands
+        write_video(path, frames, 5)
+        found.add(path.read_bytes())
+    assert len(found) == 1
