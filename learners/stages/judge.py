@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 
 from envs.encoders import to_signed
 from envs.episodes.clips import ClipStore
@@ -92,17 +92,40 @@ def train_judge(
     return fit("judge", judge, batch, loss, options, folder, watch="frame_accuracy")
 
 
-def calibrate(judge: Judge, success: Tensor, rate: float) -> None:
-    """Set the judge's threshold so that as many episodes pass as succeeded.
+def calibrate(judge: Judge, success: Tensor, succeeded: Tensor) -> bool:
+    """Set the judge's threshold where an episode is as likely to have succeeded as not.
 
     On real video, that is: on generated video the threshold would also make up for what the simulator gets wrong, and
     a judge made lenient for a pessimistic simulator is what a policy learns to exploit. And on video that it has not
-    learned from, of which it is too sure. Matching a rate uses all those episodes, where a threshold of best accuracy
-    jumps with a few of them.
+    learned from, of which it is too sure. The likelihood is logistic in the logit of an episode's score (Platt, 1999,
+    with his targets, which keep it finite where scores part the outcomes): it uses all those episodes, where a
+    threshold of best accuracy jumps with a few of them, and asks more of those near the threshold than of the rest.
 
     Args:
-        success: frame probabilities [N, T] of real episodes that it did not learn from, 0 where they are over; rate: their share of successes.
+        success: frame probabilities [N, T] of real episodes that it did not learn from, 0 where they are over;
+        succeeded: bool [N], whether they did.
+
+    Returns:
+        Whether it was set. It stays as it is where no episode succeeded, or none failed, or scores do not rise with success.
     """
     # An episode succeeds if its best run of `hold` frames lies above the threshold throughout.
-    best = success.unfold(1, judge.hold, 1).amin(-1).amax(1)
-    judge.threshold.fill_(float(best.quantile(1 - rate).clamp(0.02, 0.98)))
+    score = torch.logit(success.double().unfold(1, judge.hold, 1).amin(-1).amax(1).clamp(0.01, 0.99))
+    hits = float(succeeded.sum())
+    if hits in (0.0, float(len(succeeded))):
+        return False
+    targets = torch.where(succeeded, (hits + 1) / (hits + 2), 1 / (len(succeeded) - hits + 2)).double()
+    line = torch.zeros(2, dtype=torch.float64, requires_grad=True)
+    solver = torch.optim.LBFGS([line], max_iter=200, line_search_fn="strong_wolfe")
+
+    def objective() -> Tensor:
+        solver.zero_grad()
+        misfit = nn.functional.binary_cross_entropy_with_logits(line[0] * score + line[1], targets)
+        misfit.backward()
+        return misfit
+
+    solver.step(objective)
+    slope, offset = line.tolist()
+    if slope <= 0:
+        return False
+    judge.threshold.fill_(float(torch.tensor(-offset / slope).sigmoid().clamp(0.02, 0.98)))
+    return True

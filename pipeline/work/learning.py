@@ -116,8 +116,9 @@ def judge(cfg: Cfg, folder: Path, found: Found, data: tuple[str, ...], vision: s
     if len(unseen):
         rows, valid = store.whole(unseen)
         success = measurement.judge_frames(judge, store.frames(rows), store, unseen)
-        rate = torch.tensor([store.episodes[n]["success"] for n in unseen.tolist()]).float().mean()
-        calibrate(judge, torch.where(valid, success, 0.0), float(rate))
+        succeeded = torch.tensor([bool(store.episodes[n]["success"]) for n in unseen.tolist()])
+        if not calibrate(judge, torch.where(valid, success, 0.0), succeeded):
+            print(f"judge: {int(succeeded.sum())} of {len(succeeded)} unseen episodes succeeded, and its scores do not tell which; threshold left at {float(judge.threshold):.3f}", flush=True)
     save_weights(judge, folder)
     return {**stats, "threshold": float(judge.threshold), "generated_frames": len(imagined) if imagined is not None else 0}
 

@@ -196,12 +196,28 @@ def test_frozen_perception_is_neither_trained_nor_run_again() -> None:
     assert changed and not any(name.startswith("module.0.") for name in changed)
 
 
-def test_threshold_lets_through_as_many_as_succeed() -> None:
+def test_threshold_is_where_success_is_as_likely_as_failure() -> None:
+    draw = torch.Generator().manual_seed(0)
     judge = LearnedJudge(hold=2)
-    frames = torch.rand(200, 8, generator=torch.Generator().manual_seed(0))
-    calibrate(judge, frames, 0.25)
-    said = judge.episode(frames, torch.ones_like(frames).bool())
-    assert abs(float(said.float().mean()) - 0.25) <= 0.01
+    best = torch.rand(4000, generator=draw)
+    frames = torch.zeros(4000, 8)
+    frames[:, 3], frames[:, 5:] = 0.99, best[:, None]  # one bright frame alone is no success
+    likely = torch.sigmoid(2 * (torch.logit(best) - torch.logit(torch.tensor(0.7))))
+    succeeded = torch.rand(4000, generator=draw) < likely
+    assert calibrate(judge, frames, succeeded)
+    assert abs(float(judge.threshold) - 0.7) < 0.02
+    # A handful that scores part without fail: somewhere between them.
+    assert calibrate(judge, frames[best.argsort()][:: 400], torch.arange(10) >= 6)
+    assert 0.5 < float(judge.threshold) < 0.65
+
+
+def test_threshold_stays_where_scores_tell_nothing() -> None:
+    judge = LearnedJudge(hold=2)
+    frames = torch.linspace(0.1, 0.9, 20)[:, None].expand(20, 8)
+    before = float(judge.threshold)
+    for succeeded in (torch.zeros(20).bool(), torch.ones(20).bool(), torch.arange(20) < 10):
+        assert not calibrate(judge, frames, succeeded)
+        assert float(judge.threshold) == before
 
 
 def test_filtered_bc_keeps_successes_only() -> None:
