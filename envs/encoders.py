@@ -101,12 +101,14 @@ class Gaze(nn.Module):
     Attributes:
         out_features: numbers said of a picture; the last `gaps` are how far the objects of each pair lie apart.
         plane: per aim, the homography [aims, 3, 3] from half-pictures to the ground it moves over, in SPANs; see `survey`.
+        surveyed: bool [aims], whether `plane` was found in data.
     """
 
     GAIN = 4.0  # on where objects are seen and how far apart: small differences that decide
     SPAN = 0.25  # m; what half a picture is taken to show before anything was surveyed
 
     plane: Tensor
+    surveyed: Tensor
 
     def __init__(self, points: int, width: int, aims: int, pictures: int = 1):
         super().__init__()
@@ -116,6 +118,7 @@ class Gaze(nn.Module):
         self.encoder = SpatialEncoder(points, width, pictures)
         self.closer = CloseUp(aims, pictures=pictures) if aims else None
         self.register_buffer("plane", torch.eye(3).repeat(aims, 1, 1))
+        self.register_buffer("surveyed", torch.zeros(aims, dtype=torch.bool))
         self.gaps = aims * (aims - 1) // 2
         self.out_features = 2 * points + 16 * width + 2 * aims + 3 * self.gaps
 
@@ -155,6 +158,7 @@ class Gaze(nn.Module):
             found, _ = cv2.findHomography(where[known, number].double().numpy(), (places[known, number] / self.SPAN).double().numpy())
             if found is not None:  # points in a row tell no plane
                 self.plane[number] = torch.from_numpy(found)
+                self.surveyed[number] = True
 
     def drill(self, pictures: Tensor, where: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Mean distance, in half-pictures, by which close looks alone miss what they are to find; arguments as those of `forward` and `missed`.

@@ -2,8 +2,9 @@
 
 The first frame says where things were before an arm stood in front of them or a block lay upon the target. Whether
 it is done is a matter of millimetres between things, so some of the judge's key-points are taught to lie on them, as
-far as the data say where they are; it looks closely there, and how far they lie apart on the ground is all that one
-of its two opinions rests on. The other takes in all that is seen.
+far as the data say where they are, and it looks closely there. How far they lie apart on the ground decides on
+success, and nothing else: whatever was learned beside it cost verdicts. Progress, and success where the data say
+nothing of places, take in all that is seen.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class LearnedJudge(Judge):
         hold: frames in a row that make an episode a success.
         margin: half-width of the band around the threshold in which a clip's best frame makes the judge abstain.
         width, points: of the encoder of the first view.
-        aims: key-points that are taught to lie on the objects of the data, in their order.
+        aims: key-points that are taught to lie on the objects of the data, in their order; 0 where no gap between things makes a success.
     """
 
     def __init__(self, views: int = 3, hold: int = 4, margin: float = 0.0, width: int = 24, points: int = 24, aims: int = 2):
@@ -41,6 +42,10 @@ class LearnedJudge(Judge):
         self.look = nn.Sequential(nn.Linear(self.main.out_features + 16 * views, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU(), nn.Linear(128, 1))
         self.sharpness = nn.Parameter(torch.tensor([2.0]))  # FSDP2 takes no scalars
         self.enough = nn.Linear(16, 1)
+        # Words say which two things it is about, not how near is near: heard on that, colours moved it by millimetres.
+        self.pair = nn.Parameter(torch.zeros(16, self.main.gaps))
+        self.near = nn.Parameter(torch.ones(self.main.gaps))
+        self.strictness = nn.Parameter(torch.tensor([2.5]))
 
     def forward(self, frames: Tensor, first: Tensor, tokens: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Logits of success and of progress, float32 [N], and where it sees the objects, at a first look and closely, [N, 2, aims, 2] in half-pictures from the middle.
@@ -57,10 +62,15 @@ class LearnedJudge(Judge):
         look = self.look(torch.cat([*parts, words], -1)).float()
         if generator is not None:  # what is seen can be learned by heart: half of the time the gaps must do without it
             look = look * (torch.rand((len(look), 1), generator=generator) < 0.5).to(look.device)
-        progress = (self.apart(torch.cat((seen[:, seen.shape[1] - self.main.gaps :], words), -1)).float() + look)[:, 0]
+        gaps = seen[:, seen.shape[1] - self.main.gaps :]
+        progress = (self.apart(torch.cat((gaps, words), -1)).float() + look)[:, 0]
         # Success is progress beyond what the words call enough; progress is taught by every frame, and by centimetres only:
-        # taught by successes too, it saw things closer together than they are.
-        return self.sharpness * progress.detach() + self.enough(words)[:, 0].float(), progress, aimed
+        # taught by successes too, it saw things closer together than they are. So do gaps learn from places only.
+        success = self.sharpness * progress.detach() + self.enough(words)[:, 0].float()
+        if self.main.gaps:
+            nearer = ((words @ self.pair).softmax(-1) * (self.near - gaps.detach())).sum(-1).float()
+            success = torch.where(self.main.surveyed.all(), self.strictness.exp() * nearer, success)
+        return success, progress, aimed
 
     @torch.no_grad()
     def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:

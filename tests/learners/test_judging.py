@@ -39,6 +39,33 @@ def test_a_surveyed_gaze_tells_gaps_in_metres(store: ClipStore) -> None:
     before = gaze.plane.clone()
     gaze.survey(where * torch.nan, objects[:, :2, :2])  # of data that know nothing nothing is learned
     assert torch.equal(gaze.plane, before)
+    blind = Gaze(4, 8, 2)
+    blind.survey(where * torch.nan, objects[:, :2, :2])
+    assert bool(gaze.surveyed.all()) and not bool(blind.surveyed.any())
+
+
+def test_where_places_are_known_the_gap_alone_decides() -> None:
+    torch.manual_seed(0)
+    judge = LearnedJudge(hold=2, width=8, points=4).eval()
+    frames, words = torch.randint(0, 256, (8, 3, 3, 64, 64), dtype=torch.uint8), torch.randint(1, 20, (8, 12))
+
+    def success() -> torch.Tensor:
+        with torch.no_grad():
+            return judge(frames, frames, words)[0]
+
+    by_progress = success()
+    judge.main.surveyed.fill_(True)
+    by_gap = success()
+    with torch.no_grad():
+        pair = torch.cat((to_signed(frames)[:, 0], to_signed(frames)[:, 0]), 1)
+        gaps = judge.main(pair)[0][:, -1]
+    assert torch.equal(by_gap.argsort(), gaps.argsort(descending=True))
+    words = words.flip(0)  # it is as near whatever things are called
+    assert torch.equal(success(), by_gap)
+    judge.main.surveyed[1] = False  # of one of them nobody knows
+    assert not torch.equal(success(), by_progress)  # progress hears the words
+    words = words.flip(0)
+    assert torch.equal(success(), by_progress)
 
 
 def test_judge_learns_to_aim(store: ClipStore, tmp_path: Path) -> None:
