@@ -125,7 +125,7 @@ def calibrate(judge: Judge, success: Tensor, succeeded: Tensor) -> bool:
 
     solver.step(objective)
     slope, offset = line.tolist()
-    if slope <= 0:
+    if not slope > 0:  # or NaN
         return False
     judge.threshold.fill_(float(torch.tensor(-offset / slope).sigmoid().clamp(0.02, 0.98)))
     return True
