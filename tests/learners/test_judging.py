@@ -68,6 +68,21 @@ def test_where_places_are_known_the_gap_alone_decides() -> None:
     assert torch.equal(success(), by_progress)
 
 
+def test_words_choose_the_two_things() -> None:
+    torch.manual_seed(0)
+    judge = LearnedJudge(hold=2, width=8, points=4, aims=3).eval()
+    judge.main.surveyed.fill_(True)
+    frames, words = torch.randint(0, 256, (6, 3, 3, 64, 64), dtype=torch.uint8), torch.tensor([[1] * 12] * 3 + [[2] * 12] * 3)
+    with torch.no_grad():
+        heard = judge.words(words)[[0, 3]]
+        judge.pair.copy_(torch.linalg.pinv(heard) @ torch.tensor([[100.0, 0.0, 0.0], [0.0, 0.0, 100.0]]))  # one names the first pair, two the last
+        pictures = to_signed(frames)[:, 0]
+        gaps = judge.main(torch.cat((pictures, pictures), 1))[0][:, -3:]
+        logits = judge(frames, frames, words)[0]
+    chosen = torch.cat((gaps[:3, 0], gaps[3:, 2]))
+    assert torch.allclose(logits, judge.strictness.exp() * (1 - chosen), atol=1e-4)
+
+
 def test_judge_learns_to_aim(store: ClipStore, tmp_path: Path) -> None:
     torch.manual_seed(0)
     judge = LearnedJudge(hold=2, width=8, points=4)
