@@ -42,7 +42,7 @@ class LearnedJudge(Judge):
         self.look = nn.Sequential(nn.Linear(self.main.out_features + 16 * views, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU(), nn.Linear(128, 1))
         self.sharpness = nn.Parameter(torch.tensor([2.0]))  # FSDP2 takes no scalars
         self.enough = nn.Linear(16, 1)
-        # Words say which two things it is about, not how near is near: heard on that, colours moved it by millimetres.
+        # Words say which two things it is about, not how near is near: that they learned from colours by heart.
         self.pair = nn.Parameter(torch.zeros(16, self.main.gaps))
         self.near = nn.Parameter(torch.ones(self.main.gaps))
         self.strictness = nn.Parameter(torch.tensor([2.5]))
@@ -65,7 +65,7 @@ class LearnedJudge(Judge):
         gaps = seen[:, seen.shape[1] - self.main.gaps :]
         progress = (self.apart(torch.cat((gaps, words), -1)).float() + look)[:, 0]
         # Success is progress beyond what the words call enough; progress is taught by every frame, and by centimetres only:
-        # taught by successes too, it saw things closer together than they are. So do gaps learn from places only.
+        # taught by successes too, it saw things closer together than they are. Gaps are detached for the same reason.
         success = self.sharpness * progress.detach() + self.enough(words)[:, 0].float()
         if self.main.gaps:
             nearer = ((words @ self.pair).softmax(-1) * (self.near - gaps.detach())).sum(-1).float()
