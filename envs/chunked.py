@@ -1,4 +1,6 @@
-"""What both worlds share: one step is one chunk, the specs of VLA observations, and seeded queues of episodes."""
+"""What both worlds share: one step is one chunk, the specs of VLA observations, and seeded queues of
+episodes.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +14,14 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from envs.language import VOCABULARY, WORDS, tokenize
-from envs.schema import ACTION_DIM, EPISODE, STATE_DIM, TOKENS, ActionMode
+from envs.specs import ACTION_DIM, EPISODE, STATE_DIM, TOKENS, ActionMode
 
 
 class ChunkedEnv(EnvBase):
     """Base of PhysicsEnv and WorldEnv: a batched environment with the same specs in truth and in imagination.
 
-    Every episode has a seed. Seeds come from the queue filled by `schedule`, and when it is empty from a stream
+    Every episode has a seed. Seeds come from the queue filled by `schedule`, and when it is empty from a
+    stream
     of their own; what happens in an episode depends on its seed and on the actions only.
 
     Args:
@@ -59,7 +62,8 @@ class ChunkedEnv(EnvBase):
         self._steps = torch.zeros(batch, dtype=torch.int64)
         self._over = torch.ones(batch, 1, dtype=torch.bool)
         self._values: dict[int, dict[str, Any]] = {}
-        # Words stay outside the rollout, which carries their tokens: stacks of strings break TorchRL's stacking by device.
+        # Words stay outside the rollout, which carries their tokens: stacks of strings break TorchRL's
+        # stacking by device.
         self.instructions: list[str] = [""] * batch
         shape = (batch,)
         height, width = size
@@ -83,9 +87,12 @@ class ChunkedEnv(EnvBase):
             device=device,
         )
         self._observation_keys = list(self.observation_spec.keys(True, True))
-        # A spec must be bounded to be sampled from; a metre or a radian per chunk is beyond what any arm does.
+        # A spec must be bounded to be sampled from; a metre or a radian per chunk is beyond what any arm
+        # does.
         self.action_spec = Composite(
-            vla_action=Composite(chunk=Bounded(-1.0, 1.0, (*shape, chunk, actions)), shape=shape), shape=shape, device=device
+            vla_action=Composite(chunk=Bounded(-1.0, 1.0, (*shape, chunk, actions)), shape=shape),
+            shape=shape,
+            device=device,
         )
         self.reward_spec = Unbounded((*shape, 1), device=device)
         flag = Categorical(2, (*shape, 1), dtype=torch.bool, device=device)
@@ -121,7 +128,8 @@ class ChunkedEnv(EnvBase):
         return self._seeds
 
     def _with_identity(self, out: TensorDict, instructions: Sequence[str]) -> TensorDict:
-        out[EPISODE] = self._seeds.to(self.device, copy=True).unsqueeze(-1)  # a rollout keeps it while resets go on
+        # a rollout keeps it while resets go on
+        out[EPISODE] = self._seeds.to(self.device, copy=True).unsqueeze(-1)
         out[TOKENS] = torch.stack([tokenize(text) for text in instructions]).to(self.device)
         self.instructions = list(instructions)
         return out

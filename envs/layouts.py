@@ -1,6 +1,8 @@
-"""What the numbers of commands and joint states mean, as types: 16 numbers of one layout are never taken for another's.
+"""What the numbers of commands and joint states mean, as types: 16 numbers of one layout are never taken for
+another's.
 
-Two layouts of two 7-joint arms are in use, and both have 16 numbers: simulators take and give [L7, Lg, R7, Rg], openpi
+Two layouts of two 7-joint arms are in use, and both have 16 numbers: simulators take and give [L7, Lg, R7,
+Rg], openpi
 policies read [L7, R7, Lg, Rg]. So joint numbers cross borders as `Joints`, which knows its layout.
 """
 
@@ -64,7 +66,9 @@ class Joints:
 
     def __post_init__(self) -> None:
         if self.values.shape[-1] != 16:
-            raise ValueError(f"joints of two arms are 16 numbers, {self.layout.value}; got {tuple(self.values.shape)}")
+            raise ValueError(
+                f"joints of two arms are 16 numbers, {self.layout.value}; got {tuple(self.values.shape)}"
+            )
 
     def to(self, layout: JointLayout) -> Tensor:
         """The bare numbers [..., 16] in a layout."""
@@ -75,7 +79,8 @@ class Joints:
 
 
 def compress(chunk: Tensor, count: int, layout: CommandLayout) -> Tensor:
-    """A long chunk [..., L, A] as one of `count` rows: grippers by the nearest row, all else by means between the kept first and last row.
+    """A long chunk [..., L, A] as one of `count` rows: grippers by the nearest row, all else by means between
+    the kept first and last row.
 
     A policy may say 50 rows where a world takes 25; this is GE-Sim 2.0's way to spend one step on them.
 
@@ -92,8 +97,16 @@ def compress(chunk: Tensor, count: int, layout: CommandLayout) -> Tensor:
     if count == 1:
         return chunk[..., :1, :]
     nearest = torch.linspace(0, length - 1, count, dtype=torch.float64).round().long()
-    inner = F.adaptive_avg_pool1d(chunk[..., 1:-1, :].reshape(-1, length - 2, width).transpose(1, 2), count - 2).transpose(1, 2) if count > 2 else chunk[..., :0, :]
-    out = torch.cat([chunk[..., :1, :], inner.reshape(*chunk.shape[:-2], count - 2, width), chunk[..., -1:, :]], -2)
+    inner = (
+        F.adaptive_avg_pool1d(
+            chunk[..., 1:-1, :].reshape(-1, length - 2, width).transpose(1, 2), count - 2
+        ).transpose(1, 2)
+        if count > 2
+        else chunk[..., :0, :]
+    )
+    out = torch.cat(
+        [chunk[..., :1, :], inner.reshape(*chunk.shape[:-2], count - 2, width), chunk[..., -1:, :]], -2
+    )
     for gripper in layout.grippers:
         out[..., gripper] = chunk[..., nearest, gripper]
     return out

@@ -1,4 +1,6 @@
-"""Where bfloat16 is used: on devices that compute in it. Others only emulate it, hundreds of times slower than float32."""
+"""Where bfloat16 is used: on devices that compute in it. Others only emulate it, hundreds of times slower
+than float32.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,9 @@ import torch
 
 
 def computes_bf16(device: torch.device) -> bool:
-    """Whether a device has instructions for bfloat16 (AVX-512 BF16 or AMX on a CPU, Ampere and later on a GPU)."""
+    """Whether a device has instructions for bfloat16 (AVX-512 BF16 or AMX on a CPU, Ampere and later on a
+    GPU).
+    """
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     return bool(torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())
@@ -18,5 +22,7 @@ def working_dtype(device: torch.device, otherwise: torch.dtype) -> torch.dtype:
 
 
 def mixed_precision(device: torch.device, wanted: bool) -> torch.autocast:
-    """Autocast to bfloat16 where it is wanted and the device computes in it, else a context that changes nothing."""
+    """Autocast to bfloat16 where it is wanted and the device computes in it, else a context that changes
+    nothing.
+    """
     return torch.autocast(device.type, torch.bfloat16, enabled=wanted and computes_bf16(device))

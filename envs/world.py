@@ -1,6 +1,7 @@
 """WorldEnv: any Simulator behind the contract of PhysicsEnv. Frames are generated in `_step`.
 
-The bare environment takes conditioning (commands, pose map, cameras) and knows neither joint states nor rewards;
+The bare environment takes conditioning (commands, pose map, cameras) and knows neither joint states nor
+rewards;
 the transforms of envs/transforms add them: TransformedEnv(WorldEnv(...), world_transforms(...)).
 """
 
@@ -17,15 +18,30 @@ from torchrl.data import Bounded, Composite, Unbounded
 from envs.chunked import ChunkedEnv
 from envs.episodes.clips import ClipStore
 from envs.precision import mixed_precision
-from envs.schema import C2W, CHUNK_C2W, COMMAND, COMMANDS, FEATURES, FRAMES, IMAGE, INTRINSIC, POSE_MAP, PROGRESS, STATE, SUCCESS, ActionMode
 from envs.simulators.base import Simulator
+from envs.specs import (
+    C2W,
+    CHUNK_C2W,
+    COMMAND,
+    COMMANDS,
+    FEATURES,
+    FRAMES,
+    IMAGE,
+    INTRINSIC,
+    POSE_MAP,
+    PROGRESS,
+    STATE,
+    SUCCESS,
+    ActionMode,
+)
 
 
 @dataclass
-class Starts:
+class InitialStates:
     """First frames of recorded episodes, from which imagined ones begin; N rows.
 
-    image and pose_map uint8 [N, V, 3, H, W], state [N, 16], command [N, A], intrinsic [N, V, 3, 3], c2w [N, V, 4, 4].
+    image and pose_map uint8 [N, V, 3, H, W], state [N, 16], command [N, A], intrinsic [N, V, 3, 3], c2w [N,
+    V, 4, 4].
     """
 
     image: Tensor
@@ -38,7 +54,7 @@ class Starts:
     views: tuple[str, ...]
 
     @classmethod
-    def of(cls, store: ClipStore, episodes: Tensor | None = None) -> Starts:
+    def of(cls, store: ClipStore, episodes: Tensor | None = None) -> InitialStates:
         """The first frames of the given episodes of a store, of all by default."""
         chosen = torch.arange(len(store)) if episodes is None else episodes
         rows = store.start[chosen]
@@ -60,8 +76,10 @@ class Starts:
 class WorldEnv(ChunkedEnv):
     """A batch of imagined episodes.
 
-    An episode's seed says where it begins (seed modulo the number of starts) and, with the chunk's index, all its
-    noise: it is the same in any slot, batch or process. Seeds that differ by a multiple of the number of starts
+    An episode's seed says where it begins (seed modulo the number of starts) and, with the chunk's index, all
+    its
+    noise: it is the same in any slot, batch or process. Seeds that differ by a multiple of the number of
+    starts
     begin alike and differ in noise, unless `shared_noise` makes them alike in that too.
 
     Args:
@@ -81,7 +99,7 @@ class WorldEnv(ChunkedEnv):
     def __init__(
         self,
         simulator: Simulator,
-        starts: Starts,
+        starts: InitialStates,
         batch: int,
         horizon: int,
         mode: ActionMode = ActionMode.RELATIVE,
@@ -91,14 +109,29 @@ class WorldEnv(ChunkedEnv):
     ):
         shape = simulator.shape
         if tuple(starts.image.shape[1:]) != (shape.views, 3, *shape.size):
-            raise ValueError(f"starts show {tuple(starts.image.shape[1:])}, the simulator {(shape.views, 3, *shape.size)}; train it on these views")
+            raise ValueError(
+                f"starts show {tuple(starts.image.shape[1:])}, the simulator {(shape.views, 3, *shape.size)}; train it on these views"
+            )
         device = next(simulator.parameters()).device
-        super().__init__(batch, shape.chunk, horizon, shape.views, shape.size, mode, device, seed, actions=shape.layout.size)
+        super().__init__(
+            batch,
+            shape.chunk,
+            horizon,
+            shape.views,
+            shape.size,
+            mode,
+            device,
+            seed,
+            actions=shape.layout.size,
+        )
         self.simulator, self.starts, self.shared_noise, self.bf16 = simulator, starts, shared_noise, bf16
         self.session: TensorDict | None = None
         pictures = (batch, shape.chunk, shape.views, 3, *shape.size)
         self.observation_spec["world"] = Composite(
-            frames=Bounded(0, 255, pictures, dtype=torch.uint8), features=Unbounded((batch, *simulator.feature_shape)), shape=(batch,), device=device
+            frames=Bounded(0, 255, pictures, dtype=torch.uint8),
+            features=Unbounded((batch, *simulator.feature_shape)),
+            shape=(batch,),
+            device=device,
         )
         self.action_spec = Composite(
             {
@@ -114,12 +147,19 @@ class WorldEnv(ChunkedEnv):
         mask = self._reset_mask(tensordict)
         seeds = self._next_seeds(mask)[mask]
         start = seeds % len(self.starts)
-        names = {"frames": "image", "intrinsic": "intrinsic", "c2w": "c2w", "command": "command", "state": "state", "pose_map": "pose_map"}
+        names = {
+            "frames": "image",
+            "intrinsic": "intrinsic",
+            "c2w": "c2w",
+            "command": "command",
+            "state": "state",
+            "pose_map": "pose_map",
+        }
         begin = {key: getattr(self.starts, name)[start].to(self.device) for key, name in names.items()}
         noise = start if self.shared_noise else seeds
         if self.session is not None:
             self.simulator.release(self.session, mask)
-        fresh = self.simulator.reset(**begin, seed=noise.to(self.device), room=self.horizon + 1)
+        fresh = self.simulator.reset(**begin, seed=noise.to(self.device), capacity=self.horizon + 1)
         if self.session is None or mask.all():
             self.session = fresh
         else:
@@ -128,7 +168,9 @@ class WorldEnv(ChunkedEnv):
         self._over[mask] = False
         batch, shape = self.batch_size[0], self.simulator.shape
         out = self._observe()
-        out[FRAMES] = torch.zeros(batch, shape.chunk, shape.views, 3, *shape.size, dtype=torch.uint8, device=self.device)
+        out[FRAMES] = torch.zeros(
+            batch, shape.chunk, shape.views, 3, *shape.size, dtype=torch.uint8, device=self.device
+        )
         out[FEATURES] = torch.zeros(batch, *self.simulator.feature_shape, device=self.device)
         for key in ("done", "terminated", "truncated"):
             out[key] = torch.zeros(batch, 1, dtype=torch.bool, device=self.device)
@@ -137,7 +179,9 @@ class WorldEnv(ChunkedEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         assert self.session is not None
         with mixed_precision(self.device, self.bf16):
-            frames, features, self.session = self.simulator.step(self.session, tensordict[COMMANDS], tensordict[POSE_MAP], tensordict[CHUNK_C2W])
+            frames, features, self.session = self.simulator.step(
+                self.session, tensordict[COMMANDS], tensordict[POSE_MAP], tensordict[CHUNK_C2W]
+            )
         self._steps += self.chunk
         out = self._observe()
         out[FRAMES], out[FEATURES] = frames, features
@@ -161,7 +205,9 @@ class WorldEnv(ChunkedEnv):
         out[C2W] = now["c2w"]
         out[SUCCESS] = torch.zeros(batch, 1, dtype=torch.bool, device=self.device)
         out[PROGRESS] = torch.zeros(batch, 1, device=self.device)
-        return self._with_identity(out, [self.starts.instructions[int(s)] for s in self._seeds % len(self.starts)])
+        return self._with_identity(
+            out, [self.starts.instructions[int(s)] for s in self._seeds % len(self.starts)]
+        )
 
     def video(self, slot: int) -> Tensor:
         """All frames of the episode in a slot so far, uint8 [T, V, 3, H, W], the first being real."""

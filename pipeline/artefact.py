@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from safetensors.torch import save_file
 from torch import nn
 
-from learners.parallel import leads
+from learners.training.parallel import leads
 
 _PACKAGES = ("worldloop", "torch", "torchrl", "tensordict", "numpy", "mujoco")
 
@@ -31,7 +31,9 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text)
     except OSError as error:
         temporary.unlink(missing_ok=True)
-        raise OSError(f"cannot write {path}: {error.strerror}; free disk space and start again, finished stages are kept") from error
+        raise OSError(
+            f"cannot write {path}: {error.strerror}; free disk space and start again, finished stages are kept"
+        ) from error
     os.replace(temporary, path)
 
 
@@ -43,10 +45,15 @@ def save_weights(module: nn.Module, folder: Path, name: str = "weights") -> Path
     path = folder / f"{name}.safetensors"
     temporary = folder / f".{name}.part"
     try:
-        save_file({key: value.detach().cpu().contiguous().clone() for key, value in module.state_dict().items()}, temporary)
+        save_file(
+            {key: value.detach().cpu().contiguous().clone() for key, value in module.state_dict().items()},
+            temporary,
+        )
     except Exception as error:
         temporary.unlink(missing_ok=True)
-        raise OSError(f"cannot write {path}: {error}; free disk space and start again, finished stages are kept") from error
+        raise OSError(
+            f"cannot write {path}: {error}; free disk space and start again, finished stages are kept"
+        ) from error
     os.replace(temporary, path)
     return path
 
@@ -60,15 +67,32 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             out[package] = "not installed"
     root = Path(__file__).resolve().parent.parent
-    commit = subprocess.run(["git", "-C", str(root), "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    commit = subprocess.run(
+        ["git", "-C", str(root), "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
+    )
     out["commit"] = commit.stdout.strip() or "unknown"
     return out
 
 
-def finish(folder: Path, stage: str, key: str, config: Mapping[str, Any], parents: Mapping[str, str], seconds: float, result: Mapping[str, Any]) -> None:
+def finish(
+    folder: Path,
+    stage: str,
+    key: str,
+    config: Mapping[str, Any],
+    parents: Mapping[str, str],
+    seconds: float,
+    result: Mapping[str, Any],
+) -> None:
     """Write config.yaml and, last, manifest.json."""
     write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
-    manifest = {"stage": stage, "key": key, "parents": dict(parents), "seconds": round(seconds, 2), "versions": versions(), "result": dict(result)}
+    manifest = {
+        "stage": stage,
+        "key": key,
+        "parents": dict(parents),
+        "seconds": round(seconds, 2),
+        "versions": versions(),
+        "result": dict(result),
+    }
     write_text(folder / "manifest.json", json.dumps(manifest, indent=1, default=float))
 
 

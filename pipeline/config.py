@@ -31,8 +31,12 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
         plain = OmegaConf.to_container(cfg, resolve=True)
     except (HydraException, OmegaConfBaseException) as error:
         text = str(error).split("\nSee https")[0].split("\nfull_key")[0]
-        choices = ", ".join(sorted(p.name for p in CONFIGS.iterdir() if p.is_dir() and not p.name.startswith("_")))
-        raise ConfigError(f"{text}\nGroups are {choices}; `worldloop config` prints every key with its value.") from error
+        choices = ", ".join(
+            sorted(p.name for p in CONFIGS.iterdir() if p.is_dir() and not p.name.startswith("_"))
+        )
+        raise ConfigError(
+            f"{text}\nGroups are {choices}; `worldloop config` prints every key with its value."
+        ) from error
     assert isinstance(plain, dict)
     cfg_plain: dict[str, Any] = {str(key): value for key, value in plain.items()}
     _check(cfg_plain)

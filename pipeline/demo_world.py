@@ -1,6 +1,7 @@
 """A small imagined world made in seconds: a few scripted episodes and networks that have learned nothing.
 
-What it shows is poor, but every part is the real one; benchmarks and chaos runs need its load, not its pictures.
+What it shows is poor, but every part is the real one; benchmarks and chaos runs need its load, not its
+pictures.
 """
 
 from __future__ import annotations
@@ -13,14 +14,16 @@ import torch
 from torch import nn
 
 from actors.factory import bench_config, build_judge, build_policy, build_simulator, build_state_decoder
-from actors.recipe import Recipe
+from actors.rollouts.recipe import Recipe
 from envs.episodes import Episode, LeRobotWriter
 from envs.physics.pool import BenchPool
 from pipeline.artefact import save_weights
 
 
 def demo_recipe(cfg: Mapping[str, Any], folder: Path, episodes: int, starts: int = 16) -> Recipe:
-    """Weights and data in `folder`, made if they are not there, and the recipe of hosts with `episodes` side by side."""
+    """Weights and data in `folder`, made if they are not there, and the recipe of hosts with `episodes` side
+    by side.
+    """
     parts = ("policy", "simulator", "decoder", "judge")
     data = folder / "dataset"
     if not (folder / "done").exists():
@@ -32,13 +35,32 @@ def demo_recipe(cfg: Mapping[str, Any], folder: Path, episodes: int, starts: int
         finally:
             pool.close()
         LeRobotWriter(data, bench.views, bench.size, cfg["task"]["control_hz"]).write(
-            [Episode.from_track(track, "noisy" if number % 4 else "expert", bench.views, cfg["task"]["control_hz"]) for number, track in enumerate(tracks)]
+            [
+                Episode.from_track(
+                    track, "noisy" if number % 4 else "expert", bench.views, cfg["task"]["control_hz"]
+                )
+                for number, track in enumerate(tracks)
+            ]
         )
         simulator = build_simulator(cfg)
-        modules: list[nn.Module] = [build_policy(cfg), simulator, build_state_decoder(cfg, simulator), build_judge(cfg)]
+        modules: list[nn.Module] = [
+            build_policy(cfg),
+            simulator,
+            build_state_decoder(cfg, simulator),
+            build_judge(cfg),
+        ]
         for name, module in zip(parts, modules, strict=True):
             (folder / name).mkdir(parents=True, exist_ok=True)
             save_weights(module, folder / name)
         (folder / "done").touch()
     paths = [str((folder / name / "weights.safetensors").resolve()) for name in parts]
-    return Recipe(cfg, episodes, paths[0], paths[1], paths[2], paths[3], (str(data.resolve()),), cfg["rl"]["freeze_perception"])
+    return Recipe(
+        cfg,
+        episodes,
+        paths[0],
+        paths[1],
+        paths[2],
+        paths[3],
+        (str(data.resolve()),),
+        cfg["rl"]["freeze_perception"],
+    )

@@ -9,7 +9,19 @@ from importlib.metadata import PackageNotFoundError, version
 
 import torch
 
-_NEEDED = ("torch", "torchrl", "tensordict", "mujoco", "av", "pyarrow", "hydra-core", "ray", "wandb", "opencv-python-headless", "matplotlib")
+_NEEDED = (
+    "torch",
+    "torchrl",
+    "tensordict",
+    "mujoco",
+    "av",
+    "pyarrow",
+    "hydra-core",
+    "ray",
+    "wandb",
+    "opencv-python-headless",
+    "matplotlib",
+)
 
 
 def examine() -> int:
@@ -21,7 +33,10 @@ def examine() -> int:
         fine &= good
         print(f"[{'ok' if good else 'NO'}] {what}" + (f"\n     {fix}" if fix and not good else ""))
 
-    say(True, f"{platform.system()} {platform.release()}, Python {platform.python_version()}, {os.cpu_count()} cores")
+    say(
+        True,
+        f"{platform.system()} {platform.release()}, Python {platform.python_version()}, {os.cpu_count()} cores",
+    )
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     say(memory >= 6, f"{memory:.0f} GiB of memory", "quickstart needs about 6 GiB")
     free = shutil.disk_usage(".").free / 2**30
@@ -36,11 +51,15 @@ def examine() -> int:
     else:
         print("[--] no GPU; everything runs on the CPU")
     try:
-        from envs.physics.bench import Bench, BenchConfig
+        from envs.physics.tabletop.bench import Bench, BenchConfig
 
         bench = Bench(BenchConfig())
         bench.reset(0)
-        say(int(bench.render().max()) > 0, f"OpenGL renders (MUJOCO_GL={os.environ.get('MUJOCO_GL', 'egl')})", "the picture is black: try MUJOCO_GL=osmesa")
+        say(
+            int(bench.render().max()) > 0,
+            f"OpenGL renders (MUJOCO_GL={os.environ.get('MUJOCO_GL', 'egl')})",
+            "the picture is black: try MUJOCO_GL=osmesa",
+        )
     except Exception as error:  # whatever is wrong with the driver, the doctor's work is to say so
         say(False, "OpenGL", str(error))
     print("\nready: make quickstart" if fine else "\nnot ready: see the lines marked NO")

@@ -1,4 +1,6 @@
-"""The stage graph: a stage is keyed by its config and its parents, run once, reused for ever, resumed when cut short."""
+"""The stage graph: a stage is keyed by its config and its parents, run once, reused for ever, resumed when
+cut short.
+"""
 
 from __future__ import annotations
 
@@ -52,9 +54,17 @@ class Graph:
         unknown = [parent for parent in stage.parents if parent not in self.stages]
         if unknown:
             raise ValueError(f"stage {stage.name} comes before its parents {unknown}")
-        # Worked out once: by way of all its parents again, the ways through a graph multiply with every round.
-        text = json.dumps([stage.name, stage.config, [self.key(parent) for parent in stage.parents]], sort_keys=True, default=str)
-        self.stages[stage.name], self._keys[stage.name] = stage, hashlib.sha256(text.encode()).hexdigest()[:12]
+        # Worked out once: by way of all its parents again, the ways through a graph multiply with every
+        # round.
+        text = json.dumps(
+            [stage.name, stage.config, [self.key(parent) for parent in stage.parents]],
+            sort_keys=True,
+            default=str,
+        )
+        self.stages[stage.name], self._keys[stage.name] = (
+            stage,
+            hashlib.sha256(text.encode()).hexdigest()[:12],
+        )
         return stage.name
 
     def key(self, name: str) -> str:
@@ -96,7 +106,15 @@ class Graph:
                     raise
                 seconds = earlier + time.perf_counter() - began
                 spent.unlink(missing_ok=True)
-                finish(folder, name, self.key(name), stage.config, {p: self.key(p) for p in stage.parents}, seconds, result)
+                finish(
+                    folder,
+                    name,
+                    self.key(name),
+                    stage.config,
+                    {p: self.key(p) for p in stage.parents},
+                    seconds,
+                    result,
+                )
                 manifest = read_manifest(folder)
                 assert manifest is not None
                 tqdm.write(f"    {name} took {seconds:.0f} s {_brief(manifest['result'])}")
@@ -116,5 +134,9 @@ class Graph:
 
 
 def _brief(result: Mapping[str, Any]) -> str:
-    parts = [f"{key}={value:.3g}" if isinstance(value, float) else f"{key}={value}" for key, value in result.items() if isinstance(value, (int, float, str)) and not isinstance(value, bool)]
+    parts = [
+        f"{key}={value:.3g}" if isinstance(value, float) else f"{key}={value}"
+        for key, value in result.items()
+        if isinstance(value, (int, float, str)) and not isinstance(value, bool)
+    ]
     return ", ".join(parts[:6])

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.factory import ConfigError, build_simulator, build_state_decoder, joints_to_hands, options
-from actors.serve.sessions import ServeConfig, SessionHost
+from actors.serving.sessions import ServeConfig, SessionHost
 from pipeline.loop import build_loop
 
 
@@ -22,9 +22,15 @@ def build_session_host(cfg: Mapping[str, Any], root: Path) -> tuple[SessionHost,
         raise ConfigError("simulator=remote is served already; serve unet, dit or gesim")
     config = options(ServeConfig, cfg["serve"], "serve")
     graph, last = build_loop(dict(cfg), root), cfg["rounds"]["count"]
-    weights, decoder_weights = (graph.folder(f"{stage}-{last}") / "weights.safetensors" for stage in ("vision", "state"))
+    weights, decoder_weights = (
+        graph.folder(f"{stage}-{last}") / "weights.safetensors" for stage in ("vision", "state")
+    )
     if not weights.exists() and not cfg["simulator"].get("checkpoint"):
-        raise ConfigError(f"{weights} does not exist; run this experiment first, or serve released weights by simulator=gesim simulator.checkpoint=<folder>")
+        raise ConfigError(
+            f"{weights} does not exist; run this experiment first, or serve released weights by simulator=gesim simulator.checkpoint=<folder>"
+        )
     simulator = build_simulator(cfg, weights if weights.exists() else None)
     decoder = build_state_decoder(cfg, simulator, decoder_weights if decoder_weights.exists() else None)
-    return SessionHost(simulator, decoder.eval(), config, joints_to_hands(cfg), cfg["simulator"]["bf16"]), config
+    return SessionHost(
+        simulator, decoder.eval(), config, joints_to_hands(cfg), cfg["simulator"]["bf16"]
+    ), config

@@ -1,6 +1,8 @@
-"""Stages elsewhere: those that learn in several processes, those that evaluate where launch.place.evaluator says.
+"""Stages elsewhere: those that learn in several processes, those that evaluate where launch.place.evaluator
+says.
 
-Ray Train starts the processes that learn; all of them run the stage, the leading one writes. Which parts of a stage are shared out is told in learners/parallel.py. A worker that dies takes the others with it; Ray
+Ray Train starts the processes that learn; all of them run the stage, the leading one writes. Which parts of a
+stage are shared out is told in learners/parallel.py. A worker that dies takes the others with it; Ray
 Train starts all anew, and the stage goes on from its last checkpoint.
 """
 
@@ -22,13 +24,16 @@ SHARED = ("imitation", "tokenizer", "vision", "state", "judge", "clone", "rl")
 EVALUATORS = ("gap", "evaluate_physics", "evaluate_imagined", "measure")
 
 
-def run_stage(function: str, cfg: Mapping[str, Any], folder: Path, found: Mapping[str, Path], known: Mapping[str, Any]) -> dict[str, Any]:
-    """Run a stage of pipeline/work where the config wants it: in this process, on Ray's evaluator, or in launch.learners processes.
+def run_stage(
+    function: str, cfg: Mapping[str, Any], folder: Path, found: Mapping[str, Path], known: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Run a stage of pipeline/work where the config wants it: in this process, on Ray's evaluator, or in
+    launch.learners processes.
 
     Raises:
         ConfigError: if the processes cannot be placed, or failed.
     """
-    from pipeline import work
+    from pipeline import stages as work
 
     if function in SHARED and learners_of(cfg) > 1:
         return run_shared(function, cfg, folder, found, known)
@@ -45,11 +50,15 @@ def learners_of(cfg: Mapping[str, Any]) -> int:
     """
     count = int(cfg["launch"].get("learners", 1))
     if count > 1 and cfg["microbatches"] % count:
-        raise ConfigError(f"microbatches={cfg['microbatches']} must be a multiple of launch.learners={count}; say microbatches={count}")
+        raise ConfigError(
+            f"microbatches={cfg['microbatches']} must be a multiple of launch.learners={count}; say microbatches={count}"
+        )
     return count
 
 
-def run_shared(function: str, cfg: Mapping[str, Any], folder: Path, found: Mapping[str, Path], known: Mapping[str, Any]) -> dict[str, Any]:
+def run_shared(
+    function: str, cfg: Mapping[str, Any], folder: Path, found: Mapping[str, Path], known: Mapping[str, Any]
+) -> dict[str, Any]:
     """Run a stage of pipeline/work in launch.learners processes; returns what the leading one returned.
 
     Raises:
@@ -59,7 +68,7 @@ def run_shared(function: str, cfg: Mapping[str, Any], folder: Path, found: Mappi
     from ray.train import FailureConfig, RunConfig, ScalingConfig
     from ray.train.torch import TorchConfig, TorchTrainer
 
-    from actors.cluster import Plan, connect
+    from actors.fleets.cluster import Plan, connect
 
     launch = cfg["launch"]
     plan = Plan.of(launch)
@@ -78,29 +87,44 @@ def run_shared(function: str, cfg: Mapping[str, Any], folder: Path, found: Mappi
         work_loop,
         train_loop_config=asked,
         torch_config=TorchConfig(backend="nccl" if gpus else "gloo"),
-        scaling_config=ScalingConfig(num_workers=launch["learners"], use_gpu=gpus > 0, resources_per_worker={"CPU": plan.cpus["learner"] or 0.01, **({"GPU": gpus} if gpus else {})}),
-        run_config=RunConfig(name=folder.name, storage_path=str((folder / "ray-train").resolve()), failure_config=FailureConfig(max_failures=launch["patience"]["retries"])),
+        scaling_config=ScalingConfig(
+            num_workers=launch["learners"],
+            use_gpu=gpus > 0,
+            resources_per_worker={"CPU": plan.cpus["learner"] or 0.01, **({"GPU": gpus} if gpus else {})},
+        ),
+        run_config=RunConfig(
+            name=folder.name,
+            storage_path=str((folder / "ray-train").resolve()),
+            failure_config=FailureConfig(max_failures=launch["patience"]["retries"]),
+        ),
     )
     try:
         trainer.fit()
     except Exception as error:
-        raise ConfigError(f"the {launch['learners']} learners of {folder.name} failed: {_last(error)}; the same command goes on from the last checkpoint") from error
+        raise ConfigError(
+            f"the {launch['learners']} learners of {folder.name} failed: {_last(error)}; the same command goes on from the last checkpoint"
+        ) from error
     return dict(json.loads(answer.read_text()))
 
 
-def run_placed(function: str, cfg: Mapping[str, Any], folder: Path, found: Mapping[str, Path], known: Mapping[str, Any]) -> dict[str, Any]:
-    """Run a stage of pipeline/work as a Ray task with the evaluator's resources; a lost node only costs a second try.
+def run_placed(
+    function: str, cfg: Mapping[str, Any], folder: Path, found: Mapping[str, Path], known: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Run a stage of pipeline/work as a Ray task with the evaluator's resources; a lost node only costs a
+    second try.
 
     Raises:
         ConfigError: if the task cannot be placed.
     """
     import ray
 
-    from actors.cluster import Plan, connect
+    from actors.fleets.cluster import Plan, connect
 
     plan = Plan.of(cfg["launch"])
     plan.check(connect(cfg["launch"]))
-    task = ray.remote(_measure).options(max_retries=int(cfg["launch"]["patience"]["retries"]), **plan.options("evaluator"))
+    task = ray.remote(_measure).options(
+        max_retries=int(cfg["launch"]["patience"]["retries"]), **plan.options("evaluator")
+    )
     paths = {name: str(path.resolve()) for name, path in found.items()}
     ref = task.remote(function, dict(cfg), str(folder.resolve()), paths, dict(known))
     deadline, waited = float(cfg["launch"]["patience"]["stage"]), 0.0
@@ -109,15 +133,23 @@ def run_placed(function: str, cfg: Mapping[str, Any], folder: Path, found: Mappi
         tqdm.write(f"the driver waits for the evaluator ({folder.name}), {waited:.0f} s")
         if waited >= deadline:
             ray.cancel(ref, force=True)
-            raise ConfigError(f"{folder.name} took over launch.patience.stage={deadline:.0f} s on the evaluator; raise it, or see whether launch.place.evaluator can be placed")
+            raise ConfigError(
+                f"{folder.name} took over launch.patience.stage={deadline:.0f} s on the evaluator; raise it, or see whether launch.place.evaluator can be placed"
+            )
     answer: dict[str, Any] = ray.get(ref)
     return answer
 
 
-def _measure(function: str, cfg: dict[str, Any], folder: str, found: dict[str, str], known: dict[str, Any]) -> dict[str, Any]:
-    from pipeline import work
+def _measure(
+    function: str, cfg: dict[str, Any], folder: str, found: dict[str, str], known: dict[str, Any]
+) -> dict[str, Any]:
+    from pipeline import stages as work
 
-    return dict(getattr(work, function)(cfg, Path(folder), {name: Path(path) for name, path in found.items()}, **known))
+    return dict(
+        getattr(work, function)(
+            cfg, Path(folder), {name: Path(path) for name, path in found.items()}, **known
+        )
+    )
 
 
 def work_loop(asked: dict[str, Any]) -> None:
@@ -125,13 +157,15 @@ def work_loop(asked: dict[str, Any]) -> None:
     import torch
     from ray.train.torch import get_device
 
-    from learners.parallel import leads
-    from pipeline import work
+    from learners.training.parallel import leads
+    from pipeline import stages as work
 
     if torch.cuda.is_available():
         torch.cuda.set_device(get_device())
     folder = Path(asked["folder"])
-    result = getattr(work, asked["function"])(asked["cfg"], folder, {name: Path(path) for name, path in asked["found"].items()}, **asked["known"])
+    result = getattr(work, asked["function"])(
+        asked["cfg"], folder, {name: Path(path) for name, path in asked["found"].items()}, **asked["known"]
+    )
     if leads():
         write_text(folder / "answer.json", json.dumps(result, default=float))
 

@@ -13,7 +13,19 @@ from tqdm import tqdm
 from actors.factory import ConfigError
 
 # What a job needs none of; Ray refuses packages over 500 MiB, and runs/ alone may be larger.
-EXCLUDES = ["runs", ".git", ".venv", "shared", "wandb", "outputs", "**/__pycache__", ".mypy_cache", ".ruff_cache", ".pytest_cache", "*.mp4"]
+EXCLUDES = [
+    "runs",
+    ".git",
+    ".venv",
+    "shared",
+    "wandb",
+    "outputs",
+    "**/__pycache__",
+    ".mypy_cache",
+    ".ruff_cache",
+    ".pytest_cache",
+    "*.mp4",
+]
 
 
 def entrypoint(words: Sequence[str]) -> str:
@@ -23,7 +35,9 @@ def entrypoint(words: Sequence[str]) -> str:
         ConfigError: if no command is named, or one that would start a Ray of its own.
     """
     if not words or "=" in words[0]:
-        raise ConfigError("say what to run: worldloop submit http://head:8265 rl experiment=quickstart launch=ray launch.actors=8")
+        raise ConfigError(
+            "say what to run: worldloop submit http://head:8265 rl experiment=quickstart launch=ray launch.actors=8"
+        )
     if not any(word.startswith("launch=ray") for word in words):
         raise ConfigError("a submitted command needs launch=ray, or it would run on the head node alone")
     address = [word for word in words if word.startswith("launch.address=")]
@@ -43,9 +57,14 @@ def submit(address: str, words: Sequence[str]) -> str:
     command = entrypoint(words)
     try:
         client = JobSubmissionClient(address)
-        job = client.submit_job(entrypoint=command, runtime_env={"working_dir": str(Path(__file__).resolve().parent.parent), "excludes": EXCLUDES})
+        job = client.submit_job(
+            entrypoint=command,
+            runtime_env={"working_dir": str(Path(__file__).resolve().parent.parent), "excludes": EXCLUDES},
+        )
     except (ConnectionError, RuntimeError, ValueError) as error:
-        raise ConfigError(f"{address} takes no jobs: {str(error).splitlines()[0]}. Is the dashboard on (ray start --head --dashboard-host ...), and is ~/.ray/auth_token the head node's?") from error
+        raise ConfigError(
+            f"{address} takes no jobs: {str(error).splitlines()[0]}. Is the dashboard on (ray start --head --dashboard-host ...), and is ~/.ray/auth_token the head node's?"
+        ) from error
     tqdm.write(f"job {job}: {command}\nstop it with: ray job stop {job} --address {address}")
     shown = 0
     while True:
@@ -55,7 +74,9 @@ def submit(address: str, words: Sequence[str]) -> str:
         status = client.get_job_status(job)
         if status in (JobStatus.SUCCEEDED, JobStatus.FAILED, JobStatus.STOPPED):
             if status is not JobStatus.SUCCEEDED:
-                raise ConfigError(f"job {job} has {status.value.lower()}: {client.get_job_info(job).message}; the same command goes on from its last checkpoint if `runs` is a folder that outlives the cluster")
+                raise ConfigError(
+                    f"job {job} has {status.value.lower()}: {client.get_job_info(job).message}; the same command goes on from its last checkpoint if `runs` is a folder that outlives the cluster"
+                )
             break
         time.sleep(2)
     return job

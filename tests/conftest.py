@@ -10,10 +10,10 @@ import torch
 
 from envs.episodes import Episode, LeRobotWriter
 from envs.episodes.clips import ClipStore
-from envs.physics.bench import BenchConfig
 from envs.physics.pool import BenchPool
+from envs.physics.tabletop.bench import BenchConfig
 from envs.simulators.base import WorldShape
-from envs.simulators.unet import UNetConfig, UNetSimulator
+from envs.simulators.unet.engine import UNetConfig, UNetSimulator
 
 BENCH = BenchConfig()
 HORIZON = 16
@@ -32,11 +32,13 @@ def shared() -> Path:
 def episodes() -> list[Episode]:
     """Eight short true episodes of every behaviour."""
     pool = BenchPool(BENCH, 1, HORIZON, workers=1)
-    dials = [0.0, 0.3, 0.6, 1.0] * 2
+    noise_levels = [0.0, 0.3, 0.6, 1.0] * 2
     names = ["expert", "noisy", "noisy", "random"] * 2
-    tracks = pool.script([(seed, dial) for seed, dial in enumerate(dials)])
+    tracks = pool.script([(seed, noise_level) for seed, noise_level in enumerate(noise_levels)])
     pool.close()
-    return [Episode.from_track(track, name, BENCH.views, 10.0) for track, name in zip(tracks, names, strict=True)]
+    return [
+        Episode.from_track(track, name, BENCH.views, 10.0) for track, name in zip(tracks, names, strict=True)
+    ]
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 ORDER = ["envs", "actors", "learners", "pipeline"]
-FILES = [path for room in ORDER for path in sorted((ROOT / room).rglob("*.py"))]
+FILES = [path for room in ORDER for path in sorted((ROOT / capacity).rglob("*.py"))]
 
 
 def imported(path: Path) -> set[str]:
@@ -24,8 +24,8 @@ def imported(path: Path) -> set[str]:
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_imports_only_go_down(path: Path) -> None:
-    room = path.relative_to(ROOT).parts[0]
-    above = set(ORDER[ORDER.index(room) + 1 :])
+    capacity = path.relative_to(ROOT).parts[0]
+    above = set(ORDER[ORDER.index(capacity) + 1 :])
     assert not imported(path) & above
 
 
@@ -39,5 +39,7 @@ def test_files_are_short_and_say_what_they_are() -> None:
     for path in FILES:
         text = path.read_text()
         assert len(text.splitlines()) <= 500, f"{path} is too long"
-        assert not text.strip() or ast.get_docstring(ast.parse(text)) or path.name == "__init__.py", f"{path} has no docstring"
+        assert not text.strip() or ast.get_docstring(ast.parse(text)) or path.name == "__init__.py", (
+            f"{path} has no docstring"
+        )
         assert path.stem not in {"utils", "helpers"}

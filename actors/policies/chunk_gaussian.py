@@ -1,4 +1,6 @@
-"""A Gaussian over whole action chunks: the randomness lives in a few knots, so that exploration is smooth in time."""
+"""A Gaussian over whole action chunks: the randomness lives in a few knots, so that exploration is smooth in
+time.
+"""
 
 from __future__ import annotations
 
@@ -9,19 +11,24 @@ from torch import Tensor, nn
 from torch.distributions import Distribution, constraints, register_kl
 
 from actors.policies.heads import Head
-from envs.schema import ACTION_DIM
+from envs.specs import ACTION_DIM
 
 
 def knot_basis(chunk: int, knots: int) -> Tensor:
-    """Linear interpolation [chunk, knots] from rest at time 0 through knots spread evenly up to the chunk's end."""
+    """Linear interpolation [chunk, knots] from rest at time 0 through knots spread evenly up to the chunk's
+    end.
+    """
     times = torch.arange(1, chunk + 1, dtype=torch.float32)
     at = torch.linspace(0, chunk, knots + 1)
-    hats = torch.stack([(1 - (times - at[k]).abs() * knots / chunk).clamp(min=0) for k in range(1, knots + 1)], 1)
+    hats = torch.stack(
+        [(1 - (times - at[k]).abs() * knots / chunk).clamp(min=0) for k in range(1, knots + 1)], 1
+    )
     return hats
 
 
 class ChunkGaussian(Distribution):
-    """chunk = offset + gain * basis @ knots with knots ~ Normal(loc, scale); dimensions with gain 0 are constant.
+    """chunk = offset + gain * basis @ knots with knots ~ Normal(loc, scale); dimensions with gain 0 are
+    constant.
 
     The density is that of the knots; a chunk determines them exactly (the basis has full column rank), so
     likelihood ratios are those of the chunk.
@@ -35,13 +42,24 @@ class ChunkGaussian(Distribution):
     arg_constraints: ClassVar[dict[str, Any]] = {"loc": constraints.real, "scale": constraints.positive}
     has_rsample = True
 
-    def __init__(self, loc: Tensor, scale: Tensor, basis: Tensor, gain: Tensor, offset: Tensor, validate_args: bool | None = None):
+    def __init__(
+        self,
+        loc: Tensor,
+        scale: Tensor,
+        basis: Tensor,
+        gain: Tensor,
+        offset: Tensor,
+        validate_args: bool | None = None,
+    ):
         self.loc, self.scale = loc, scale
-        shared = basis.ndim - 2  # TensorDict hands shared tensors over with batch dimensions; every row is the same
+        # TensorDict hands shared tensors over with batch dimensions; every row is the same
+        shared = basis.ndim - 2
         self.basis = basis[(0,) * shared]
         self.gain, self.offset = gain[(0,) * (gain.ndim - 1)], offset[(0,) * (offset.ndim - 1)]
         self.active = self.gain > 0
-        super().__init__(loc.shape[:-2], torch.Size([self.basis.shape[0], loc.shape[-1]]), validate_args=False)
+        super().__init__(
+            loc.shape[:-2], torch.Size([self.basis.shape[0], loc.shape[-1]]), validate_args=False
+        )
 
     def _decode(self, knots: Tensor) -> Tensor:
         return self.offset + self.gain * (self.basis @ knots)
@@ -73,7 +91,9 @@ class ChunkGaussian(Distribution):
         return (normal.log_prob(self._encode(value)) * self.active).sum((-2, -1))
 
     def entropy(self) -> Tensor:
-        return (torch.distributions.Normal(self.loc, self.scale, validate_args=False).entropy() * self.active).sum((-2, -1))
+        return (
+            torch.distributions.Normal(self.loc, self.scale, validate_args=False).entropy() * self.active
+        ).sum((-2, -1))
 
     def held(self) -> ChunkGaussian:
         """The same with a spread that does not learn."""
@@ -120,7 +140,13 @@ class ChunkGaussianHead(Head):
         loc = self.mean(hidden.float()).unflatten(-1, (self.knots, self.actions))
         scale = self.log_std.clamp(-4.0, 0.5).exp().expand_as(loc)
         lead = hidden.shape[:-1]
-        return loc, scale, self.basis.expand(*lead, *self.basis.shape), self.gain.expand(*lead, -1), self.offset.expand(*lead, -1)
+        return (
+            loc,
+            scale,
+            self.basis.expand(*lead, *self.basis.shape),
+            self.gain.expand(*lead, -1),
+            self.offset.expand(*lead, -1),
+        )
 
     def normalise(self, chunks: Tensor, floor: Tensor) -> None:
         """See Head.normalise; the knots of dimensions that vary get unit spread."""

@@ -1,4 +1,6 @@
-"""Action tokens (Brohan et al. 2023, RT-2): every number of a chunk is one of a few bins, said independently of the others."""
+"""Action tokens (Brohan et al. 2023, RT-2): every number of a chunk is one of a few bins, said independently
+of the others.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution, constraints, register_kl
 
 from actors.policies.heads import Head
-from envs.schema import ACTION_DIM
+from envs.specs import ACTION_DIM
 
 
 class ChunkTokens(Distribution):
@@ -49,12 +51,19 @@ class ChunkTokens(Distribution):
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
         with torch.no_grad():
-            share = self.log_share.exp().nan_to_num(1.0)  # NaN shows in the log-probability; drawing from it would raise for all rows
-            drawn = torch.multinomial(share.flatten(0, -2), max(1, torch.Size(sample_shape).numel()), replacement=True)
+            # NaN shows in the log-probability; drawing from it would raise for all rows
+            share = self.log_share.exp().nan_to_num(1.0)
+            drawn = torch.multinomial(
+                share.flatten(0, -2), max(1, torch.Size(sample_shape).numel()), replacement=True
+            )
             return self._decode(drawn.movedim(-1, 0).reshape(*sample_shape, *share.shape[:-1]))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        said = self.log_share.expand(*value.shape, self.bins).gather(-1, bins_of(value, self.low, self.high, self.bins).unsqueeze(-1)).squeeze(-1)
+        said = (
+            self.log_share.expand(*value.shape, self.bins)
+            .gather(-1, bins_of(value, self.low, self.high, self.bins).unsqueeze(-1))
+            .squeeze(-1)
+        )
         return (said * self.active).sum((-2, -1))
 
     def entropy(self) -> Tensor:
@@ -93,7 +102,15 @@ class ChunkTokenHead(Head):
     low: Tensor
     high: Tensor
 
-    def __init__(self, width: int, chunk: int, bins: int = 64, low: float = -1.0, high: float = 1.0, actions: int = ACTION_DIM):
+    def __init__(
+        self,
+        width: int,
+        chunk: int,
+        bins: int = 64,
+        low: float = -1.0,
+        high: float = 1.0,
+        actions: int = ACTION_DIM,
+    ):
         super().__init__()
         self.chunk, self.bins, self.actions = chunk, bins, actions
         self.logits = nn.Linear(width, chunk * actions * bins)
@@ -121,7 +138,9 @@ class ChunkTokenHead(Head):
 
     def error(self, hidden: Tensor, target: Tensor) -> Tensor:
         """Cross-entropy per number that varies, in nats."""
-        wrong = F.cross_entropy(self(hidden)[0].flatten(0, -2), target.flatten(), reduction="none").view(target.shape)
+        wrong = F.cross_entropy(self(hidden)[0].flatten(0, -2), target.flatten(), reduction="none").view(
+            target.shape
+        )
         active = (self.high > self.low).float()
         return (wrong * active).sum() / (active.sum() * target.shape[0] * target.shape[1])
 

@@ -12,7 +12,8 @@ class Head(nn.Module, abc.ABC):
     """From a policy's hidden vector [..., width] to the parameters of a distribution over chunks [K, A].
 
     Attributes:
-        names: of those parameters, in the order in which forward returns them; the distribution takes them by name.
+        names: of those parameters, in the order in which forward returns them; the distribution takes them by
+            name.
         distribution: its class, with log_prob, entropy, mode, a registered KL divergence, and `held`.
         chunk: actions per chunk, K.
     """
@@ -23,7 +24,9 @@ class Head(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def normalise(self, chunks: Tensor, floor: Tensor) -> None:
-        """Set units from demonstrated chunks [N, K, A]; dimensions whose spread is below `floor` [A] become constants."""
+        """Set units from demonstrated chunks [N, K, A]; dimensions whose spread is below `floor` [A] become
+        constants.
+        """
 
     @abc.abstractmethod
     def target(self, chunks: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """policy=openpi: any openpi policy server (websocket, msgpack) drives either world in evaluation.
 
-The server sees pictures, the joint state with grippers last, and the words of the task, and says absolute joints
+The server sees pictures, the joint state with grippers last, and the words of the task, and says absolute
+joints
 [L7, Lg, R7, Rg]. Worlds that take end-effector poses get them through the robot's kinematics.
 """
 
@@ -16,9 +17,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from envs.kinematics import Kinematics
+from envs.geometry.kinematics import Kinematics
 from envs.layouts import CommandLayout, JointLayout, Joints, compress
-from envs.schema import CHUNK, COMMAND, IMAGE, STATE, ActionMode, to_relative
+from envs.specs import CHUNK, COMMAND, IMAGE, STATE, ActionMode, to_relative
 
 
 class PolicyServerError(RuntimeError):
@@ -42,20 +43,46 @@ class OpenPIPolicy(TensorDictModuleBase):
     in_keys: ClassVar[list[Any]] = [IMAGE, STATE, COMMAND]
     out_keys: ClassVar[list[Any]] = [CHUNK]
 
-    def __init__(self, url: str, views: tuple[str, ...], chunk: int, layout: CommandLayout, mode: ActionMode, kinematics: Kinematics | None = None):
+    def __init__(
+        self,
+        url: str,
+        views: tuple[str, ...],
+        chunk: int,
+        layout: CommandLayout,
+        mode: ActionMode,
+        kinematics: Kinematics | None = None,
+    ):
         super().__init__()
         place = urlparse(url)
         if place.scheme not in ("ws", "wss") or not place.hostname:
-            raise PolicyServerError(f"url={url!r} must be the address of an openpi server, such as ws://127.0.0.1:8000")
+            raise PolicyServerError(
+                f"url={url!r} must be the address of an openpi server, such as ws://127.0.0.1:8000"
+            )
         if layout is CommandLayout.EEF and kinematics is None:
-            raise PolicyServerError("openpi policies say joints; a world of end-effector commands needs simulator.kinematics ({} is the bench)")
-        self.url, self.views, self.chunk, self.layout, self.mode, self.kinematics = url, views, chunk, layout, mode, kinematics
+            raise PolicyServerError(
+                "openpi policies say joints; a world of end-effector commands needs simulator.kinematics ({} is the bench)"
+            )
+        self.url, self.views, self.chunk, self.layout, self.mode, self.kinematics = (
+            url,
+            views,
+            chunk,
+            layout,
+            mode,
+            kinematics,
+        )
         self.instructions: list[str] = []
         self._client = _connect(f"{place.scheme}://{place.hostname}", place.port)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the chunk float32 [B, K, A]."""
-        rows = [self._ask(tensordict[IMAGE][row], tensordict[STATE][row], self.instructions[row] if self.instructions else "") for row in range(len(tensordict))]
+        rows = [
+            self._ask(
+                tensordict[IMAGE][row],
+                tensordict[STATE][row],
+                self.instructions[row] if self.instructions else "",
+            )
+            for row in range(len(tensordict))
+        ]
         chunk = torch.stack(rows).to(tensordict.device or "cpu")
         if self.mode is ActionMode.RELATIVE:
             chunk = to_relative(chunk, tensordict[COMMAND])
@@ -64,8 +91,17 @@ class OpenPIPolicy(TensorDictModuleBase):
 
     def _ask(self, image: Tensor, state: Tensor, words: str) -> Tensor:
         """Commands [K, A] of one episode, image uint8 [V, 3, H, W], state [16]."""
-        seen: dict[str, Any] = {f"observation.images.{view}": image[k].permute(1, 2, 0).contiguous().cpu().numpy() for k, view in enumerate(self.views)}
-        seen |= {"observation.state": Joints(state.cpu(), JointLayout.PER_ARM).to(JointLayout.GRIPPERS_LAST).numpy().astype(np.float32), "prompt": words}
+        seen: dict[str, Any] = {
+            f"observation.images.{view}": image[k].permute(1, 2, 0).contiguous().cpu().numpy()
+            for k, view in enumerate(self.views)
+        }
+        seen |= {
+            "observation.state": Joints(state.cpu(), JointLayout.PER_ARM)
+            .to(JointLayout.GRIPPERS_LAST)
+            .numpy()
+            .astype(np.float32),
+            "prompt": words,
+        }
         try:
             answer = self._client.infer(seen)
         except Exception as error:  # the client raises whatever the socket or the server did
@@ -73,12 +109,16 @@ class OpenPIPolicy(TensorDictModuleBase):
         said = np.asarray(answer.get("actions") if isinstance(answer, dict) else None, dtype=np.float32)
         said = said[0] if said.ndim == 3 and len(said) == 1 else said
         if said.ndim != 2 or said.shape[1] != 16 or len(said) < self.chunk or not np.isfinite(said).all():
-            raise PolicyServerError(f"{self.url} answered actions of shape {said.shape}, wanted at least {self.chunk} finite rows of 16 joints [L7,Lg,R7,Rg]")
+            raise PolicyServerError(
+                f"{self.url} answered actions of shape {said.shape}, wanted at least {self.chunk} finite rows of 16 joints [L7,Lg,R7,Rg]"
+            )
         rows = torch.from_numpy(np.array(said))
         if self.layout is CommandLayout.JOINTS:
             return compress(rows, self.chunk, CommandLayout.JOINTS)
         assert self.kinematics is not None
-        return self.kinematics.flanges(Joints(compress(rows, self.chunk, CommandLayout.JOINTS), JointLayout.PER_ARM))
+        return self.kinematics.flanges(
+            Joints(compress(rows, self.chunk, CommandLayout.JOINTS), JointLayout.PER_ARM)
+        )
 
 
 def _connect(host: str, port: int | None) -> Any:

@@ -1,6 +1,7 @@
 """The small vision-language-action policy: all views, state and words in, a distribution over chunks out.
 
-Perception, fusion and head are modules of their own: heads (heads.py) are a choice, and RL may leave perception as it is.
+Perception, fusion and head are modules of their own: heads (heads.py) are a choice, and RL may leave
+perception as it is.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ from torch import Tensor, nn
 
 from actors.policies.heads import Head
 from envs.encoders import Gaze, PatchEncoder, WordEncoder, to_signed
-from envs.schema import CHUNK, IMAGE, LOG_PROB, STATE, STATE_DIM, TOKENS
+from envs.specs import CHUNK, IMAGE, LOG_PROB, STATE, STATE_DIM, TOKENS
 
-SEEN = ("policy", "seen")  # float32 [B, S]: what perception makes of pictures and words, for heads and critics
-HIDDEN = ("policy", "hidden")  # float32 [B, width]: that joined with the state
+# float32 [B, S]: what perception makes of pictures and words, for heads and critics
+VISUAL_FEATURES = ("policy", "visual_features")
+POLICY_FEATURES = ("policy", "policy_features")  # float32 [B, width]: that joined with the state
 
 
 class Perception(nn.Module):
@@ -37,16 +39,22 @@ class Perception(nn.Module):
         self.out_features = self.main.out_features + 32 * (views - 1) + 16
 
     def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
-        """uint8 or float (-1..1) [B, V, 3, H, W], int64 [B, WORDS] -> float32 [B, out_features]; leading dimensions may be more."""
+        """uint8 or float (-1..1) [B, V, 3, H, W], int64 [B, WORDS] -> float32 [B, out_features]; leading
+        dimensions may be more.
+        """
         lead = image.shape[:-4]
         seen, _ = self.look(image.reshape(-1, *image.shape[-4:]), tokens.reshape(-1, tokens.shape[-1]))
         return seen.reshape(*lead, -1)
 
     def look(self, image: Tensor, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """The same of one leading dimension, and where objects are seen in the first view, [B, 2, aims, 2]; see Gaze."""
+        """The same of one leading dimension, and where objects are seen in the first view, [B, 2, aims, 2];
+        see Gaze.
+        """
         pictures = to_signed(image)
         first, aimed = self.main(pictures[:, 0])
-        return torch.cat([first, *(side(pictures[:, k + 1]) for k, side in enumerate(self.sides)), self.words(tokens)], -1), aimed
+        return torch.cat(
+            [first, *(side(pictures[:, k + 1]) for k, side in enumerate(self.sides)), self.words(tokens)], -1
+        ), aimed
 
 
 class Fusion(nn.Module):
@@ -94,12 +102,27 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         "('vla_action', 'log_probs')"
     """
 
-    def __init__(self, views: int, head: Callable[[int], Head], width: int = 256, points: int = 32, states: int = STATE_DIM, channels: int = 32, aims: int = 0):
+    def __init__(
+        self,
+        views: int,
+        head: Callable[[int], Head],
+        width: int = 256,
+        points: int = 32,
+        states: int = STATE_DIM,
+        channels: int = 32,
+        aims: int = 0,
+    ):
         eyes = Perception(views, points, channels, aims)
-        perception = TensorDictModule(eyes, in_keys=[IMAGE, TOKENS], out_keys=[SEEN])
-        fusion = TensorDictModule(Fusion(eyes.out_features, width, states), in_keys=[SEEN, STATE], out_keys=[HIDDEN])
+        perception = TensorDictModule(eyes, in_keys=[IMAGE, TOKENS], out_keys=[VISUAL_FEATURES])
+        fusion = TensorDictModule(
+            Fusion(eyes.out_features, width, states),
+            in_keys=[VISUAL_FEATURES, STATE],
+            out_keys=[POLICY_FEATURES],
+        )
         speaker = head(width)
-        said = TensorDictModule(speaker, in_keys=[HIDDEN], out_keys=[("policy", name) for name in speaker.names])
+        said = TensorDictModule(
+            speaker, in_keys=[POLICY_FEATURES], out_keys=[("policy", name) for name in speaker.names]
+        )
         sampler = ProbabilisticTensorDictModule(
             in_keys={name: ("policy", name) for name in speaker.names},
             out_keys=[CHUNK],
@@ -126,13 +149,17 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         return self[2].module
 
     def freeze_perception(self) -> None:
-        """Leave perception as imitation made it: what was seen during a rollout then serves every update, and no picture is encoded twice."""
+        """Leave perception as imitation made it: what was seen during a rollout then serves every update, and
+        no picture is encoded twice.
+        """
         self.perception.requires_grad_(False)
         self.frozen = True
 
     @property
     def trained(self) -> ProbabilisticTensorDictSequential:
-        """The part that learners train, a policy in its own right: all of it, or what follows a frozen perception."""
+        """The part that learners train, a policy in its own right: all of it, or what follows a frozen
+        perception.
+        """
         return ProbabilisticTensorDictSequential(self[1], self[2], self[3]) if self.frozen else self
 
     def normalise(self, chunks: Tensor, states: Tensor, floor: Tensor) -> None:

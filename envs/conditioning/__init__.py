@@ -1,4 +1,6 @@
-"""Action conditioning as pictures: where the grippers will be (pose map) and where each pixel looks (ray map)."""
+"""Action conditioning as pictures: where the grippers will be (pose map) and where each pixel looks (ray
+map).
+"""
 
 from envs.conditioning.pose_map import CANVAS, PoseMapStyle, render_pose_map
 from envs.conditioning.ray_map import render_ray_map

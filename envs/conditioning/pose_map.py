@@ -1,6 +1,7 @@
 """Pose maps: the commanded grippers drawn into each camera, as in GE-Sim 2.0.
 
-A filled circle marks each fingertip (size: how near, shade: how closed) and three thick lines its axes. Drawing
+A filled circle marks each fingertip (size: how near, shade: how closed) and three thick lines its axes.
+Drawing
 goes plane by plane into the [3, H, W] result, which saves the transposition an RGB canvas would need.
 """
 
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envs.geometry import eef_transforms
+from envs.geometry.cameras import eef_transforms
 
 CANVAS = 50  # of 255, where nothing is drawn
 _AXIS = 0.1  # m
@@ -29,7 +30,8 @@ class PoseMapStyle:
 
     Args:
         tool_offset: metres from wrist to fingertip along the wrist's z (GE-Sim 1: 0.23).
-        radius_law: "released" draws 100 * clip(1 - d - 0.07/0.73, 0, 1) pixels, "paper" 100 * clip(1 - (d - 0.07)/0.73, 0, 1).
+        radius_law: "released" draws 100 * clip(1 - d - 0.07/0.73, 0, 1) pixels, "paper" 100 * clip(1 - (d -
+            0.07)/0.73, 0, 1).
         gripper_range: the gripper values that mean open and closed.
         cull_behind: leave out what lies behind the camera; the released code does not ask.
         scale: factor on radii and thickness; None scales them with the picture's height.
@@ -52,7 +54,10 @@ def arm_shades() -> np.ndarray:
     import matplotlib
 
     return np.stack(
-        [(matplotlib.colormaps[name](np.arange(256))[:, :3] * 255).astype(np.uint8) for name in ("Greens", "Reds")]
+        [
+            (matplotlib.colormaps[name](np.arange(256))[:, :3] * 255).astype(np.uint8)
+            for name in ("Greens", "Reds")
+        ]
     )
 
 
@@ -88,7 +93,9 @@ def render_pose_map(
             f"got {tuple(eef_poses.shape)}, {tuple(c2w.shape)}, {tuple(intrinsic.shape)}"
         )
     if eef_poses.shape[-2] != c2w.shape[-3] or c2w.shape[-4] != intrinsic.shape[-3]:
-        raise ValueError(f"eef_poses has T={eef_poses.shape[-2]}, c2w V,T={tuple(c2w.shape[-4:-2])}, intrinsic V={intrinsic.shape[-3]}")
+        raise ValueError(
+            f"eef_poses has T={eef_poses.shape[-2]}, c2w V,T={tuple(c2w.shape[-4:-2])}, intrinsic V={intrinsic.shape[-3]}"
+        )
     if not torch.isfinite(eef_poses).all() or not torch.isfinite(c2w).all():
         raise ValueError("pose map: eef_poses or c2w hold NaN or infinite values")
     lead, views, steps = c2w.shape[:-4], c2w.shape[-4], c2w.shape[-3]
@@ -119,9 +126,16 @@ def render_pose_map(
 
 
 def layout(
-    eef_poses: Tensor, c2w: Tensor, intrinsic: Tensor, size: tuple[int, int], offset: float, style: PoseMapStyle
+    eef_poses: Tensor,
+    c2w: Tensor,
+    intrinsic: Tensor,
+    size: tuple[int, int],
+    offset: float,
+    style: PoseMapStyle,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Integer pixels [..., V, T, 2, 4, 2] of origin and axis tips, radii, shade indices and visibility [..., V, T, 2]."""
+    """Integer pixels [..., V, T, 2, 4, 2] of origin and axis tips, radii, shade indices and visibility [...,
+    V, T, 2].
+    """
     height, width = size
     wrist = eef_transforms(eef_poses.double())  # [..., T, 2, 4, 4]
     origin = wrist[..., :3, 3] + offset * wrist[..., :3, 2]
@@ -132,7 +146,13 @@ def layout(
     camera = points @ w2c[..., :3, :3].transpose(-1, -2) + w2c[..., None, :3, 3]
     image = camera @ intrinsic.double()[..., :, None, None, :, :].transpose(-1, -2)
     depth = camera[..., 2]
-    pixels = (image[..., :2] / image[..., 2:]).nan_to_num(nan=-1e6, posinf=-1e6, neginf=-1e6).clamp(-30000, 30000).trunc().long()
+    pixels = (
+        (image[..., :2] / image[..., 2:])
+        .nan_to_num(nan=-1e6, posinf=-1e6, neginf=-1e6)
+        .clamp(-30000, 30000)
+        .trunc()
+        .long()
+    )
     at = pixels[..., 0, :]
     visible = (at[..., 0] >= 0) & (at[..., 0] < width) & (at[..., 1] >= 0) & (at[..., 1] < height)
     if style.cull_behind:

@@ -16,7 +16,8 @@ def render_ray_map(intrinsic: Tensor, c2w: Tensor, size: tuple[int, int], stride
         stride: keep every stride-th pixel in both directions.
 
     Returns:
-        float32 [..., V, T, 6, ceil(H / stride), ceil(W / stride)]: channels 0-2 origin, 3-5 direction; pixel centres lie at +0.5.
+        float32 [..., V, T, 6, ceil(H / stride), ceil(W / stride)]: channels 0-2 origin, 3-5 direction; pixel
+        centres lie at +0.5.
     """
     height, width = size
     v, u = torch.meshgrid(
@@ -25,7 +26,8 @@ def render_ray_map(intrinsic: Tensor, c2w: Tensor, size: tuple[int, int], stride
         indexing="ij",
     )
     pixels = torch.stack((u, v, torch.ones_like(u)))  # [3, h, w]
-    local = torch.einsum("...ij,jhw->...ihw", torch.linalg.inv(intrinsic.float()), pixels)  # [..., V, 3, h, w]
+    # [..., V, 3, h, w]
+    local = torch.einsum("...ij,jhw->...ihw", torch.linalg.inv(intrinsic.float()), pixels)
     local = local / local.norm(dim=-3, keepdim=True)
     direction = torch.einsum("...vtij,...vjhw->...vtihw", c2w[..., :3, :3].float(), local)
     origin = c2w[..., :3, 3, None, None].float().expand_as(direction)

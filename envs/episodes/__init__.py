@@ -1,6 +1,6 @@
 """Recorded episodes: one type, LeRobot v3.0 on disk, clips for training."""
 
 from envs.episodes.episode import Episode, EpisodeError
-from envs.episodes.lerobot import LeRobotDataset, LeRobotWriter
+from envs.episodes.formats.lerobot import LeRobotDataset, LeRobotWriter
 
 __all__ = ["Episode", "EpisodeError", "LeRobotDataset", "LeRobotWriter"]

@@ -21,8 +21,8 @@ from torch import Tensor
 
 from envs.conditioning import CANVAS, PoseMapStyle, render_pose_map
 from envs.episodes.episode import Episode, EpisodeError
-from envs.episodes.lerobot import LeRobotDataset
-from envs.geometry import follow_hands, hands_of
+from envs.episodes.formats.lerobot import LeRobotDataset
+from envs.geometry.cameras import follow_hands, hands_of
 from envs.language import tokenize
 from envs.layouts import CommandLayout
 
@@ -45,7 +45,9 @@ class ClipSpec:
 
 
 def memory_indices(length: Tensor, count: int) -> Tensor:
-    """Frames to remember out of the first `length` [...]: `count` of them, evenly spread, first and last included -> [..., count]."""
+    """Frames to remember out of the first `length` [...]: `count` of them, evenly spread, first and last
+    included -> [..., count].
+    """
     share = torch.linspace(0, 1, count, dtype=torch.float64, device=length.device)
     return ((length.unsqueeze(-1) - 1) * share).round().long()
 
@@ -64,12 +66,19 @@ class ClipStore:
         EpisodeError: if the data sets differ, or have no commands of that layout.
     """
 
-    def __init__(self, folders: Sequence[Path], layout: CommandLayout = CommandLayout.EEF, style: PoseMapStyle | None = None):
+    def __init__(
+        self,
+        folders: Sequence[Path],
+        layout: CommandLayout = CommandLayout.EEF,
+        style: PoseMapStyle | None = None,
+    ):
         self.parts = [_open(Path(folder), style or PoseMapStyle()) for folder in folders]
         first = self.parts[0]
         for part in self.parts[1:]:
             if part.info["views"] != first.info["views"] or part.info["size"] != first.info["size"]:
-                raise EpisodeError(f"{part.folder} holds views {part.info['views']} of {part.info['size']}, {first.folder} {first.info['views']} of {first.info['size']}")
+                raise EpisodeError(
+                    f"{part.folder} holds views {part.info['views']} of {part.info['size']}, {first.folder} {first.info['views']} of {first.info['size']}"
+                )
         self.views: tuple[str, ...] = tuple(first.info["views"])
         self.size: tuple[int, int] = (first.info["size"][0], first.info["size"][1])
         self.fps: float = first.info["fps"]
@@ -79,12 +88,15 @@ class ClipStore:
         if layout is not CommandLayout.EEF:
             other = sorted({row["recorded_layout"] for row in self.episodes} - {layout.value})
             if other:
-                raise EpisodeError(f"simulator.layout={layout.value}, but the data have recorded actions of layout {other}; convert data that have joint commands, or use simulator.layout=eef")
+                raise EpisodeError(
+                    f"simulator.layout={layout.value}, but the data have recorded actions of layout {other}; convert data that have joint commands, or use simulator.layout=eef"
+                )
             self.arrays["commands"] = self.arrays["recorded"]
         self.length = torch.tensor([row["length"] for row in self.episodes])
         self.start = torch.cat([torch.zeros(1, dtype=torch.int64), self.length.cumsum(0)])[:-1]
         self.intrinsic = torch.tensor([row["intrinsic"] for row in self.episodes])
-        self.tokens = torch.stack([tokenize(row["instruction"]) for row in self.episodes])  # int64 [episodes, WORDS]
+        # int64 [episodes, WORDS]
+        self.tokens = torch.stack([tokenize(row["instruction"]) for row in self.episodes])
         bounds = np.cumsum([0] + [len(part.frames) for part in self.parts])
         self._bounds = bounds
 
@@ -95,7 +107,9 @@ class ClipStore:
         """Pictures uint8 [*rows.shape, V, 3, H, W] of `frames` or `pose_maps`."""
         flat = rows.reshape(-1).numpy()
         if len(self.parts) == 1:
-            return torch.from_numpy(getattr(self.parts[0], name)[flat]).reshape(*rows.shape, len(self.views), 3, *self.size)
+            return torch.from_numpy(getattr(self.parts[0], name)[flat]).reshape(
+                *rows.shape, len(self.views), 3, *self.size
+            )
         out = np.empty((len(flat), len(self.views), 3, *self.size), np.uint8)
         owner = np.searchsorted(self._bounds, flat, side="right") - 1
         for k, part in enumerate(self.parts):
@@ -112,12 +126,16 @@ class ClipStore:
         return self._pictures("pose_maps", rows)
 
     def select(self, behaviours: Iterable[str] | None = None, succeeded: bool | None = None) -> Tensor:
-        """Numbers of the episodes with one of these behaviours (a trailing * matches any ending) and this outcome."""
+        """Numbers of the episodes with one of these behaviours (a trailing * matches any ending) and this
+        outcome.
+        """
         wanted = None if behaviours is None else list(behaviours)
         keep = []
         for number, row in enumerate(self.episodes):
             name = row["behaviour"]
-            if wanted is not None and not any(name == w or (w.endswith("*") and name.startswith(w[:-1])) for w in wanted):
+            if wanted is not None and not any(
+                name == w or (w.endswith("*") and name.startswith(w[:-1])) for w in wanted
+            ):
                 continue
             if succeeded is not None and row["success"] != succeeded:
                 continue
@@ -128,9 +146,12 @@ class ClipStore:
         """Clips that begin at frame `begin` [B] of `episode` [B].
 
         Returns:
-            TensorDict [B] with memory (index [L, M], frames, pose_map uint8 [L, M, V, 3, H, W], c2w [L, M, V, 4, 4], objects [L, M, 2, 4]),
-            future (frames, pose_map [L*K, V, 3, H, W], c2w, commands [L*K, 14], states [L*K, 16], objects [L*K, 2, 4], valid [L*K]),
-            now (command [14], state [16], objects [2, 4]), history (states, commands [M, ...]), intrinsic [V, 3, 3], begin [].
+            TensorDict [B] with memory (index [L, M], frames, pose_map uint8 [L, M, V, 3, H, W], c2w [L, M, V,
+            4, 4], objects [L, M, 2, 4]),
+            future (frames, pose_map [L*K, V, 3, H, W], c2w, commands [L*K, 14], states [L*K, 16], objects
+            [L*K, 2, 4], valid [L*K]),
+            now (command [14], state [16], objects [2, 4]), history (states, commands [M, ...]), intrinsic [V,
+            3, 3], begin [].
             Frames past the episode's end repeat its last, and they and black frames are not valid.
         """
         total = spec.chunks * spec.chunk
@@ -139,12 +160,15 @@ class ClipStore:
         ahead = begin[:, None] + spec.stride * torch.arange(1, total + 1)
         rows = base[:, None] + torch.minimum(ahead, last[:, None])
         valid = (ahead <= last[:, None]) & self.arrays["seen"][rows]
-        past = begin[:, None] // spec.stride + spec.chunk * torch.arange(spec.chunks)  # frames before each chunk, in strides
+        # frames before each chunk, in strides
+        past = begin[:, None] // spec.stride + spec.chunk * torch.arange(spec.chunks)
         index = memory_indices(past + 1, spec.memory)  # [B, L, M], in strides from `begin % stride`
         at = (begin % spec.stride)[:, None, None] + index * spec.stride
         memory = base[:, None, None] + torch.minimum(at, last[:, None, None])
         now = base + begin
-        recent = base[:, None] + (begin[:, None] - spec.stride * torch.arange(spec.memory - 1, -1, -1)).clamp(min=0)
+        recent = base[:, None] + (begin[:, None] - spec.stride * torch.arange(spec.memory - 1, -1, -1)).clamp(
+            min=0
+        )
         size = episode.shape
 
         def pick(name: str, where: Tensor) -> Tensor:
@@ -152,7 +176,16 @@ class ClipStore:
 
         return TensorDict(
             {
-                "memory": TensorDict({"index": index, "frames": self.frames(memory), "pose_map": self.pose_maps(memory), "c2w": pick("c2w", memory), "objects": pick("objects", memory)}, size),
+                "memory": TensorDict(
+                    {
+                        "index": index,
+                        "frames": self.frames(memory),
+                        "pose_map": self.pose_maps(memory),
+                        "c2w": pick("c2w", memory),
+                        "objects": pick("objects", memory),
+                    },
+                    size,
+                ),
                 "future": TensorDict(
                     {
                         "frames": self.frames(rows),
@@ -165,8 +198,17 @@ class ClipStore:
                     },
                     size,
                 ),
-                "now": TensorDict({"command": pick("commands", now), "state": pick("states", now), "objects": pick("objects", now)}, size),
-                "history": TensorDict({"commands": pick("commands", recent), "states": pick("states", recent)}, size),
+                "now": TensorDict(
+                    {
+                        "command": pick("commands", now),
+                        "state": pick("states", now),
+                        "objects": pick("objects", now),
+                    },
+                    size,
+                ),
+                "history": TensorDict(
+                    {"commands": pick("commands", recent), "states": pick("states", recent)}, size
+                ),
                 "intrinsic": self.intrinsic[episode],
                 "begin": begin // spec.stride,
             },
@@ -177,10 +219,14 @@ class ClipStore:
         """Rows int64 [N] of all frames of some episodes, one episode after the other."""
         length = self.length[episodes]
         before = length.cumsum(0) - length
-        return torch.repeat_interleave(self.start[episodes] - before, length) + torch.arange(int(length.sum()))
+        return torch.repeat_interleave(self.start[episodes] - before, length) + torch.arange(
+            int(length.sum())
+        )
 
     def whole(self, episodes: Tensor) -> tuple[Tensor, Tensor]:
-        """Rows int64 [N, T] of all frames but the first of some episodes, the last repeated up to the longest, and which are no repeats, bool [N, T]."""
+        """Rows int64 [N, T] of all frames but the first of some episodes, the last repeated up to the
+        longest, and which are no repeats, bool [N, T].
+        """
         ahead = torch.arange(1, int(self.length[episodes].max()))
         last = self.length[episodes][:, None] - 1
         return self.start[episodes][:, None] + torch.minimum(ahead, last), ahead <= last
@@ -195,14 +241,19 @@ class ClipStore:
         ahead = (torch.rand(count, generator=generator) * self.length[chosen]).long()
         ahead[torch.arange(count) % 4 > 0] = 0
         rows = self.start[chosen] + ahead
-        arrays = {"objects": self.arrays["objects"][rows], "c2w": self.arrays["c2w"][rows, 0], "intrinsic": self.intrinsic[chosen, 0]}
+        arrays = {
+            "objects": self.arrays["objects"][rows],
+            "c2w": self.arrays["c2w"][rows, 0],
+            "intrinsic": self.intrinsic[chosen, 0],
+        }
         return TensorDict({"frames": self.frames(rows)[:, 0], **arrays}, [count])
 
     def motions(self, episodes: Tensor, count: int, chunk: int, generator: torch.Generator) -> TensorDict:
         """`count` random chunks without pictures, each wholly within its episode.
 
         Returns:
-            TensorDict [count] with recent [1 + K, 14], the commands up to now, now (objects [2, 4]) and future (commands [K, 14],
+            TensorDict [count] with recent [1 + K, 14], the commands up to now, now (objects [2, 4]) and
+            future (commands [K, 14],
             objects [K, 2, 4]).
         """
         choices = (self.length[episodes] - chunk).clamp(min=0)
@@ -219,13 +270,17 @@ class ClipStore:
             {
                 "recent": commands[before],
                 "now": TensorDict({"objects": objects[now]}, [count]),
-                "future": TensorDict({"commands": commands[ahead], "objects": objects[ahead]}, [count, chunk]),
+                "future": TensorDict(
+                    {"commands": commands[ahead], "objects": objects[ahead]}, [count, chunk]
+                ),
             },
             [count],
         )
 
     def sample(self, episodes: Tensor, count: int, spec: ClipSpec, generator: torch.Generator) -> TensorDict:
-        """`count` random clips of the given episodes, every frame that has a successor being equally likely to begin one."""
+        """`count` random clips of the given episodes, every frame that has a successor being equally likely
+        to begin one.
+        """
         choices = (self.length[episodes] - spec.stride).clamp(min=1)
         edges = choices.cumsum(0)
         draw = torch.randint(int(edges[-1]), (count,), generator=generator)
@@ -259,7 +314,13 @@ def _open(folder: Path, style: PoseMapStyle) -> _Part:
         _build(folder, cache, stamp, style)
     info = json.loads(marker.read_text())
     arrays = {name: np.load(cache / f"{name}.npy") for name in _NUMERIC}
-    return _Part(folder, info, np.load(cache / "frames.npy", mmap_mode="r"), np.load(cache / "pose_maps.npy", mmap_mode="r"), arrays)
+    return _Part(
+        folder,
+        info,
+        np.load(cache / "frames.npy", mmap_mode="r"),
+        np.load(cache / "pose_maps.npy", mmap_mode="r"),
+        arrays,
+    )
 
 
 def _build(folder: Path, cache: Path, stamp: str, style: PoseMapStyle) -> None:
@@ -268,19 +329,24 @@ def _build(folder: Path, cache: Path, stamp: str, style: PoseMapStyle) -> None:
     (cache / "info.json").unlink(missing_ok=True)
     total = int(data.episode_rows()[-1]["dataset_to_index"])
     shape = (total, len(data.views), 3, *data.size)
-    pictures = {name: np.lib.format.open_memmap(cache / f"{name}.npy", "w+", np.uint8, shape) for name in ("frames", "pose_maps")}
+    pictures = {
+        name: np.lib.format.open_memmap(cache / f"{name}.npy", "w+", np.uint8, shape)
+        for name in ("frames", "pose_maps")
+    }
     columns: dict[str, list[NDArray[Any]]] = {name: [] for name in _NUMERIC}
     episodes, row = [], 0
     for episode in data:
         rows = slice(row, row + len(episode))
         pictures["frames"][rows] = episode.frames
-        # Wrist cameras are placed where the commands lead them, as they will be in imagination, where nobody can measure them.
+        # Wrist cameras are placed where the commands lead them, as they will be in imagination, where nobody
+        # can measure them.
         c2w = commanded_cameras(episode)
         pictures["pose_maps"][rows] = pose_maps_of(episode, c2w, style).transpose(0, 1).numpy()
         numbers = {name: getattr(episode, name) for name in _NUMERIC} | {"c2w": c2w.numpy()}
         if episode.recorded is None:
             numbers["recorded"] = np.zeros((len(episode), 0), np.float32)
-        # Networks take no NaN: what is unknown of arms and cameras is nothing, and a camera at the world's origin.
+        # Networks take no NaN: what is unknown of arms and cameras is nothing, and a camera at the world's
+        # origin.
         for name in ("commands", "achieved", "states"):
             numbers[name] = np.nan_to_num(numbers[name])
         numbers["c2w"] = np.where(np.isnan(numbers["c2w"]), np.eye(4, dtype=np.float32), numbers["c2w"])
@@ -303,23 +369,41 @@ def _build(folder: Path, cache: Path, stamp: str, style: PoseMapStyle) -> None:
     for name, values in columns.items():
         np.save(cache / f"{name}.npy", np.concatenate(values))
     temporary = cache / ".info.part"
-    temporary.write_text(json.dumps({"stamp": stamp, "views": data.views, "size": data.size, "fps": data.fps, "episodes": episodes}))
+    temporary.write_text(
+        json.dumps(
+            {"stamp": stamp, "views": data.views, "size": data.size, "fps": data.fps, "episodes": episodes}
+        )
+    )
     os.replace(temporary, cache / "info.json")
 
 
 def pose_maps_of(episode: Episode, c2w: Tensor, style: PoseMapStyle | None = None) -> Tensor:
-    """Pose maps uint8 [V, T, 3, H, W] of an episode's commands seen from c2w [T, V, 4, 4]; empty where a camera or the commands are unknown."""
+    """Pose maps uint8 [V, T, 3, H, W] of an episode's commands seen from c2w [T, V, 4, 4]; empty where a
+    camera or the commands are unknown.
+    """
     length, views = c2w.shape[:2]
     size = (episode.frames.shape[-2], episode.frames.shape[-1])
     maps = torch.full((views, length, 3, *size), CANVAS, dtype=torch.uint8)
-    known = torch.isfinite(c2w).all((0, 2, 3)) if np.isfinite(episode.commands).all() else torch.zeros(views, dtype=torch.bool)
+    known = (
+        torch.isfinite(c2w).all((0, 2, 3))
+        if np.isfinite(episode.commands).all()
+        else torch.zeros(views, dtype=torch.bool)
+    )
     if known.any():
-        maps[known] = render_pose_map(torch.from_numpy(episode.commands), c2w[:, known].transpose(0, 1), torch.from_numpy(episode.intrinsic)[known], size, style=style)
+        maps[known] = render_pose_map(
+            torch.from_numpy(episode.commands),
+            c2w[:, known].transpose(0, 1),
+            torch.from_numpy(episode.intrinsic)[known],
+            size,
+            style=style,
+        )
     return maps
 
 
 def commanded_cameras(episode: Episode) -> Tensor:
-    """Camera poses [T, V, 4, 4] if the arms had followed their commands exactly from the first frame on; as recorded where commands are unknown, or cameras move by themselves."""
+    """Camera poses [T, V, 4, 4] if the arms had followed their commands exactly from the first frame on; as
+    recorded where commands are unknown, or cameras move by themselves.
+    """
     if not np.isfinite(episode.commands).all():
         return torch.from_numpy(episode.c2w)
     commands = torch.from_numpy(episode.commands)

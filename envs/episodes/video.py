@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from envs.episodes.episode import EpisodeError
 
 
-def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, crf: int = 10, browser: bool = False) -> None:
+def write_video(
+    path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, crf: int = 10, browser: bool = False
+) -> None:
     """Write frames uint8 [H, W, 3] RGB as H.264; the same frames give the same bytes.
 
     Args:
@@ -21,7 +23,8 @@ def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, crf
         frames: pictures of equal, even size.
         fps: frames per second.
         crf: x264 quality, 0 lossless .. 51 worst.
-        browser: use 4:2:0 colour, which browsers need; data keep 4:4:4, for at 64 pixels halved colour smears.
+        browser: use 4:2:0 colour, which browsers need; data keep 4:4:4, for at 64 pixels halved colour
+            smears.
     """
     with av.open(str(path), "w", format="mp4") as container:
         stream = None
@@ -30,9 +33,18 @@ def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, crf
                 stream = container.add_stream("libx264", rate=round(fps))
                 stream.height, stream.width = frame.shape[:2]
                 stream.pix_fmt = "yuv420p" if browser else "yuv444p"
-                # x264's macroblock tree reads memory that nobody wrote (with AVX-512): the same frames gave other bytes, and pictures, each time.
-                stream.options = {"crf": str(crf), "preset": "veryfast", "g": "20", "threads": "1", "mbtree": "0"}
-            for packet in stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")):
+                # x264's macroblock tree reads memory that nobody wrote (with AVX-512): the same frames gave
+                # other bytes, and pictures, each time.
+                stream.options = {
+                    "crf": str(crf),
+                    "preset": "veryfast",
+                    "g": "20",
+                    "threads": "1",
+                    "mbtree": "0",
+                }
+            for packet in stream.encode(
+                av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+            ):
                 container.mux(packet)
         if stream is not None:
             for packet in stream.encode():
@@ -53,7 +65,9 @@ def read_video(path: Path, expected: int | None = None) -> NDArray[np.uint8]:
             decoded = (convert.reformat(frame, format="rgb24") for frame in container.decode(video=0))
             frames = [frame.to_ndarray().transpose(2, 0, 1) for frame in decoded]
     except (av.error.FFmpegError, OSError, IndexError) as error:
-        raise EpisodeError(f"{path}: not a readable video ({error}); collect this shard again or restore the file") from error
+        raise EpisodeError(
+            f"{path}: not a readable video ({error}); collect this shard again or restore the file"
+        ) from error
     if not frames or (expected is not None and len(frames) < expected):
         raise EpisodeError(f"{path}: holds {len(frames)} frames, expected {expected}; the file is truncated")
     return np.stack(frames)

@@ -7,11 +7,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from envs.schema import Status
+from envs.specs import Status
 
 
 class Verdict(NamedTuple):
-    """success float32 [B, T] (probability in 0..1), progress float32 [B, T] in 0..1, status int64 [B] (schema.Status)."""
+    """success float32 [B, T] (probability in 0..1), progress float32 [B, T] in 0..1, status int64 [B]
+    (schema.Status).
+    """
 
     success: Tensor
     progress: Tensor
@@ -40,12 +42,15 @@ class Judge(nn.Module):
             frames: uint8 [B, T, V, 3, H, W].
             first: uint8 [B, V, 3, H, W], the episode's first frame, in which everything can still be seen.
             tokens: int64 [B, WORDS], the instruction (language.tokenize).
-            objects: float32 [B, T, 2, 4] true places of block and target (schema.OBJECT_DIM); only the rule judge looks.
+            objects: float32 [B, T, 2, 4] true places of block and target (schema.OBJECT_DIM); only the rule
+                judge looks.
         """
         raise NotImplementedError
 
     def begin(self, frames: Tensor, first: Tensor, tokens: Tensor) -> Any:
-        """Hand clips over for a verdict that is fetched later with `end`; a judge in this process puts it off until then."""
+        """Hand clips over for a verdict that is fetched later with `end`; a judge in this process puts it off
+        until then.
+        """
         return frames, first, tokens
 
     def end(self, ticket: Any) -> Verdict:

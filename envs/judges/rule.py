@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from envs.judges.base import Judge, Verdict, ok_status
-from envs.physics.tasks import Push
+from envs.physics.tabletop.tasks import Push
 
 
 class RuleJudge(Judge):
@@ -28,8 +28,12 @@ class RuleJudge(Judge):
             ValueError: without true positions, as in imagination.
         """
         if objects is None:
-            raise ValueError("judge=rule needs true object positions, which only physics has; use judge=learned for imagined video")
+            raise ValueError(
+                "judge=rule needs true object positions, which only physics has; use judge=learned for imagined video"
+            )
         distance = (objects[..., 0, :2] - objects[..., 1, :2]).norm(dim=-1)
         success = (distance < self.task.radius).float()
         progress = (1 - distance / self.task.scale).clamp(0, 1)
-        return Verdict(success, progress, ok_status(torch.where(torch.isfinite(distance), success, torch.nan)))
+        return Verdict(
+            success, progress, ok_status(torch.where(torch.isfinite(distance), success, torch.nan))
+        )

@@ -10,9 +10,22 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from envs.chunked import ChunkedEnv
-from envs.physics.bench import BenchConfig
 from envs.physics.pool import BenchPool, Track
-from envs.schema import C2W, CHUNK, COMMAND, IMAGE, INTRINSIC, PROGRESS, STATE, SUCCESS, ActionMode, Rewards, check_chunk, to_absolute
+from envs.physics.tabletop.bench import BenchConfig
+from envs.specs import (
+    C2W,
+    CHUNK,
+    COMMAND,
+    IMAGE,
+    INTRINSIC,
+    PROGRESS,
+    STATE,
+    SUCCESS,
+    ActionMode,
+    Rewards,
+    check_chunk,
+    to_absolute,
+)
 
 
 class PhysicsEnv(ChunkedEnv):

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.bench import Bench, BenchConfig
+from envs.physics.tabletop.bench import Bench, BenchConfig
 
 
 def available_cores() -> int:
@@ -29,7 +29,8 @@ def available_cores() -> int:
 class Track:
     """What one episode leaves behind, a row per video frame; row 0 is the start.
 
-    frames uint8 [T, V, 3, H, W], commands and achieved [T, 14], states [T, 16], c2w [T, V, 4, 4], success [T],
+    frames uint8 [T, V, 3, H, W], commands and achieved [T, 14], states [T, 16], c2w [T, V, 4, 4], success
+    [T],
     progress [T], objects [T, 2, 4] = places of block and target (schema.OBJECT_DIM); a disc has no heading.
     """
 
@@ -79,14 +80,18 @@ class Worker:
             slot = self.slots[index]
             slot.bench.reset(seed)
             slot.steps, slot.over = 0, False
-            slot.track = Track(seed, slot.bench.layout.instruction, slot.bench.cameras()[0]) if record else None
+            slot.track = (
+                Track(seed, slot.bench.layout.instruction, slot.bench.cameras()[0]) if record else None
+            )
             if slot.track is not None:
                 slot.track.add(slot.bench)
             out[index] = self._observe(slot)
         return out
 
     def step(self, chunks: dict[int, NDArray[Any]]) -> dict[int, dict[str, Any]]:
-        """Carry out chunks {slot: [K, 14] absolute}, each to its end, as imagined worlds do; an episode that is over stands still."""
+        """Carry out chunks {slot: [K, 14] absolute}, each to its end, as imagined worlds do; an episode that
+        is over stands still.
+        """
         out = {}
         for index, chunk in chunks.items():
             slot = self.slots[index]
@@ -102,14 +107,22 @@ class Worker:
         return out
 
     def script(self, jobs: list[tuple[int, float]], chunk: int = 1) -> list[Track]:
-        """Whole episodes of scripted behaviours for (seed, dial) pairs; recorded to the horizon, or to the end of the `chunk` steps in which they succeed."""
-        from envs.physics.behaviours import Behaviour
+        """Whole episodes of scripted behaviours for (seed, noise_level) pairs; recorded to the horizon, or to
+        the end of the `chunk` steps in which they succeed.
+        """
+        from envs.physics.tabletop.experts import Behaviour
 
         out = []
-        for seed, dial in jobs:
+        for seed, noise_level in jobs:
             bench = self.slots[0].bench
             bench.reset(seed)
-            behaviour = Behaviour(bench.task, bench.layout, dial, np.random.default_rng([seed, 1]), 1 / self.config.control_hz)
+            behaviour = Behaviour(
+                bench.task,
+                bench.layout,
+                noise_level,
+                np.random.default_rng([seed, 1]),
+                1 / self.config.control_hz,
+            )
             near = bench.layout.arm * 7
             track = Track(seed, bench.layout.instruction, bench.cameras()[0])
             track.add(bench)
@@ -190,8 +203,11 @@ class BenchPool:
         if count == 1:
             self._inline = Worker(config, slots, horizon)
             return
-        context = multiprocessing.get_context("forkserver")  # whose imports later pools share; a fork of this process would share its threads' locks
-        context.set_forkserver_preload(["torchrl.envs", __name__])  # torchrl for the script that started us, which workers import anew
+        context = multiprocessing.get_context(
+            "forkserver"
+        )  # whose imports later pools share; a fork of this process would share its threads' locks
+        # torchrl for the script that started us, which workers import anew
+        context.set_forkserver_preload(["torchrl.envs", __name__])
         for size in sizes:
             ours, theirs = context.Pipe()
             process = context.Process(target=_serve, args=(theirs, config, size, horizon), daemon=True)
@@ -207,7 +223,9 @@ class BenchPool:
             status, value = self._pipes[index].recv()
         except (EOFError, ConnectionResetError) as error:
             code = self._processes[index].exitcode
-            raise PoolError(f"physics worker {index} died (exit code {code}); out of memory or a broken GL driver") from error
+            raise PoolError(
+                f"physics worker {index} died (exit code {code}); out of memory or a broken GL driver"
+            ) from error
         if status == "error":
             raise PoolError(f"physics worker {index} failed:\n{value}")
         return value
@@ -236,7 +254,7 @@ class BenchPool:
         return self._scatter("step", chunks)
 
     def script(self, jobs: list[tuple[int, float]], chunk: int = 1) -> list[Track]:
-        """Scripted episodes for (seed, dial) pairs, in the order of `jobs`; see Worker.script."""
+        """Scripted episodes for (seed, noise_level) pairs, in the order of `jobs`; see Worker.script."""
         if self._inline is not None:
             return self._inline.script(jobs, chunk)
         count = len(self._pipes)

@@ -26,10 +26,12 @@ class Offscreen:
 
     def __init__(self, model: mujoco.MjModel, size: tuple[int, int]):
         height, width = size
-        # Mesa's software driver hands pictures this small to threads of its own at a loss; every core has a worker already.
+        # Mesa's software driver hands pictures this small to threads of its own at a loss; every core has a
+        # worker already.
         os.environ.setdefault("LP_NUM_THREADS", "0")
         try:
-            # Asked for by name: mujoco.GLContext was chosen when somebody first imported mujoco, perhaps for a window.
+            # Asked for by name: mujoco.GLContext was chosen when somebody first imported mujoco, perhaps for
+            # a window.
             backend = os.environ.get("MUJOCO_GL", "egl")
             self._gl = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
             self._gl.make_current()
@@ -48,7 +50,9 @@ class Offscreen:
         self._rect = mujoco.MjrRect(0, 0, width, height)
         self._pixels = np.empty((height, width, 3), np.uint8)
 
-    def render(self, model: mujoco.MjModel, data: mujoco.MjData, views: tuple[str, ...], shadows: bool) -> NDArray[np.uint8]:
+    def render(
+        self, model: mujoco.MjModel, data: mujoco.MjData, views: tuple[str, ...], shadows: bool
+    ) -> NDArray[np.uint8]:
         """Pictures uint8 [V, 3, H, W] of the named cameras."""
         self._gl.make_current()
         height, width, _ = self._pixels.shape

@@ -1,7 +1,9 @@
 """The contract of a learned world, and the sparse memory that every engine shares.
 
-A simulator is a function of explicit state: `reset` makes the state of a batch of sessions, `step` turns it and a
-chunk of commands into frames, features and the next state. The state is a TensorDict with one row per session, so
+A simulator is a function of explicit state: `reset` makes the state of a batch of sessions, `step` turns it
+and a
+chunk of commands into frames, features and the next state. The state is a TensorDict with one row per
+session, so
 resetting some sessions is a masked write, and all randomness comes from (session seed, chunk index).
 """
 
@@ -29,7 +31,8 @@ class WorldShape:
         chunk: frames per step, K.
         memory: sparse memory frames, M; the first frame is always one of them.
         fps: frames per second.
-        sides: of things whose places are followed (places.py), S of them, the turns of a circle that leave each looking the same; () follows none.
+        sides: of things whose places are followed (places.py), S of them, the turns of a circle that leave
+            each looking the same; () follows none.
         layout: what its commands are, A numbers a frame.
     """
 
@@ -43,7 +46,9 @@ class WorldShape:
 
     def __post_init__(self) -> None:
         if self.sides and self.layout is not CommandLayout.EEF:
-            raise ValueError("simulator.sides follows things under end-effector commands only; set it to [] for joint commands")
+            raise ValueError(
+                "simulator.sides follows things under end-effector commands only; set it to [] for joint commands"
+            )
 
     @property
     def objects(self) -> int:
@@ -65,15 +70,18 @@ class Simulator(nn.Module):
         self.shape = shape
         self.places = Places(shape.sides)
 
-    # -- what a subclass gives -----------------------------------------------------------------------------------
+    # -- what a subclass gives
+    # -----------------------------------------------------------------------------------
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """Generate the frames of one chunk.
 
         Args:
-            inputs: TensorDict [B] with memory (frames, pose_map uint8 [M, V, 3, H, W], c2w [M, V, 4, 4], places [M, S, 4]),
+            inputs: TensorDict [B] with memory (frames, pose_map uint8 [M, V, 3, H, W], c2w [M, V, 4, 4],
+                places [M, S, 4]),
                 future (pose_map uint8 [K, V, 3, H, W], c2w [K, V, 4, 4], commands [K, A], places [K, S, 4]),
                 now (command [A], state [16], places [S, 4]; NaN where unknown),
-                begin (what `prepare` made of the first pictures), intrinsic [V, 3, 3], seed int64 [], chunk_index int64 [].
+                begin (what `prepare` made of the first pictures), intrinsic [V, 3, 3], seed int64 [],
+                chunk_index int64 [].
 
         Returns:
             frames uint8 [B, K, V, 3, H, W] and features float32 [B, *feature_shape] for the state expert.
@@ -81,15 +89,19 @@ class Simulator(nn.Module):
         raise NotImplementedError
 
     def prepare(self, frames: Tensor, places: Tensor, intrinsic: Tensor, c2w: Tensor) -> TensorDict:
-        """What an engine makes of first pictures once, for all chunks of their episodes; a TensorDict [B], here an empty one.
+        """What an engine makes of first pictures once, for all chunks of their episodes; a TensorDict [B],
+        here an empty one.
 
         Args:
-            frames: uint8 [B, V, 3, H, W]; places: [B, S, 4]; intrinsic: [B, V, 3, 3] pixels; c2w: [B, V, 4, 4].
+            frames: uint8 [B, V, 3, H, W]; places: [B, S, 4]; intrinsic: [B, V, 3, 3] pixels; c2w: [B, V, 4,
+                4].
         """
         return TensorDict({}, frames.shape[:1])
 
     def glance(self, frames: Tensor, c2w: Tensor) -> None:
-        """Look at first pictures uint8 [N, V, 3, H, W] of different episodes, c2w [N, V, 4, 4], before training; an engine may learn what is the same in all."""
+        """Look at first pictures uint8 [N, V, 3, H, W] of different episodes, c2w [N, V, 4, 4], before
+        training; an engine may learn what is the same in all.
+        """
 
     def features(self, inputs: TensorDict) -> Tensor:
         """Only the features of `predict`, for training the state expert."""
@@ -99,33 +111,61 @@ class Simulator(nn.Module):
         """Training loss of a clip (see ClipStore.clips) and figures to log."""
         raise NotImplementedError
 
-    def asked(self, clip: TensorDict, number: int, drawn: Tensor | None = None, generator: torch.Generator | None = None, begin: TensorDict | None = None) -> TensorDict:
+    def build_inputs(
+        self,
+        clip: TensorDict,
+        number: int,
+        drawn: Tensor | None = None,
+        generator: torch.Generator | None = None,
+        begin: TensorDict | None = None,
+    ) -> TensorDict:
         """The inputs of `predict` for chunk `number` of a training clip [B].
 
         Args:
-            drawn: uint8 [B, number * K, V, 3, H, W], the model's own frames of the chunks before; memory then shows
+            drawn: uint8 [B, number * K, V, 3, H, W], the model's own frames of the chunks before; memory then
+                shows
                 these instead of true ones.
             generator: draws the noise seeds; without one they are zero.
             begin: of the clip's episodes, from an earlier call; without it they are prepared anew.
         """
         chunk, size = self.shape.chunk, clip.shape
         part = slice(number * chunk, (number + 1) * chunk)
-        memory = TensorDict({key: clip["memory", key][:, number] for key in ("frames", "pose_map", "c2w")}, size)
+        memory = TensorDict(
+            {key: clip["memory", key][:, number] for key in ("frames", "pose_map", "c2w")}, size
+        )
         memory["places"] = self.places.of(clip["memory", "objects"][:, number])
         if begin is None:
-            begin = self.prepare(memory["frames"][:, 0], memory["places"][:, 0], clip["intrinsic"], memory["c2w"][:, 0])
+            begin = self.prepare(
+                memory["frames"][:, 0], memory["places"][:, 0], clip["intrinsic"], memory["c2w"][:, 0]
+            )
         if drawn is not None:
             rows = torch.arange(len(clip), device=clip.device)[:, None]
             ahead = clip["memory", "index"][:, number] - clip["begin"][:, None] - 1
-            memory["frames"] = torch.where((ahead >= 0)[..., None, None, None, None], drawn[rows, ahead.clamp(min=0)], memory["frames"])
-        future = TensorDict({key: clip["future", key][:, part] for key in ("pose_map", "c2w", "commands")}, size)
+            memory["frames"] = torch.where(
+                (ahead >= 0)[..., None, None, None, None], drawn[rows, ahead.clamp(min=0)], memory["frames"]
+            )
+        future = TensorDict(
+            {key: clip["future", key][:, part] for key in ("pose_map", "c2w", "commands")}, size
+        )
         future["places"] = self.places.of(clip["future", "objects"][:, part])
         if number == 0:
-            now = {"command": clip["now", "command"], "state": clip["now", "state"], "places": self.places.of(clip["now", "objects"])}
+            now = {
+                "command": clip["now", "command"],
+                "state": clip["now", "state"],
+                "places": self.places.of(clip["now", "objects"]),
+            }
         else:
             before = clip["future"][:, part.start - 1]
-            now = {"command": before["commands"], "state": before["states"], "places": self.places.of(before["objects"])}
-        seed = torch.zeros(size, dtype=torch.int64) if generator is None else torch.randint(2**40, size, generator=generator)
+            now = {
+                "command": before["commands"],
+                "state": before["states"],
+                "places": self.places.of(before["objects"]),
+            }
+        seed = (
+            torch.zeros(size, dtype=torch.int64)
+            if generator is None
+            else torch.randint(2**40, size, generator=generator)
+        )
         return TensorDict(
             {
                 "memory": memory,
@@ -139,8 +179,21 @@ class Simulator(nn.Module):
             size,
         )
 
-    # -- the contract --------------------------------------------------------------------------------------------
-    def reset(self, frames: Tensor, intrinsic: Tensor, c2w: Tensor, command: Tensor, state: Tensor, pose_map: Tensor, seed: Tensor, *, likeliest: bool = False, room: int = 1) -> TensorDict:
+    # -- the contract
+    # --------------------------------------------------------------------------------------------
+    def reset(
+        self,
+        frames: Tensor,
+        intrinsic: Tensor,
+        c2w: Tensor,
+        command: Tensor,
+        state: Tensor,
+        pose_map: Tensor,
+        seed: Tensor,
+        *,
+        likeliest: bool = False,
+        capacity: int = 1,
+    ) -> TensorDict:
         """Begin sessions from first frames.
 
         Args:
@@ -149,8 +202,10 @@ class Simulator(nn.Module):
             command: [B, A] command in force; state: [B, 16] joint state.
             pose_map: uint8 [B, V, 3, H, W] of that command.
             seed: int64 [B].
-            likeliest: let objects go their likeliest way, for comparing with what happened; else the seed decides.
-            room: frames to keep room for, where it is known how long sessions last; longer ones make more as they go.
+            likeliest: let objects go their likeliest way, for comparing with what happened; else the seed
+                decides.
+            capacity: frames to keep room for, where it is known how long sessions last; longer ones make more
+                as they go.
 
         Returns:
             The sessions' state, a TensorDict [B].
@@ -159,10 +214,19 @@ class Simulator(nn.Module):
         with torch.no_grad():
             places = self.places.find(frames[:, 0], intrinsic[:, 0].float(), c2w[:, 0].float())
             begin = self.prepare(frames, places, intrinsic.float(), c2w.float())
-        first = {"frames": frames, "pose_map": pose_map, "c2w": c2w.float(), "commands": command.float(), "states": state.float(), "places": places}
+        first = {
+            "frames": frames,
+            "pose_map": pose_map,
+            "c2w": c2w.float(),
+            "commands": command.float(),
+            "states": state.float(),
+            "places": places,
+        }
         return TensorDict(
             {
-                "history": _roomy(TensorDict({name: value[:, None] for name, value in first.items()}, [*size, 1]), room),
+                "history": _with_capacity(
+                    TensorDict({name: value[:, None] for name, value in first.items()}, [*size, 1]), capacity
+                ),
                 "begin": begin,
                 "length": torch.ones(size, dtype=torch.int64, device=frames.device),
                 "intrinsic": intrinsic.float(),
@@ -174,14 +238,17 @@ class Simulator(nn.Module):
         )
 
     @torch.no_grad()
-    def step(self, state: TensorDict, commands: Tensor, pose_map: Tensor, c2w: Tensor) -> tuple[Tensor, Tensor, TensorDict]:
+    def step(
+        self, state: TensorDict, commands: Tensor, pose_map: Tensor, c2w: Tensor
+    ) -> tuple[Tensor, Tensor, TensorDict]:
         """Advance every session by one chunk; `state` is used up, its buffers go into the one returned.
 
         Args:
             commands: [B, K, A] absolute; pose_map: uint8 [B, K, V, 3, H, W]; c2w: [B, K, V, 4, 4].
 
         Returns:
-            frames uint8 [B, K, V, 3, H, W], features [B, *feature_shape], next state. The joint states of the new
+            frames uint8 [B, K, V, 3, H, W], features [B, *feature_shape], next state. The joint states of the
+            new
             frames are unknown here and repeat the last; the state expert fills them in (`remember_states`).
         """
         batch, count = commands.shape[:2]
@@ -190,15 +257,23 @@ class Simulator(nn.Module):
         history = state["history"]
         now = history.select("commands", "states", "places")[rows, length - 1]
         if self.shape.objects:
-            luck = self._luck(state["seed"], state["chunk_index"]).to(commands.device).masked_fill(state["likeliest"][:, None, None], 0.0)
+            luck = (
+                self._luck(state["seed"], state["chunk_index"])
+                .to(commands.device)
+                .masked_fill(state["likeliest"][:, None, None], 0.0)
+            )
             ahead = self.places.push(now["places"], self.recent(state, 1 + count)["commands"], commands, luck)
         else:
             ahead = now["places"][:, None].expand(-1, count, -1, -1)
         inputs = TensorDict(
             {
                 "memory": self.recall(state, pose_map, c2w),
-                "future": TensorDict({"pose_map": pose_map, "c2w": c2w, "commands": commands, "places": ahead}, [batch]),
-                "now": TensorDict({"command": now["commands"], "state": now["states"], "places": now["places"]}, [batch]),
+                "future": TensorDict(
+                    {"pose_map": pose_map, "c2w": c2w, "commands": commands, "places": ahead}, [batch]
+                ),
+                "now": TensorDict(
+                    {"command": now["commands"], "state": now["states"], "places": now["places"]}, [batch]
+                ),
                 "begin": state["begin"],
                 "intrinsic": state["intrinsic"],
                 "seed": state["seed"],
@@ -209,27 +284,45 @@ class Simulator(nn.Module):
         pictures, features = self.predict(inputs)
         need = int(length.max()) + count
         if need > history.shape[1]:
-            history = _roomy(history, max(need, 2 * history.shape[1]))  # for twice as many frames, so that long rollouts copy seldom
+            # for twice as many frames, so that long rollouts copy seldom
+            history = _with_capacity(history, max(need, 2 * history.shape[1]))
         at = length[:, None] + torch.arange(count, device=length.device)
-        new = {"frames": pictures, "pose_map": pose_map, "c2w": c2w, "commands": commands, "states": now["states"][:, None].expand(-1, count, -1), "places": ahead}
+        new = {
+            "frames": pictures,
+            "pose_map": pose_map,
+            "c2w": c2w,
+            "commands": commands,
+            "states": now["states"][:, None].expand(-1, count, -1),
+            "places": ahead,
+        }
         for name, value in new.items():
             history[name][rows[:, None], at] = value
         state = state.copy()  # of the names only
-        state["history"], state["length"], state["chunk_index"] = history, length + count, state["chunk_index"] + 1
+        state["history"], state["length"], state["chunk_index"] = (
+            history,
+            length + count,
+            state["chunk_index"] + 1,
+        )
         return pictures, features.float(), state
 
     def recall(self, state: TensorDict, pose_map: Tensor, c2w: Tensor) -> TensorDict:
-        """What is remembered for the next chunk: frames, pose_map, c2w, places [B, M, ...], evenly spread over the past and with the first frame.
+        """What is remembered for the next chunk: frames, pose_map, c2w, places [B, M, ...], evenly spread
+        over the past and with the first frame.
 
         Args:
             pose_map, c2w: of the chunk to come, [B, K, ...].
         """
         rows = torch.arange(len(state), device=state["length"].device)[:, None]
-        return state["history"].select("frames", "pose_map", "c2w", "places")[rows, memory_indices(state["length"], self.shape.memory)]
+        return state["history"].select("frames", "pose_map", "c2w", "places")[
+            rows, memory_indices(state["length"], self.shape.memory)
+        ]
 
     def _luck(self, seed: Tensor, chunk_index: Tensor) -> Tensor:
         """Standard normal numbers [B, S, 3] that belong to each session's seed and chunk."""
-        rows = [torch.randn(self.shape.objects, 3, generator=noise_generator(s, c)) for s, c in zip(seed.tolist(), chunk_index.tolist(), strict=True)]
+        rows = [
+            torch.randn(self.shape.objects, 3, generator=noise_generator(s, c))
+            for s, c in zip(seed.tolist(), chunk_index.tolist(), strict=True)
+        ]
         return torch.stack(rows)
 
     @staticmethod
@@ -242,18 +335,22 @@ class Simulator(nn.Module):
 
     @staticmethod
     def stack(states: Sequence[TensorDict]) -> TensorDict:
-        """Sessions [B1], [B2], ... of equal or different length as one state; rows past a session's own length hold anything."""
+        """Sessions [B1], [B2], ... of equal or different length as one state; rows past a session's own
+        length hold anything.
+        """
         most = max(state["history"].shape[1] for state in states)
         parts = []
         for state in states:
             part = state.copy()
-            part["history"] = _roomy(state["history"], most)
+            part["history"] = _with_capacity(state["history"], most)
             parts.append(part)
         return torch.cat(parts)
 
     @staticmethod
     def recent(state: TensorDict, count: int) -> TensorDict:
-        """The last `count` commands and states [B, count, ...] of each session, the first repeated where there are fewer."""
+        """The last `count` commands and states [B, count, ...] of each session, the first repeated where
+        there are fewer.
+        """
         length = state["length"]
         rows = torch.arange(len(length), device=length.device)[:, None]
         at = (length[:, None] - count + torch.arange(count, device=length.device)).clamp(min=0)
@@ -264,7 +361,9 @@ class Simulator(nn.Module):
 
     @staticmethod
     def replace(state: TensorDict, mask: Tensor, fresh: TensorDict) -> TensorDict:
-        """The state with the sessions of `mask` [B] replaced by those of `fresh` (one row per True, in order)."""
+        """The state with the sessions of `mask` [B] replaced by those of `fresh` (one row per True, in
+        order).
+        """
         for name in state.keys():
             if name not in ("history", "begin"):
                 state[name][mask] = fresh[name].to(state[name].dtype)
@@ -274,12 +373,14 @@ class Simulator(nn.Module):
         return state
 
 
-def _roomy(history: TensorDict, room: int) -> TensorDict:
-    """A history [B, N] as one of at least `room` frames; rows past a session's length hold anything and are never read."""
+def _with_capacity(history: TensorDict, capacity: int) -> TensorDict:
+    """A history [B, N] as one of at least `room` frames; rows past a session's length hold anything and are
+    never read.
+    """
     rows = history.shape[1]
     if room <= rows:
         return history
-    out = history.new_empty(len(history), room)
+    out = history.new_empty(len(history), capacity)
     for name, value in history.items():
         out[name][:, :rows] = value
     return out
@@ -292,18 +393,23 @@ def noise_generator(seed: int, chunk_index: int) -> torch.Generator:
 
 def to_bytes(frames: Tensor) -> Tensor:
     """Float frames in 0..1, or somewhat beyond, as uint8."""
-    return frames.clamp(0, 1).mul_(255).round_().to(torch.uint8)  # in place: these are a rollout's largest tensors
+    return (
+        frames.clamp(0, 1).mul_(255).round_().to(torch.uint8)
+    )  # in place: these are a rollout's largest tensors
 
 
 def foreground_weight(frames: Tensor, gain: float) -> Tensor:
-    """Loss weights [..., 1, H, W] that lift whatever differs from the picture's median colour, most of all in hue.
+    """Loss weights [..., 1, H, W] that lift whatever differs from the picture's median colour, most of all in
+    hue.
 
-    Block and target cover one per cent of the pixels, arms ten; unweighted losses are won by the table alone, and
+    Block and target cover one per cent of the pixels, arms ten; unweighted losses are won by the table alone,
+    and
     losses that ask for any difference by the arms.
 
     Args:
         frames: float [..., 3, H, W] in 0..1.
-        gain: weight of a pixel of a fully different hue, above the 1 of the median colour; a grey difference gets a twelfth.
+        gain: weight of a pixel of a fully different hue, above the 1 of the median colour; a grey difference
+            gets a twelfth.
     """
     gap = frames - frames.flatten(-2).median(-1).values[..., None, None]
     grey = gap.mean(-3, keepdim=True)

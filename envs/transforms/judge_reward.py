@@ -1,4 +1,6 @@
-"""The forward path's second half, where a reward is decided: the judge watches the chunk and writes reward and done."""
+"""The forward path's second half, where a reward is decided: the judge watches the chunk and writes reward
+and done.
+"""
 
 from __future__ import annotations
 
@@ -10,18 +12,20 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from envs.judges import Judge, Verdict
-from envs.schema import FEATURES, FRAMES, IMAGE, JUDGE_STATUS, PROGRESS, SUCCESS, TOKENS, Rewards, Status
+from envs.specs import FEATURES, FRAMES, IMAGE, JUDGE_STATUS, PROGRESS, SUCCESS, TOKENS, Rewards, Status
 
 
 class JudgeReward(Transform):
     """Success, progress and reward of imagined video; the frames themselves stay behind.
 
-    A verdict that is not OK ends the episode and is written to `judge_status`, by which learners drop and count it.
+    A verdict that is not OK ends the episode and is written to `judge_status`, by which learners drop and
+    count it.
 
     Args:
         judge: scores frames.
         rewards: turns progress and success into a number.
-        later: do not wait for verdicts. Episodes then run to their horizon, and `settle` writes rewards and ends into
+        later: do not wait for verdicts. Episodes then run to their horizon, and `settle` writes rewards and
+            ends into
             the finished rollout; what a slot did after its success belongs to no episode.
     """
 
@@ -41,7 +45,11 @@ class JudgeReward(Transform):
                 self._opening = self._progress
             self._tickets.append(self.judge.begin(*clips))
             nothing = torch.zeros_like(self._progress)
-            next_tensordict["reward"], next_tensordict[SUCCESS], next_tensordict[PROGRESS] = nothing, nothing.bool(), self._progress
+            next_tensordict["reward"], next_tensordict[SUCCESS], next_tensordict[PROGRESS] = (
+                nothing,
+                nothing.bool(),
+                self._progress,
+            )
             next_tensordict[JUDGE_STATUS] = torch.full_like(self._run, Status.OK.value).unsqueeze(-1)
             return next_tensordict.exclude(FRAMES, FEATURES, "world")
         self._decide(self.judge.score(*clips), next_tensordict)
@@ -55,7 +63,9 @@ class JudgeReward(Transform):
         """Write the verdicts of a finished rollout [B, T] of whole episodes into it."""
         tickets, self._tickets = self._tickets, []
         if len(tickets) != batch.shape[1]:
-            raise RuntimeError(f"{len(tickets)} chunks were handed to the judge, the rollout holds {batch.shape[1]}; settle each rollout before the next begins")
+            raise RuntimeError(
+                f"{len(tickets)} chunks were handed to the judge, the rollout holds {batch.shape[1]}; settle each rollout before the next begins"
+            )
         # By now the collector has begun the next episodes; these begin where theirs did.
         self._run, self._progress = torch.zeros_like(self._run), self._opening
         for number, ticket in enumerate(tickets):
@@ -64,7 +74,9 @@ class JudgeReward(Transform):
             batch["next"][:, number] = after
 
     def _decide(self, verdict: Verdict, next_tensordict: TensorDictBase) -> None:
-        """Reward, success, progress, status and ends of one step; remembers progress and the run of successes."""
+        """Reward, success, progress, status and ends of one step; remembers progress and the run of
+        successes.
+        """
         done, self._run = self.judge.streak(verdict.success, self._run)
         failed = (verdict.status != Status.OK.value).unsqueeze(-1)
         success = done.any(1, keepdim=True) & ~failed

@@ -6,8 +6,8 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import Transform
 
-from envs.schema import FEATURES, STATE
-from envs.simulators.state_base import StateDecoder
+from envs.simulators.state_experts.base import StateDecoder
+from envs.specs import FEATURES, STATE
 
 
 class StateExpertTransform(Transform):

@@ -9,35 +9,47 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from actors.policies.vla import SEEN, ChunkPolicy
+from actors.policies.vla import VISUAL_FEATURES, ChunkPolicy
 from envs.encoders import Gaze, to_signed
 from envs.episodes.clips import ClipStore
-from envs.schema import IMAGE, STATE, TOKENS, to_relative
-from learners.fit import FitConfig, fit
-from learners.remembered import looked_at
+from envs.specs import IMAGE, STATE, TOKENS, to_relative
+from learners.rl.dataset_rollout import looked_at
 from learners.stages.pictures import augment, sights, survey
+from learners.training.fit import FitConfig, fit
 
-# Spread below which a command dimension is a constant: a millimetre, a hundredth of a radian, a twentieth of a grip.
+# Spread below which a command dimension is a constant: a millimetre, a hundredth of a radian, a twentieth of
+# a grip.
 ACTIVE_FLOOR = (1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2, 5e-2)
 _AIM = 16.0  # on how far off objects are seen, beside the error of what is done
 
 
 class Cloning:
-    """Chunks to imitate: every frame of the given episodes, with the next K commands relative to the one in force.
+    """Chunks to imitate: every frame of the given episodes, with the next K commands relative to the one in
+    force.
 
     Past an episode's end its last command is held.
 
     Args:
-        generated: frames of generated.py. On these the policy is asked to do what it does on the true ones: what it
+        generated: frames of generated.py. On these the policy is asked to do what it does on the true ones:
+            what it
             learns in imagination is of use only as far as it sees both alike.
-        watched: episodes whose frames, without their actions, teach the policy's perception where objects are seen, as
+        watched: episodes whose frames, without their actions, teach the policy's perception where objects are
+            seen, as
             far as the data say so.
     """
 
-    def __init__(self, policy: ChunkPolicy, store: ClipStore, episodes: Tensor, generated: TensorDict | None = None, watched: Tensor | None = None):
+    def __init__(
+        self,
+        policy: ChunkPolicy,
+        store: ClipStore,
+        episodes: Tensor,
+        generated: TensorDict | None = None,
+        watched: Tensor | None = None,
+    ):
         self.policy, self.store = policy, store
         self.aims = policy.perception.main.aims
-        self.generated = generated if generated is not None and len(generated) else None  # a bad simulator leaves none
+        # a bad simulator leaves none
+        self.generated = generated if generated is not None and len(generated) else None
         self.watched = store.rows(watched) if watched is not None and self.aims else None
         chunk = policy.head.chunk
         self.rows = store.rows(episodes)
@@ -60,14 +72,31 @@ class Cloning:
         if self.seen is None:
             out[IMAGE], out[TOKENS] = self.store.frames(self.rows[pick]), self.tokens[pick]
         else:
-            out[SEEN] = self.seen[pick]
+            out[VISUAL_FEATURES] = self.seen[pick]
         if self.generated is not None:
-            made = self.generated[torch.randint(len(self.generated), (max(1, count // 2),), generator=generator)]  # each brings its true one
-            out["pair"] = TensorDict({"made": made["frames"], "true": self.store.frames(made["row"]), STATE: self.store.arrays["states"][made["row"]], TOKENS: made["tokens"]}, made.shape)
+            # each brings its true one
+            made = self.generated[
+                torch.randint(len(self.generated), (max(1, count // 2),), generator=generator)
+            ]
+            out["pair"] = TensorDict(
+                {
+                    "made": made["frames"],
+                    "true": self.store.frames(made["row"]),
+                    STATE: self.store.arrays["states"][made["row"]],
+                    TOKENS: made["tokens"],
+                },
+                made.shape,
+            )
             out["pair", "where"] = sights(self.store, made["places"], made["row"], self.aims)
         if self.watched is not None:
             shown = self.watched[torch.randint(len(self.watched), (count,), generator=generator)]
-            out["shown"] = TensorDict({"frames": self.store.frames(shown)[:, :1], "where": sights(self.store, self.store.arrays["objects"][shown], shown, self.aims)}, [count])
+            out["shown"] = TensorDict(
+                {
+                    "frames": self.store.frames(shown)[:, :1],
+                    "where": sights(self.store, self.store.arrays["objects"][shown], shown, self.aims),
+                },
+                [count],
+            )
         out["target"] = self.policy.head.target(self.targets[pick])
         return out
 
@@ -77,8 +106,14 @@ class Cloning:
         Pictures and states are disturbed a little, for robustness.
         """
         policy, state = self.policy, data[STATE]
-        seen = data[SEEN] if self.seen is not None else policy.perception(augment(to_signed(data[IMAGE]), generator), data[TOKENS])
-        noise = torch.randn(state.shape, generator=generator).to(state.device) * 0.05 * policy.fusion.state_std
+        seen = (
+            data[VISUAL_FEATURES]
+            if self.seen is not None
+            else policy.perception(augment(to_signed(data[IMAGE]), generator), data[TOKENS])
+        )
+        noise = (
+            torch.randn(state.shape, generator=generator).to(state.device) * 0.05 * policy.fusion.state_std
+        )
         total = policy.head.error(policy.fusion(seen, state + noise), data["target"])
         if "shown" in data.keys():
             shown = data["shown"]
@@ -95,21 +130,39 @@ class Cloning:
 
 
 def train_imitation(
-    policy: ChunkPolicy, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path, fresh: bool = True, generated: TensorDict | None = None, watched: Tensor | None = None
+    policy: ChunkPolicy,
+    store: ClipStore,
+    episodes: Tensor,
+    options: FitConfig,
+    folder: Path,
+    fresh: bool = True,
+    generated: TensorDict | None = None,
+    watched: Tensor | None = None,
 ) -> dict[str, float]:
-    """Clone the given episodes; a `fresh` policy gets its units from them first, one that can act already keeps its own. The rest: see Cloning."""
+    """Clone the given episodes; a `fresh` policy gets its units from them first, one that can act already
+    keeps its own. The rest: see Cloning.
+    """
     cloning = Cloning(policy, store, episodes, generated, watched)
     if fresh:
         if cloning.watched is not None:
             survey(policy.perception.main, store, cloning.watched)
-        policy.normalise(cloning.targets, store.arrays["states"][cloning.rows], torch.tensor(ACTIVE_FLOOR * 2))
+        policy.normalise(
+            cloning.targets, store.arrays["states"][cloning.rows], torch.tensor(ACTIVE_FLOOR * 2)
+        )
     for parameter in policy.head.exploration():
         parameter.requires_grad_(False)
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         return cloning.loss(data, generator), {}
 
-    stats = fit("imitation", policy, lambda step, generator: cloning.sample(options.part, generator), loss, options, folder)
+    stats = fit(
+        "imitation",
+        policy,
+        lambda step, generator: cloning.sample(options.part, generator),
+        loss,
+        options,
+        folder,
+    )
     for parameter in policy.head.exploration():
         parameter.requires_grad_(True)
     return stats

@@ -9,20 +9,24 @@ import torch
 from torch import Tensor
 
 from envs.episodes.clips import ClipStore
-from envs.simulators.autoencoder import Autoencoder
 from envs.simulators.base import foreground_weight
-from envs.simulators.dit_world import DiTSimulator
-from learners.fit import FitConfig, fit
+from envs.simulators.dit.engine import DiTSimulator
+from envs.simulators.tokenizers.autoencoder import Autoencoder
+from learners.training.fit import FitConfig, fit
 
 
-def train_tokenizer(simulator: DiTSimulator, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path) -> dict[str, float]:
+def train_tokenizer(
+    simulator: DiTSimulator, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path
+) -> dict[str, float]:
     """Train the simulator's autoencoder in place on single frames, then set its latents' units."""
     rows = store.rows(episodes)
     codec, gain = simulator.codec, simulator.foreground
     assert isinstance(codec, Autoencoder)
 
     def batch(step: int, generator: torch.Generator) -> Tensor:
-        return store.frames(rows[torch.randint(len(rows), (options.part,), generator=generator)]).flatten(0, 1)
+        return store.frames(rows[torch.randint(len(rows), (options.part,), generator=generator)]).flatten(
+            0, 1
+        )
 
     def loss(frames: Tensor, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         truth = frames.float() / 255

@@ -1,4 +1,6 @@
-"""Stage: teach a simulator where objects go and to continue videos, from true frames at first and from its own later."""
+"""Stage: teach a simulator where objects go and to continue videos, from true frames at first and from its
+own later.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,9 @@ from torch import Tensor
 
 from envs.episodes.clips import ClipSpec, ClipStore
 from envs.simulators.base import Simulator
-from envs.simulators.latent_world import LatentWorld
-from learners.fit import FitConfig, fit, step_generator
-from learners.lora import low_rank
+from envs.simulators.dit.latent_world import LatentWorld
+from learners.training.fit import FitConfig, fit, step_generator
+from learners.training.lora import low_rank
 
 _GLANCES = 128  # first pictures of different episodes, at which a simulator looks before it learns
 
@@ -24,10 +26,13 @@ class VisionConfig:
 
     Args:
         alone: share of the steps that train on single chunks; the rest unrolls.
-        unroll: chunks predicted from own predictions after that; the batch shrinks so that a step costs the same.
+        unroll: chunks predicted from own predictions after that; the batch shrinks so that a step costs the
+            same.
         strides: frame strides to draw from, uniformly.
-        fresh: share of each batch drawn from the newest data set, so that what the policy now does is seen often; 0 draws by size.
-        lora: rank of the adapters that learn instead of all weights (latent worlds only); 0 trains all weights.
+        fresh: share of each batch drawn from the newest data set, so that what the policy now does is seen
+            often; 0 draws by size.
+        lora: rank of the adapters that learn instead of all weights (latent worlds only); 0 trains all
+            weights.
     """
 
     alone: float = 0.6
@@ -37,7 +42,15 @@ class VisionConfig:
     lora: int = 0
 
 
-def train_vision(simulator: Simulator, store: ClipStore, episodes: Tensor, config: VisionConfig, options: FitConfig, folder: Path, newest: Tensor | None = None) -> dict[str, float]:
+def train_vision(
+    simulator: Simulator,
+    store: ClipStore,
+    episodes: Tensor,
+    config: VisionConfig,
+    options: FitConfig,
+    folder: Path,
+    newest: Tensor | None = None,
+) -> dict[str, float]:
     """Train `simulator` in place on the given episodes of a store; `newest` are those that `fresh` speaks of."""
     shape = simulator.shape
 
@@ -52,12 +65,18 @@ def train_vision(simulator: Simulator, store: ClipStore, episodes: Tensor, confi
             parts.append(store.sample(newest, recent, spec, generator))
         return torch.cat(parts) if len(parts) > 1 else parts[0]
 
-    some = store.start[episodes[torch.randperm(len(episodes), generator=torch.Generator().manual_seed(options.seed))[:_GLANCES]]]
+    some = store.start[
+        episodes[
+            torch.randperm(len(episodes), generator=torch.Generator().manual_seed(options.seed))[:_GLANCES]
+        ]
+    ]
     simulator.glance(store.frames(some), store.arrays["c2w"][some])
     if not config.lora:
         return fit("vision", simulator, batch, simulator.loss, options, folder)
     if not isinstance(simulator, LatentWorld):
-        raise ValueError(f"vision lora={config.lora} adapts transformers; simulator.engine=dit and gesim have one")
+        raise ValueError(
+            f"vision lora={config.lora} adapts transformers; simulator.engine=dit and gesim have one"
+        )
     simulator.requires_grad_(False)
     with low_rank(simulator.net, config.lora):
         stats = fit("vision", simulator, batch, simulator.loss, options, folder)
@@ -65,8 +84,12 @@ def train_vision(simulator: Simulator, store: ClipStore, episodes: Tensor, confi
     return stats
 
 
-def train_sight(simulator: Simulator, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path) -> dict[str, float]:
-    """Train what finds the simulator's objects in first pictures, in place; does nothing where no episode knows its objects' places."""
+def train_sight(
+    simulator: Simulator, store: ClipStore, episodes: Tensor, options: FitConfig, folder: Path
+) -> dict[str, float]:
+    """Train what finds the simulator's objects in first pictures, in place; does nothing where no episode
+    knows its objects' places.
+    """
     places = simulator.places
     if not _placed(simulator, store, episodes):
         return {}
@@ -74,13 +97,24 @@ def train_sight(simulator: Simulator, store: ClipStore, episodes: Tensor, option
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         return places.sight.loss(data, places.of(data["objects"]), generator)
 
-    stats = fit("sight", places.sight, lambda _, generator: store.shots(episodes, options.part, generator), loss, options, folder)
+    stats = fit(
+        "sight",
+        places.sight,
+        lambda _, generator: store.shots(episodes, options.part, generator),
+        loss,
+        options,
+        folder,
+    )
     places.taught.fill_(True)
     return stats
 
 
-def train_contact(simulator: Simulator, store: ClipStore, episodes: Tensor, kept: Tensor, options: FitConfig, folder: Path) -> dict[str, float]:
-    """Train what moves the simulator's objects, in place, and fit its doubt to the `kept` episodes; does nothing where no episode knows its objects' places."""
+def train_contact(
+    simulator: Simulator, store: ClipStore, episodes: Tensor, kept: Tensor, options: FitConfig, folder: Path
+) -> dict[str, float]:
+    """Train what moves the simulator's objects, in place, and fit its doubt to the `kept` episodes; does
+    nothing where no episode knows its objects' places.
+    """
     places, chunk = simulator.places, simulator.shape.chunk
     if not _placed(simulator, store, episodes):
         return {}
@@ -91,13 +125,24 @@ def train_contact(simulator: Simulator, store: ClipStore, episodes: Tensor, kept
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         return places.contact.loss(whole(data), data)
 
-    stats = fit("contact", places.contact, lambda _, generator: store.motions(episodes, options.part, chunk, generator), loss, options, folder)
+    stats = fit(
+        "contact",
+        places.contact,
+        lambda _, generator: store.motions(episodes, options.part, chunk, generator),
+        loss,
+        options,
+        folder,
+    )
     if len(kept):
-        motion = store.motions(kept, 4096, chunk, step_generator(options.seed, options.steps)).to(places.taught.device)
+        motion = store.motions(kept, 4096, chunk, step_generator(options.seed, options.steps)).to(
+            places.taught.device
+        )
         places.contact.calibrate(whole(motion), motion)
     return {**stats, "spread": float(places.contact.spread)}
 
 
 def _placed(simulator: Simulator, store: ClipStore, episodes: Tensor) -> bool:
     """Whether any episode knows where any object stands that the simulator follows."""
-    return bool(torch.isfinite(simulator.places.of(store.arrays["objects"][store.start[episodes]])[..., :3]).any())
+    return bool(
+        torch.isfinite(simulator.places.of(store.arrays["objects"][store.start[episodes]])[..., :3]).any()
+    )

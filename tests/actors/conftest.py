@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from actors.recipe import Recipe
+from actors.rollouts.recipe import Recipe
 from pipeline.config import load_config
 from pipeline.demo_world import demo_recipe
 

@@ -1,4 +1,6 @@
-"""A real server in a thread, and a client written from the protocol's description alone, as strangers write theirs."""
+"""A real server in a thread, and a client written from the protocol's description alone, as strangers write
+theirs.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,8 @@ import requests
 from aiohttp import web
 from PIL import Image
 
-from actors.serve.app import Server
-from actors.serve.sessions import SessionHost
+from actors.serving.app import Server
+from actors.serving.sessions import SessionHost
 
 
 def free_port() -> int:
@@ -60,7 +62,10 @@ def block(data: bytes) -> bytes:
 
 def jpeg(frame: np.ndarray) -> bytes:
     """A float frame (3, V, H, W) in 0..1 as the tiled JPEG of the protocol."""
-    tiled = np.concatenate([(view.transpose(1, 2, 0) * 255).round().astype(np.uint8) for view in frame.transpose(1, 0, 2, 3)], axis=1)
+    tiled = np.concatenate(
+        [(view.transpose(1, 2, 0) * 255).round().astype(np.uint8) for view in frame.transpose(1, 0, 2, 3)],
+        axis=1,
+    )
     buffer = io.BytesIO()
     Image.fromarray(tiled).save(buffer, format="JPEG", quality=95)
     return buffer.getvalue()
@@ -71,16 +76,22 @@ class Stranger:
 
     def __init__(self, url: str, user: str = "stranger", **more: Any):
         self.url, self.http = url, requests.Session()
-        self.id = self.http.post(f"{url}/init", json={"user_name": user, **more}, timeout=30).json()["client_id"]
+        self.id = self.http.post(f"{url}/init", json={"user_name": user, **more}, timeout=30).json()[
+            "client_id"
+        ]
 
     def post(self, path: str, **payload: Any) -> requests.Response:
         return self.http.post(self.url + path, json={"client_id": self.id, **payload}, timeout=30)
 
     def send(self, path: str, body: bytes) -> requests.Response:
-        return self.http.post(self.url + path, data=body, headers={"Content-Type": "application/octet-stream"}, timeout=60)
+        return self.http.post(
+            self.url + path, data=body, headers={"Content-Type": "application/octet-stream"}, timeout=60
+        )
 
     def first_frame(self, frame: np.ndarray) -> bytes:
-        return block(jpeg(frame)) + block(json.dumps({"client_id": self.id, "frame_shape": list(frame.shape)}).encode())
+        return block(jpeg(frame)) + block(
+            json.dumps({"client_id": self.id, "frame_shape": list(frame.shape)}).encode()
+        )
 
     def trajectory(self, traj: np.ndarray, c2w: np.ndarray) -> bytes:
         pictures = b"".join(block(jpeg(traj[:, :, t])) for t in range(traj.shape[2]))
@@ -91,15 +102,25 @@ class Stranger:
         meta = {"client_id": self.id, "action_shape": list(actions.shape), **more}
         return block(actions.astype("<f4").tobytes()) + block(json.dumps(meta).encode())
 
-    def prepare(self, views: int = 3, size: tuple[int, int] = (64, 64), frames: int = 4, seed: int = 0) -> None:
+    def prepare(
+        self, views: int = 3, size: tuple[int, int] = (64, 64), frames: int = 4, seed: int = 0
+    ) -> None:
         """Cameras, a first frame and a trajectory of random pictures."""
         rng = np.random.default_rng(seed)
         k = [[60.0, 0, 32], [0, 60, 32], [0, 0, 1]]
         assert self.post("/set_camera_params", intrinsic=[k] * views).status_code == 200
-        smooth = np.repeat(np.repeat(rng.random((3, views, size[0] // 8, size[1] // 8), np.float32), 8, -1), 8, -2)
+        smooth = np.repeat(
+            np.repeat(rng.random((3, views, size[0] // 8, size[1] // 8), np.float32), 8, -1), 8, -2
+        )
         assert self.send("/set_episode_data", self.first_frame(smooth)).status_code == 200
         c2w = np.tile(np.eye(4, dtype=np.float32), (views, frames, 1, 1))
-        assert self.send("/set_episode_traj", self.trajectory(np.full((3, views, frames, *size), 50 / 255, np.float32), c2w)).status_code == 200
+        assert (
+            self.send(
+                "/set_episode_traj",
+                self.trajectory(np.full((3, views, frames, *size), 50 / 255, np.float32), c2w),
+            ).status_code
+            == 200
+        )
 
     def step(self, actions: np.ndarray, **more: Any) -> tuple[np.ndarray, np.ndarray | None]:
         answer = self.send("/step", self.actions(actions, **more))
@@ -115,6 +136,9 @@ class Stranger:
             at += 4 + size
         meta = json.loads(blocks[0])
         count, _, views, height, width = meta["frame_shape"]
-        pictures = [np.asarray(Image.open(io.BytesIO(data))).reshape(height, views, width, 3) for data in blocks[1 : 1 + count]]
+        pictures = [
+            np.asarray(Image.open(io.BytesIO(data))).reshape(height, views, width, 3)
+            for data in blocks[1 : 1 + count]
+        ]
         state = np.frombuffer(blocks[-1], "<f4").reshape(meta["state_shape"]) if meta["state_shape"] else None
         return np.stack(pictures).transpose(0, 4, 2, 1, 3), state

@@ -1,4 +1,6 @@
-"""Three nodes on this machine, one of them lost while running; and the words for what goes wrong with clusters."""
+"""Three nodes on this machine, one of them lost while running; and the words for what goes wrong with
+clusters.
+"""
 
 from __future__ import annotations
 
@@ -17,22 +19,39 @@ import pytest
 import ray
 from ray.cluster_utils import Cluster
 
-from actors.cluster import _advice, check_versions, connect, versions
 from actors.factory import ConfigError, build_policy
-from actors.launch import build_fleet
-from actors.ray_fleet import RayFleet
-from actors.recipe import Recipe
-from actors.rollouts import Job, trained_weights
+from actors.fleets.cluster import _advice, check_versions, connect, versions
+from actors.fleets.launch import build_fleet
+from actors.fleets.ray_fleet import RayFleet
+from actors.rollouts.host import Job, trained_weights
+from actors.rollouts.recipe import Recipe
 from pipeline.config import load_config
 from pipeline.submit import entrypoint
 
 
 def test_a_lost_node_costs_no_job(recipe: Recipe) -> None:
     # Ray gives a silent node half a minute by default.
-    soon = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_timeout_ms": 1000, "health_check_failure_threshold": 3}
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False, "_system_config": soon})
+    soon = {
+        "health_check_initial_delay_ms": 0,
+        "health_check_period_ms": 500,
+        "health_check_timeout_ms": 1000,
+        "health_check_failure_threshold": 3,
+    }
+    cluster = Cluster(
+        initialize_head=True,
+        head_node_args={"num_cpus": 1, "include_dashboard": False, "_system_config": soon},
+    )
     nodes = [cluster.add_node(num_cpus=2) for _ in range(2)]
-    cfg = load_config(["experiment=smoke", "launch=ray", f"launch.address={cluster.address}", "launch.actors=4", "launch.place.actors.num_cpus=1", "launch.strategy=disaggregated"])
+    cfg = load_config(
+        [
+            "experiment=smoke",
+            "launch=ray",
+            f"launch.address={cluster.address}",
+            "launch.actors=4",
+            "launch.place.actors.num_cpus=1",
+            "launch.strategy=disaggregated",
+        ]
+    )
     try:
         fleet = build_fleet(replace(recipe, config=cfg))
         assert isinstance(fleet, RayFleet)
@@ -45,7 +64,9 @@ def test_a_lost_node_costs_no_job(recipe: Recipe) -> None:
         cluster.remove_node(nodes[0], allow_graceful=False)
         fleet.resize(3)  # what the remaining nodes can hold
         rest = [fleet.take() for _ in range(7)]
-        assert sorted(r.job.number for r in [first, *rest] if r is not None and r.batch is not None) == list(range(8))
+        assert sorted(r.job.number for r in [first, *rest] if r is not None and r.batch is not None) == list(
+            range(8)
+        )
         fleet.close()
     finally:
         ray.shutdown()
@@ -57,17 +78,33 @@ def test_a_wrong_token_is_named() -> None:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     mine, wrong = ({**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": letter * 64} for letter in "ab")
-    command = [str(Path(sys.executable).with_name("ray")), "start", "--head", "--block", f"--port={port}", "--num-cpus=1", "--include-dashboard=false", "--node-ip-address=127.0.0.1", "--disable-usage-stats"]
-    head = subprocess.Popen(command, env=mine, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    command = [
+        str(Path(sys.executable).with_name("ray")),
+        "start",
+        "--head",
+        "--block",
+        f"--port={port}",
+        "--num-cpus=1",
+        "--include-dashboard=false",
+        "--node-ip-address=127.0.0.1",
+        "--disable-usage-stats",
+    ]
+    head = subprocess.Popen(
+        command, env=mine, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
     try:
         for _ in range(120):
             time.sleep(0.5)
             with contextlib.suppress(OSError):
                 socket.create_connection(("127.0.0.1", port), timeout=1).close()
                 break
-        script = f"from actors.cluster import connect; connect({{'address': '127.0.0.1:{port}'}})"
-        stranger = subprocess.run([sys.executable, "-c", script], env=wrong, capture_output=True, text=True, timeout=240)
-        assert "refused our token" in stranger.stderr and "auth_token" in stranger.stderr, stranger.stderr[-2000:]
+        script = f"from actors.fleets.cluster import connect; connect({{'address': '127.0.0.1:{port}'}})"
+        stranger = subprocess.run(
+            [sys.executable, "-c", script], env=wrong, capture_output=True, text=True, timeout=240
+        )
+        assert "refused our token" in stranger.stderr and "auth_token" in stranger.stderr, stranger.stderr[
+            -2000:
+        ]
     finally:
         os.killpg(head.pid, signal.SIGKILL)
         head.wait()
@@ -81,11 +118,16 @@ def test_unreachable_clusters_and_other_versions_are_named() -> None:
     check_versions(mine, dict(mine))
     with pytest.raises(ConfigError, match=r"torch 1\.0 instead of .*constraints\.txt"):
         check_versions(mine, mine | {"torch": "1.0"})
-    assert "constraints.txt" in _advice("head:6379", RuntimeError("Version mismatch: the cluster was started with Ray 2.50"))
+    assert "constraints.txt" in _advice(
+        "head:6379", RuntimeError("Version mismatch: the cluster was started with Ray 2.50")
+    )
 
 
 def test_what_is_submitted_runs_on_the_cluster() -> None:
-    assert entrypoint(["rl", "launch=ray", "launch.actors=8"]) == "python -m pipeline rl launch=ray launch.actors=8 launch.address=auto"
+    assert (
+        entrypoint(["rl", "launch=ray", "launch.actors=8"])
+        == "python -m pipeline rl launch=ray launch.actors=8 launch.address=auto"
+    )
     for words in ([], ["launch=ray"], ["rl", "seed=1"]):
         with pytest.raises(ConfigError):
             entrypoint(words)

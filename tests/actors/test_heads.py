@@ -10,12 +10,14 @@ from torch.distributions import kl_divergence
 
 from actors.policies.chunk_tokens import ChunkTokenHead, ChunkTokens
 from actors.policies.vla import ChunkPolicy
-from envs.schema import CHUNK, IMAGE, LOG_PROB, STATE, TOKENS
+from envs.specs import CHUNK, IMAGE, LOG_PROB, STATE, TOKENS
 
 
 def tokens(*batch: int, bins: int = 8) -> ChunkTokens:
     """A distribution over chunks [4, 3] whose middle dimension is constant."""
-    return ChunkTokens(torch.randn(*batch, 4, 3, bins), torch.tensor([-1.0, 0.5, 0.0]), torch.tensor([1.0, 0.5, 2.0]))
+    return ChunkTokens(
+        torch.randn(*batch, 4, 3, bins), torch.tensor([-1.0, 0.5, 0.0]), torch.tensor([1.0, 0.5, 2.0])
+    )
 
 
 def test_tokens_are_a_density_over_bins() -> None:
@@ -44,13 +46,25 @@ def test_tokens_draw_as_often_as_they_say_and_diverge_from_others_only() -> None
 
 def test_a_token_policy_learns_a_demonstrated_chunk_and_scores_what_it_writes() -> None:
     torch.manual_seed(0)
-    policy = ChunkPolicy(1, partial(ChunkTokenHead, chunk=4, bins=16, actions=3), width=32, points=4, states=5, channels=16)
-    seen = TensorDict({IMAGE: torch.randint(0, 255, (6, 1, 3, 16, 16), dtype=torch.uint8), STATE: torch.randn(6, 5), TOKENS: torch.randint(0, 99, (6, 12))}, [6])
+    policy = ChunkPolicy(
+        1, partial(ChunkTokenHead, chunk=4, bins=16, actions=3), width=32, points=4, states=5, channels=16
+    )
+    seen = TensorDict(
+        {
+            IMAGE: torch.randint(0, 255, (6, 1, 3, 16, 16), dtype=torch.uint8),
+            STATE: torch.randn(6, 5),
+            TOKENS: torch.randint(0, 99, (6, 12)),
+        },
+        [6],
+    )
     chunks = torch.rand(6, 4, 3) * torch.tensor([0.2, 1e-6, 4.0])
     policy.normalise(chunks, seen[STATE], torch.full((3,), 1e-3))
     out = policy(seen.clone())
     assert torch.allclose(policy.get_dist(seen.clone()).log_prob(out[CHUNK]), out[LOG_PROB], atol=1e-4)
-    hidden, target = policy.fusion(policy.perception(seen[IMAGE], seen[TOKENS]), seen[STATE]).detach(), policy.head.target(chunks)
+    hidden, target = (
+        policy.fusion(policy.perception(seen[IMAGE], seen[TOKENS]), seen[STATE]).detach(),
+        policy.head.target(chunks),
+    )
     optimiser = torch.optim.Adam(policy.head.parameters(), 0.05)
     for _ in range(150):
         optimiser.zero_grad()
@@ -58,6 +72,7 @@ def test_a_token_policy_learns_a_demonstrated_chunk_and_scores_what_it_writes() 
         optimiser.step()
     with torch.no_grad():
         said = ChunkTokens(*policy.head(hidden)).mode
-    assert float((said - chunks)[..., 2].abs().max()) < 4.8 / 16  # a bin spans the range and a tenth on either side
+    # a bin spans the range and a tenth on either side
+    assert float((said - chunks)[..., 2].abs().max()) < 4.8 / 16
     assert bool(((said - chunks)[..., 1].abs() < 1e-5).all())
     assert float(policy.head.apart(hidden, hidden)) < 1e-6 < float(policy.head.apart(hidden, hidden.flip(0)))

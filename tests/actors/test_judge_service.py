@@ -10,14 +10,14 @@ import pytest
 import ray
 import torch
 
-from actors.cluster import connect
 from actors.factory import ConfigError, build_judge
-from actors.fleet import LocalFleet
-from actors.judge_service import JudgeClient, ServiceConfig, start_service
-from actors.recipe import Recipe, build_host
-from actors.rollouts import Job
-from envs.schema import EPISODE, JUDGE_STATUS, SUCCESS, Status
-from learners.algorithm import first_episode
+from actors.fleets.cluster import connect
+from actors.fleets.fleet import LocalFleet
+from actors.rollouts.host import Job
+from actors.rollouts.recipe import Recipe, build_host
+from actors.serving.judge_service import JudgeClient, ServiceConfig, start_service
+from envs.specs import EPISODE, JUDGE_STATUS, SUCCESS, Status
+from learners.rl.algorithm import first_episode
 from pipeline.artefact import save_weights
 
 OPTIONS = ServiceConfig(batch=8, wait_ms=20.0, budget=40, deadline=20.0, retries=1, pause=0.1)
@@ -78,7 +78,9 @@ def test_restarted_service_is_found_again_and_a_lost_one_is_an_error(service: An
 
 
 def test_rewards_that_come_later_are_those_that_come_at_once(recipe: Recipe) -> None:
-    now, later = (LocalFleet(build_host(replace(recipe, later=flag, bootstrap=False))) for flag in (False, True))
+    now, later = (
+        LocalFleet(build_host(replace(recipe, later=flag, bootstrap=False))) for flag in (False, True)
+    )
     now.host._judging.judge.threshold.fill_(0.0)  # type: ignore[union-attr]
     later.host._judging.judge.threshold.fill_(0.0)  # type: ignore[union-attr]
     job = Job(0, tuple(range(4)), 5)
@@ -86,6 +88,11 @@ def test_rewards_that_come_later_are_those_that_come_at_once(recipe: Recipe) -> 
     mine = first_episode(one["next", "done"].squeeze(-1))
     assert torch.equal(mine, first_episode(other["next", "done"].squeeze(-1)))
     assert bool(one["next", SUCCESS][:, 0].all())  # a threshold of zero lets everything through
-    assert one[EPISODE][:, 0, 0].tolist() == [0, 1, 2, 3] and not torch.equal(one[EPISODE][:, 0], one[EPISODE][:, 1])  # slots began anew
+    # slots began anew
+    assert one[EPISODE][:, 0, 0].tolist() == [0, 1, 2, 3] and not torch.equal(
+        one[EPISODE][:, 0], one[EPISODE][:, 1]
+    )
     for key in ("reward", SUCCESS, "terminated", JUDGE_STATUS):
-        assert torch.allclose(one["next", key][mine].float(), other["next", key][mine].float(), atol=1e-6), key
+        assert torch.allclose(one["next", key][mine].float(), other["next", key][mine].float(), atol=1e-6), (
+            key
+        )

@@ -12,13 +12,13 @@ import torch
 import websockets.sync.server
 from openpi_client import msgpack_numpy
 
-from actors.evaluate import evaluate
 from actors.policies.openpi import OpenPIPolicy, PolicyServerError
-from envs.kinematics import Kinematics
+from actors.rollouts.evaluate import evaluate
+from envs.geometry.kinematics import Kinematics
 from envs.layouts import CommandLayout, JointLayout, Joints
-from envs.physics.bench import BenchConfig
 from envs.physics.env import PhysicsEnv
-from envs.schema import ActionMode
+from envs.physics.tabletop.bench import BenchConfig
+from envs.specs import ActionMode
 
 
 class PolicyServer:
@@ -67,7 +67,11 @@ def test_it_drives_physics_through_kinematics(still: PolicyServer, mode: ActionM
         env.close()
     assert len(outcome.seeds) == 2
     shown = still.seen[0]
-    assert shown["observation.images.head"].shape == (64, 64, 3) and shown["observation.images.head"].dtype == np.uint8 and "block" in shown["prompt"]
+    assert (
+        shown["observation.images.head"].shape == (64, 64, 3)
+        and shown["observation.images.head"].dtype == np.uint8
+        and "block" in shown["prompt"]
+    )
     mine = Joints(before["observation", "state"][0], JointLayout.PER_ARM).to(JointLayout.GRIPPERS_LAST)
     assert np.allclose(shown["observation.state"], mine.numpy(), atol=1e-5)
     meant = Kinematics().flanges(Joints(after["observation", "state"][:, 0], JointLayout.PER_ARM))
@@ -77,9 +81,25 @@ def test_it_drives_physics_through_kinematics(still: PolicyServer, mode: ActionM
 def test_joint_worlds_get_joints(still: PolicyServer) -> None:
     from tensordict import TensorDict
 
-    policy = OpenPIPolicy(still.url, ("head", "hand_left", "hand_right"), 25, CommandLayout.JOINTS, ActionMode.ABSOLUTE)
+    policy = OpenPIPolicy(
+        still.url, ("head", "hand_left", "hand_right"), 25, CommandLayout.JOINTS, ActionMode.ABSOLUTE
+    )
     state = torch.arange(16.0)[None]
-    said = policy(TensorDict({"observation": TensorDict({"image": torch.zeros(1, 3, 3, 8, 8, dtype=torch.uint8), "state": state, "command": state}, [1])}, [1]))
+    said = policy(
+        TensorDict(
+            {
+                "observation": TensorDict(
+                    {
+                        "image": torch.zeros(1, 3, 3, 8, 8, dtype=torch.uint8),
+                        "state": state,
+                        "command": state,
+                    },
+                    [1],
+                )
+            },
+            [1],
+        )
+    )
     assert torch.equal(said["vla_action", "chunk"], state[:, None].expand(-1, 25, -1))
 
 
@@ -87,8 +107,21 @@ def test_what_a_policy_server_may_get_wrong() -> None:
     from tensordict import TensorDict
 
     state = torch.zeros(1, 16)
-    seen = TensorDict({"observation": TensorDict({"image": torch.zeros(1, 1, 3, 8, 8, dtype=torch.uint8), "state": state, "command": state}, [1])}, [1])
-    for answer, message in (({"actions": np.zeros((50, 7), np.float32)}, r"\(50, 7\)"), ({"actions": np.full((50, 16), np.nan, np.float32)}, "finite"), ("Traceback", "Error in inference server"), ({}, "wanted at least")):
+    seen = TensorDict(
+        {
+            "observation": TensorDict(
+                {"image": torch.zeros(1, 1, 3, 8, 8, dtype=torch.uint8), "state": state, "command": state},
+                [1],
+            )
+        },
+        [1],
+    )
+    for answer, message in (
+        ({"actions": np.zeros((50, 7), np.float32)}, r"\(50, 7\)"),
+        ({"actions": np.full((50, 16), np.nan, np.float32)}, "finite"),
+        ("Traceback", "Error in inference server"),
+        ({}, "wanted at least"),
+    ):
         server = PolicyServer(lambda _, answer=answer: answer)
         policy = OpenPIPolicy(server.url, ("head",), 25, CommandLayout.JOINTS, ActionMode.ABSOLUTE)
         with pytest.raises(PolicyServerError, match=message):

@@ -14,16 +14,16 @@ import ray
 import torch
 from tensordict import TensorDict
 
-from actors.cluster import Plan, connect
 from actors.factory import ConfigError, build_policy
-from actors.fleet import Fleet, FleetError, LocalFleet
-from actors.launch import build_fleet
-from actors.ray_fleet import Patience, RayFleet
-from actors.recipe import Recipe, build_host
-from actors.rollouts import Job, pack, trained_weights, unpack
-from learners.algorithm import RLConfig
-from learners.factory import build_algorithm
-from learners.rl import train_rl
+from actors.fleets.cluster import Plan, connect
+from actors.fleets.fleet import Fleet, FleetError, LocalFleet
+from actors.fleets.launch import build_fleet
+from actors.fleets.ray_fleet import Patience, RayFleet
+from actors.rollouts.host import Job, pack, trained_weights, unpack
+from actors.rollouts.recipe import Recipe, build_host
+from learners.rl.algorithm import RLConfig
+from learners.rl.factory import build_algorithm
+from learners.rl.loop import train_rl
 
 
 @pytest.fixture(scope="module")
@@ -33,13 +33,25 @@ def cluster(cfg: dict[str, Any]) -> Iterator[None]:
     ray.shutdown()
 
 
-def learn(fleet: Fleet, recipe: Recipe, folder: Path, **changes: Any) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+def learn(
+    fleet: Fleet, recipe: Recipe, folder: Path, **changes: Any
+) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     cfg = recipe.config
     torch.set_num_threads(1)
     policy = build_policy(cfg, Path(recipe.policy))
     policy.freeze_perception()
     torch.manual_seed(3)
-    settings = RLConfig(**{"iterations": 2, "envs": 16, "shards": 4, "epochs": 1, "minibatch": 32, "freeze_perception": True, **changes})
+    settings = RLConfig(
+        **{
+            "iterations": 2,
+            "envs": 16,
+            "shards": 4,
+            "epochs": 1,
+            "minibatch": 32,
+            "freeze_perception": True,
+            **changes,
+        }
+    )
     stats = train_rl(fleet, policy, build_algorithm(cfg, policy), settings, folder, starts=8)
     return {name: value.clone() for name, value in policy.state_dict().items()}, stats
 
@@ -55,10 +67,14 @@ def rollout(fleet: Fleet, recipe: Recipe) -> list[TensorDict]:
 
 
 def equal(one: TensorDict, other: TensorDict) -> bool:
-    return all(torch.equal(value, other[key]) for key, value in one.items(True, True)) and set(one.keys(True, True)) == set(other.keys(True, True))
+    return all(torch.equal(value, other[key]) for key, value in one.items(True, True)) and set(
+        one.keys(True, True)
+    ) == set(other.keys(True, True))
 
 
-def test_rollouts_and_learned_weights_are_the_same_bits_for_any_number_of_actors(cluster: None, recipe: Recipe, tmp_path: Path) -> None:
+def test_rollouts_and_learned_weights_are_the_same_bits_for_any_number_of_actors(
+    cluster: None, recipe: Recipe, tmp_path: Path
+) -> None:
     torch.set_num_threads(1)
     local = LocalFleet(build_host(recipe))
     wanted = rollout(local, recipe)
@@ -72,7 +88,7 @@ def test_rollouts_and_learned_weights_are_the_same_bits_for_any_number_of_actors
         finally:
             fleet.close()
         assert all(torch.equal(value, learned[name]) for name, value in weights.items())
-        assert stats["books"]["learned"] == stats["books"]["asked"] == 32
+        assert stats["ledger"]["learned"] == stats["ledger"]["asked"] == 32
     torch.set_num_threads(len(os.sched_getaffinity(0)))
 
 
@@ -90,8 +106,11 @@ def test_a_killed_host_is_replaced_and_its_job_run_again(cluster: None, recipe: 
         fleet.kill(1)
         got = sorted((fleet.take() for _ in range(4)), key=lambda r: r.job.number)  # type: ignore[union-attr]
         assert [r.job.number for r in got if r] == [0, 1, 2, 3]
-        assert all(r is not None and r.batch is not None and torch.equal(r.batch["episode_seed"], w["episode_seed"]) for r, w in zip(got, wanted, strict=True))
-        assert fleet.books.deaths == 2
+        assert all(
+            r is not None and r.batch is not None and torch.equal(r.batch["episode_seed"], w["episode_seed"])
+            for r, w in zip(got, wanted, strict=True)
+        )
+        assert fleet.ledger.deaths == 2
     finally:
         fleet.close()
 
@@ -115,9 +134,9 @@ def test_async_keeps_lag_bounded_and_books_balanced(cluster: None, recipe: Recip
         _, stats = learn(fleet, recipe, tmp_path, iterations=4, schedule="async", max_policy_lag=1, queue=6)
     finally:
         fleet.close()
-    books = stats["books"]
-    assert books["learned"] == 4 * 16
-    assert books["asked"] == books["learned"] + sum(books["dropped"].values())
+    ledger = stats["ledger"]
+    assert ledger["learned"] == 4 * 16
+    assert ledger["asked"] == ledger["learned"] + sum(ledger["dropped"].values())
     assert stats["last"]["policy_lag_max"] <= 1
 
 
@@ -127,7 +146,8 @@ def test_a_job_that_raises_is_given_up_and_counted(cluster: None, recipe: Recipe
         policy = build_policy(recipe.config, Path(recipe.policy))
         policy.freeze_perception()
         weights = trained_weights(policy)
-        fleet.publish(0, {name: value[..., :-1] for name, value in weights.items()})  # of another shape, so taking over raises
+        # of another shape, so taking over raises
+        fleet.publish(0, {name: value[..., :-1] for name, value in weights.items()})
         fleet.submit(Job(0, tuple(range(4)), 0))
         result = fleet.take()
         assert result is not None and result.batch is None and result.failure.startswith("RuntimeError")
@@ -154,7 +174,11 @@ def test_hosts_that_cannot_be_built_stop_the_run(cluster: None, recipe: Recipe) 
 
 
 def test_a_plan_that_cannot_be_scheduled_is_refused(cfg: dict[str, Any]) -> None:
-    launch = {**cfg["launch"], "actors": 5, "place": {**cfg["launch"]["place"], "actors": {"num_cpus": 1, "num_gpus": 0.5}}}
+    launch = {
+        **cfg["launch"],
+        "actors": 5,
+        "place": {**cfg["launch"]["place"], "actors": {"num_cpus": 1, "num_gpus": 0.5}},
+    }
     plan = Plan.of(launch)
     with pytest.raises(ConfigError, match=r"launch\.place\.actors .* needs 1 CPU and 0.5 GPU"):
         plan.check([{"CPU": 8.0}])
@@ -169,5 +193,7 @@ def test_missing_weights_are_named_before_anything_starts(cluster: None, recipe:
 
 
 def test_rollouts_survive_packing() -> None:
-    batch = TensorDict({("a", "b"): torch.arange(6).reshape(2, 3), "c": torch.zeros(2, 3, 4, dtype=torch.uint8)}, [2, 3])
+    batch = TensorDict(
+        {("a", "b"): torch.arange(6).reshape(2, 3), "c": torch.zeros(2, 3, 4, dtype=torch.uint8)}, [2, 3]
+    )
     assert equal(batch, unpack(pack(batch)))

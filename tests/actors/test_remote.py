@@ -15,16 +15,16 @@ import torch
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from actors.serve.sessions import ServeConfig, SessionHost
+from actors.serving.sessions import ServeConfig, SessionHost
 from envs.episodes.clips import ClipStore
 from envs.judges import LearnedJudge
-from envs.schema import CHUNK, EPISODE, IMAGE, STATE, Rewards
 from envs.simulators.base import WorldShape
-from envs.simulators.remote import GivenStates, RemoteConfig, RemoteError, RemoteSimulator
-from envs.simulators.state_head import StateHead
-from envs.simulators.unet import UNetSimulator
+from envs.simulators.remote.engine import GivenStates, RemoteConfig, RemoteError, RemoteSimulator
+from envs.simulators.state_experts.head import StateHead
+from envs.simulators.unet.engine import UNetSimulator
+from envs.specs import CHUNK, EPISODE, IMAGE, STATE, Rewards
 from envs.transforms import world_transforms
-from envs.world import Starts, WorldEnv
+from envs.world import InitialStates, WorldEnv
 from tests.actors.serving import Running
 
 SHAPE = WorldShape(chunk=4, sides=())
@@ -45,12 +45,19 @@ def server(simulator: UNetSimulator, decoder: StateHead) -> Iterator[Running]:
 
 def world(simulator: object, decoder: object, store: ClipStore, batch: int) -> TransformedEnv:
     torch.manual_seed(2)
-    base = WorldEnv(simulator, Starts.of(store), batch, horizon=8, bf16=False)  # type: ignore[arg-type]
-    return TransformedEnv(base, world_transforms(decoder, LearnedJudge(3, 4), Rewards(), store.views))  # type: ignore[arg-type]
+    # type: ignore[arg-type]
+    base = WorldEnv(simulator, InitialStates.of(store), batch, horizon=8, bf16=False)
+    # type: ignore[arg-type]
+    return TransformedEnv(base, world_transforms(decoder, LearnedJudge(3, 4), Rewards(), store.views))
 
 
-def test_a_served_world_is_the_world_up_to_jpeg(server: Running, simulator: UNetSimulator, decoder: StateHead, store: ClipStore) -> None:
-    far, near = world(RemoteSimulator(SHAPE, RemoteConfig((server.url,))), GivenStates(4), store, 2), world(simulator, decoder, store, 2)
+def test_a_served_world_is_the_world_up_to_jpeg(
+    server: Running, simulator: UNetSimulator, decoder: StateHead, store: ClipStore
+) -> None:
+    far, near = (
+        world(RemoteSimulator(SHAPE, RemoteConfig((server.url,))), GivenStates(4), store, 2),
+        world(simulator, decoder, store, 2),
+    )
     torch.manual_seed(3)
     actions = 0.05 * torch.randn(2, 2, 4, 14)
     last = []
@@ -79,8 +86,12 @@ def test_specs_and_partial_resets(server: Running, store: ClipStore) -> None:
     assert len(server.host.sessions) == 2 and len(kept & set(server.host.sessions)) == 1
 
 
-def test_more_rows_than_places_and_many_urls(server: Running, simulator: UNetSimulator, decoder: StateHead, store: ClipStore) -> None:
-    with pytest.raises(RemoteError, match=r"4 sessions are wanted, the servers at simulator\.model\.urls hold 3"):
+def test_more_rows_than_places_and_many_urls(
+    server: Running, simulator: UNetSimulator, decoder: StateHead, store: ClipStore
+) -> None:
+    with pytest.raises(
+        RemoteError, match=r"4 sessions are wanted, the servers at simulator\.model\.urls hold 3"
+    ):
         world(RemoteSimulator(SHAPE, RemoteConfig((server.url,))), GivenStates(4), store, 4).reset()
     second = Running(SessionHost(simulator, decoder, ServeConfig(sessions=1), bf16=False))
     try:
@@ -127,10 +138,17 @@ def strange_server(answer: Callable[[str, bytes], tuple[int, bytes]]) -> tuple[s
         ("/step", 403, b'{"error": "unknown client_id"}', "ended by the server or by another client"),
         ("/step", 200, b"", "the answer is empty"),
         ("/step", 200, b"\0\0\0\x05{}", "announces 5 bytes"),
-        ("/step", 200, b'\0\0\0\x3f{"frame_shape": [25, 3, 3, 384, 512], "state_shape": [25, 16]} ', "task.chunk"),
+        (
+            "/step",
+            200,
+            b'\0\0\0\x3f{"frame_shape": [25, 3, 3, 384, 512], "state_shape": [25, 16]} ',
+            "task.chunk",
+        ),
     ],
 )
-def test_servers_that_answer_nonsense(path: str, status: int, body: bytes, message: str, store: ClipStore) -> None:
+def test_servers_that_answer_nonsense(
+    path: str, status: int, body: bytes, message: str, store: ClipStore
+) -> None:
     def answer(asked: str, _: bytes) -> tuple[int, bytes]:
         return (status, body) if asked == path else (200, json.dumps({"client_id": "x"}).encode())
 
@@ -146,11 +164,17 @@ def test_servers_that_answer_nonsense(path: str, status: int, body: bytes, messa
 
 
 def test_servers_that_never_answer_and_that_are_not_there(store: ClipStore) -> None:
-    url, httpd = strange_server(lambda *_: (time.sleep(3), (200, b"{}"))[1])  # type: ignore[func-returns-value]
+    # type: ignore[func-returns-value]
+    url, httpd = strange_server(lambda *_: (time.sleep(3), (200, b"{}"))[1])
     try:
         began = time.monotonic()
         with pytest.raises(RemoteError, match=r"deadline_s=0\.3 after 2 tries"):
-            world(RemoteSimulator(SHAPE, RemoteConfig((url,), deadline_s=0.3, retries=1)), GivenStates(4), store, 1).reset()
+            world(
+                RemoteSimulator(SHAPE, RemoteConfig((url,), deadline_s=0.3, retries=1)),
+                GivenStates(4),
+                store,
+                1,
+            ).reset()
         assert time.monotonic() - began < 2.5
     finally:
         httpd.shutdown()
@@ -158,10 +182,17 @@ def test_servers_that_never_answer_and_that_are_not_there(store: ClipStore) -> N
         s.bind(("127.0.0.1", 0))
         port = s.getsockname()[1]
     with pytest.raises(RemoteError, match="no answer"):
-        world(RemoteSimulator(SHAPE, RemoteConfig((f"http://127.0.0.1:{port}",), retries=0)), GivenStates(4), store, 1).reset()
+        world(
+            RemoteSimulator(SHAPE, RemoteConfig((f"http://127.0.0.1:{port}",), retries=0)),
+            GivenStates(4),
+            store,
+            1,
+        ).reset()
 
 
-def test_a_lost_answer_is_asked_for_again_where_that_is_safe(server: Running, store: ClipStore, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lost_answer_is_asked_for_again_where_that_is_safe(
+    server: Running, store: ClipStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import requests
 
     env = world(RemoteSimulator(SHAPE, RemoteConfig((server.url,), retries=1)), GivenStates(4), store, 1)

@@ -1,4 +1,6 @@
-"""A served simulator: strangers' clients work, sessions share passes and nothing else, bad input harms nobody."""
+"""A served simulator: strangers' clients work, sessions share passes and nothing else, bad input harms
+nobody.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +16,10 @@ import pytest
 import requests
 import torch
 
-from actors.serve.sessions import ServeConfig, SessionHost
-from envs.kinematics import Kinematics
-from envs.simulators.state_head import StateHead
-from envs.simulators.unet import UNetSimulator
+from actors.serving.sessions import ServeConfig, SessionHost
+from envs.geometry.kinematics import Kinematics
+from envs.simulators.state_experts.head import StateHead
+from envs.simulators.unet.engine import UNetSimulator
 from tests.actors.serving import Running, Stranger, block, jpeg
 
 REST = np.tile(np.array([0, -0.35, 0, 2.1, 0, 1.39, 0, 0.2] * 2, np.float32), (4, 1))
@@ -26,7 +28,8 @@ REST = np.tile(np.array([0, -0.35, 0, 2.1, 0, 1.39, 0, 0.2] * 2, np.float32), (4
 def make(simulator: UNetSimulator, **config: object) -> Running:
     torch.manual_seed(1)
     decoder = StateHead(simulator.feature_shape[0], simulator.shape.chunk, simulator.shape.memory).eval()
-    return Running(SessionHost(simulator, decoder, ServeConfig(**config), Kinematics(), bf16=False))  # type: ignore[arg-type]
+    # type: ignore[arg-type]
+    return Running(SessionHost(simulator, decoder, ServeConfig(**config), Kinematics(), bf16=False))
 
 
 @pytest.fixture
@@ -48,7 +51,13 @@ def test_a_strangers_client_works_unchanged(server: Running) -> None:
     (session,) = server.host.sessions.values()
     assert session.frames == 7 and int(session.state["length"]) == 8
     said = requests.get(f"{server.url}/api/status", timeout=5).json()
-    assert said["step_count"] == 2 and said["frames_generated"] == 7 and said["has_preview"] and len(said["state"]) == 16 and said["task"] == "push it"
+    assert (
+        said["step_count"] == 2
+        and said["frames_generated"] == 7
+        and said["has_preview"]
+        and len(said["state"]) == 16
+        and said["task"] == "push it"
+    )
     assert client.id not in json.dumps(said)
     preview = requests.get(f"{server.url}/api/preview.jpg", timeout=5)
     assert preview.headers["Content-Type"] == "image/jpeg" and preview.content[:2] == b"\xff\xd8"
@@ -73,7 +82,10 @@ def test_sessions_share_forward_passes_and_nothing_else(simulator: UNetSimulator
             client.prepare(seed=n)
         made: dict[int, list[np.ndarray]] = {n: [] for n in range(4)}
         for _ in range(2):
-            threads = [threading.Thread(target=lambda n=n: made[n].append(clients[n].step(REST)[0])) for n in range(4)]
+            threads = [
+                threading.Thread(target=lambda n=n: made[n].append(clients[n].step(REST)[0]))
+                for n in range(4)
+            ]
             [thread.start() for thread in threads]
             [thread.join() for thread in threads]
         assert server.host.steps == 8 and server.host.passes <= 4
@@ -91,9 +103,16 @@ def test_bad_input_is_refused_by_name(server: Running) -> None:
     client.prepare()
 
     def refused(response: requests.Response, status: int, word: str) -> None:
-        assert response.status_code == status and word in response.json()["error"], (response.status_code, response.text)
+        assert response.status_code == status and word in response.json()["error"], (
+            response.status_code,
+            response.text,
+        )
 
-    refused(requests.post(f"{server.url}/reset", json={"client_id": "nobody"}, timeout=5), 403, "unknown client_id")
+    refused(
+        requests.post(f"{server.url}/reset", json={"client_id": "nobody"}, timeout=5),
+        403,
+        "unknown client_id",
+    )
     refused(requests.post(f"{server.url}/nowhere", json={}, timeout=5), 404, "Not Found")
     refused(client.post("/set_camera_params", intrinsic=[[1, 2], [3]]), 400, "intrinsic")
     refused(client.post("/set_camera_params", intrinsic=np.zeros((3, 3, 3)).tolist()), 400, "invertible")
@@ -103,7 +122,15 @@ def test_bad_input_is_refused_by_name(server: Running) -> None:
     meta = json.dumps({"client_id": client.id, "frame_shape": [3, 3, 64, 64]}).encode()
     refused(client.send("/set_episode_data", block(jpeg(frame)[:-200]) + block(meta)), 400, "picture")
     refused(client.send("/set_episode_data", block(jpeg(frame[:, :, :32])) + block(meta)), 400, "32 x 192")
-    refused(client.send("/set_episode_data", block(jpeg(frame)) + block(b'{"client_id": "%s", "frame_shape": [3, 3, 99999, 99999]}' % client.id.encode())), 400, "larger")
+    refused(
+        client.send(
+            "/set_episode_data",
+            block(jpeg(frame))
+            + block(b'{"client_id": "%s", "frame_shape": [3, 3, 99999, 99999]}' % client.id.encode()),
+        ),
+        400,
+        "larger",
+    )
     refused(client.send("/set_episode_data", block(jpeg(frame)) + block(b"[" * 100_000)), 400, "JSON")
     refused(client.send("/step", client.actions(np.full((4, 16), np.nan))), 400, "NaN")
     refused(client.send("/step", client.actions(np.zeros((4, 7)))), 400, "14 numbers")
@@ -114,10 +141,14 @@ def test_bad_input_is_refused_by_name(server: Running) -> None:
 
 def test_an_enormous_body_is_refused_before_it_is_read(server: Running) -> None:
     with socket.create_connection(("127.0.0.1", server.port), timeout=10) as s:
-        s.sendall(b"POST /set_episode_traj HTTP/1.1\r\nHost: x\r\nContent-Length: 27917287424\r\n\r\n" + b"\0" * 1000)
+        s.sendall(
+            b"POST /set_episode_traj HTTP/1.1\r\nHost: x\r\nContent-Length: 27917287424\r\n\r\n"
+            + b"\0" * 1000
+        )
         answer = s.recv(4096)
     assert b" 413 " in answer.split(b"\r\n", 1)[0] and b"body_mb" in answer
-    said = requests.post(f"{server.url}/step", data=(b"\0" * 2**20 for _ in range(9)), timeout=30)  # its size is not announced
+    # its size is not announced
+    said = requests.post(f"{server.url}/step", data=(b"\0" * 2**20 for _ in range(9)), timeout=30)
     assert said.status_code == 413
 
 
@@ -127,7 +158,10 @@ def test_a_client_that_vanishes_harms_nobody(server: Running) -> None:
     body = gone.actions(REST)
     for sent in (len(body) // 2, len(body)):
         with socket.create_connection(("127.0.0.1", server.port)) as s:
-            s.sendall(f"POST /step HTTP/1.1\r\nHost: x\r\nContent-Length: {len(body)}\r\n\r\n".encode() + body[:sent])
+            s.sendall(
+                f"POST /step HTTP/1.1\r\nHost: x\r\nContent-Length: {len(body)}\r\n\r\n".encode()
+                + body[:sent]
+            )
     assert bystander.step(REST)[0].shape[0] == 4
     until = time.monotonic() + 10
     while server.host.sessions[gone.id].chunk < 1 and time.monotonic() < until:
@@ -161,7 +195,9 @@ def test_full_servers_say_so_and_idle_sessions_make_room(simulator: UNetSimulato
         server.stop()
 
 
-def test_a_failing_model_is_a_500_and_the_session_goes_on(server: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_model_is_a_500_and_the_session_goes_on(
+    server: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
     client = Stranger(server.url)
     client.prepare()
     step = server.host.simulator.step
@@ -200,7 +236,9 @@ def test_six_hundred_mutated_bodies(server: Running) -> None:
             elif kind == 2:
                 body[at:at] = bytes(rng.randrange(256) for _ in range(rng.randrange(1, 40)))
             elif kind == 3:
-                body[: min(4, len(body))] = rng.choice((b"\0\0\0\0", b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff"))
+                body[: min(4, len(body))] = rng.choice(
+                    (b"\0\0\0\0", b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff")
+                )
             else:
                 body += bytes(body[: rng.randrange(200)])
         status = victim.send(path, bytes(body)).status_code

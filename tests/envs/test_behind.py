@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from envs.episodes.behind import WriteBehind
-from envs.episodes.lerobot import LeRobotDataset, LeRobotWriter
+from envs.episodes.formats.lerobot import LeRobotDataset, LeRobotWriter
+from envs.episodes.write_behind import WriteBehind
 
 
 def test_shards_come_in_order_and_are_there_at_the_end(dataset: Path, tmp_path: Path) -> None:
@@ -22,7 +22,10 @@ def test_shards_come_in_order_and_are_there_at_the_end(dataset: Path, tmp_path: 
 def test_what_fails_in_writing_is_raised_and_nothing_finished_is_lost(dataset: Path, tmp_path: Path) -> None:
     data = LeRobotDataset(dataset)
     episodes = list(data)[:2]
-    with pytest.raises(AttributeError), WriteBehind(LeRobotWriter(tmp_path, data.views, data.size, data.fps)) as behind:
+    with (
+        pytest.raises(AttributeError),
+        WriteBehind(LeRobotWriter(tmp_path, data.views, data.size, data.fps)) as behind,
+    ):
         behind.write(episodes)
         behind.write([None])  # type: ignore[list-item]
     assert len(LeRobotDataset(tmp_path)) == 2

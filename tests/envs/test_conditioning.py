@@ -17,12 +17,17 @@ def golden(shared: Path) -> dict[str, np.ndarray]:
 
 
 def test_pose_map_equals_the_public_one_in_every_pixel(golden: dict[str, np.ndarray]) -> None:
-    drawn = render_pose_map(*(torch.from_numpy(golden[k]) for k in ("eef_poses", "c2w", "intrinsic")), tool_offset=float(golden["gripper_offset"]))
+    drawn = render_pose_map(
+        *(torch.from_numpy(golden[k]) for k in ("eef_poses", "c2w", "intrinsic")),
+        tool_offset=float(golden["gripper_offset"]),
+    )
     assert np.array_equal(drawn.numpy(), golden["pose_map_uint8"].transpose(1, 2, 0, 3, 4))
 
 
 def test_ray_map_equals_the_public_one(golden: dict[str, np.ndarray]) -> None:
-    rays = render_ray_map(torch.from_numpy(golden["intrinsic"]), torch.from_numpy(golden["c2w"][:, :2]), (384, 512), stride=16)
+    rays = render_ray_map(
+        torch.from_numpy(golden["intrinsic"]), torch.from_numpy(golden["c2w"][:, :2]), (384, 512), stride=16
+    )
     assert np.abs(rays.numpy().transpose(2, 0, 1, 3, 4) - golden["ray_map_stride16"]).max() < 1e-5
 
 
@@ -36,7 +41,12 @@ def scene(steps: int = 3) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 def test_batch_dimensions_and_any_size() -> None:
     poses, c2w, intrinsic = scene()
     one = render_pose_map(poses, c2w, intrinsic, (64, 48))
-    many = render_pose_map(poses.expand(2, 5, *poses.shape), c2w.expand(2, 5, *c2w.shape), intrinsic.expand(2, 5, *intrinsic.shape), (64, 48))
+    many = render_pose_map(
+        poses.expand(2, 5, *poses.shape),
+        c2w.expand(2, 5, *c2w.shape),
+        intrinsic.expand(2, 5, *intrinsic.shape),
+        (64, 48),
+    )
     assert many.shape == (2, 5, 1, 3, 3, 64, 48)
     assert bool((many == one).all())
     assert bool((one != 50).any())

@@ -30,11 +30,23 @@ def test_format_is_lerobot_v3(dataset: Path) -> None:
     info = json.loads((dataset / "meta/info.json").read_text())
     assert info["codebase_version"] == "v3.0"
     rows = pq.read_table(dataset / info["data_path"].format(chunk_index=0, file_index=1))
-    assert {"timestamp", "frame_index", "episode_index", "index", "task_index", "action", "observation.state"} <= set(rows.column_names)
+    assert {
+        "timestamp",
+        "frame_index",
+        "episode_index",
+        "index",
+        "task_index",
+        "action",
+        "observation.state",
+    } <= set(rows.column_names)
     assert rows["index"][0].as_py() == sum(r["length"] for r in LeRobotDataset(dataset).episode_rows()[:4])
     episode = LeRobotDataset(dataset).episode_rows()[5]
-    assert episode["videos/observation.images.head/from_timestamp"] == pytest.approx(LeRobotDataset(dataset).episode_rows()[4]["length"] / 10)
-    assert json.loads(pq.read_schema(dataset / "meta/tasks.parquet").metadata[b"pandas"])["index_columns"] == ["task"]
+    assert episode["videos/observation.images.head/from_timestamp"] == pytest.approx(
+        LeRobotDataset(dataset).episode_rows()[4]["length"] / 10
+    )
+    assert json.loads(pq.read_schema(dataset / "meta/tasks.parquet").metadata[b"pandas"])[
+        "index_columns"
+    ] == ["task"]
     stats = json.loads((dataset / "meta/stats.json").read_text())
     assert len(stats["action"]["mean"]) == 14 and len(stats["observation.images.head"]["mean"]) == 3
 
@@ -49,14 +61,17 @@ def test_action_is_the_next_command(dataset: Path, episodes: list[Episode]) -> N
 def test_interrupted_collection_resumes(dataset: Path, episodes: list[Episode], tmp_path: Path) -> None:
     root = tmp_path / "copy"
     shutil.copytree(dataset, root)
-    (root / "meta/episodes/chunk-000/file-001.parquet").unlink()  # the second shard was being written when the power failed
+    # the second shard was being written when the power failed
+    (root / "meta/episodes/chunk-000/file-001.parquet").unlink()
     writer = LeRobotWriter(root, ("head", "hand_left", "hand_right"), (64, 64), 10.0)
     assert writer.shards == 1
     writer.write(episodes[4:])
     assert [e.seed for e in LeRobotDataset(root)] == [e.seed for e in episodes]
 
 
-@pytest.mark.parametrize("name", ["videos/observation.images.head/chunk-000/file-000.mp4", "data/chunk-000/file-000.parquet"])
+@pytest.mark.parametrize(
+    "name", ["videos/observation.images.head/chunk-000/file-000.mp4", "data/chunk-000/file-000.parquet"]
+)
 def test_damage_names_the_file(dataset: Path, tmp_path: Path, name: str) -> None:
     root = tmp_path / "copy"
     shutil.copytree(dataset, root)
@@ -91,7 +106,12 @@ def test_nan_in_an_episode_is_refused(episodes: list[Episode]) -> None:
 
 
 def test_memory_is_sparse_and_keeps_first_and_last() -> None:
-    assert memory_indices(torch.tensor([1, 4, 10, 41]), 4).tolist() == [[0, 0, 0, 0], [0, 1, 2, 3], [0, 3, 6, 9], [0, 13, 27, 40]]
+    assert memory_indices(torch.tensor([1, 4, 10, 41]), 4).tolist() == [
+        [0, 0, 0, 0],
+        [0, 1, 2, 3],
+        [0, 3, 6, 9],
+        [0, 13, 27, 40],
+    ]
 
 
 def test_clips_line_up(store: ClipStore) -> None:
@@ -105,7 +125,9 @@ def test_clips_line_up(store: ClipStore) -> None:
 
 def test_stride_skips_frames(store: ClipStore) -> None:
     clip = store.clips(torch.tensor([3]), torch.tensor([5]), ClipSpec(4, 2, 1, stride=3))
-    assert torch.equal(clip["future", "commands"][0], store.arrays["commands"][store.start[3] + torch.tensor([8, 11])])
+    assert torch.equal(
+        clip["future", "commands"][0], store.arrays["commands"][store.start[3] + torch.tensor([8, 11])]
+    )
     assert int(clip["begin"]) == 1  # one stride of past: frames 2 and 5
 
 
@@ -129,7 +151,12 @@ def test_objects_without_headings_are_refused_by_name(dataset: Path, tmp_path: P
     root = tmp_path / "copy"
     shutil.copytree(dataset, root)
     info = json.loads((root / "meta/info.json").read_text())
-    assert info["features"]["observation.objects"]["names"][:4] == ["object0_x", "object0_y", "object0_z", "object0_heading"]
+    assert info["features"]["observation.objects"]["names"][:4] == [
+        "object0_x",
+        "object0_y",
+        "object0_z",
+        "object0_heading",
+    ]
     info["features"]["observation.objects"] |= {"names": None, "shape": [6]}
     (root / "meta/info.json").write_text(json.dumps(info))
     with pytest.raises(EpisodeError, match="heading"):
@@ -137,7 +164,9 @@ def test_objects_without_headings_are_refused_by_name(dataset: Path, tmp_path: P
 
 
 def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
-    """A coder that reads memory nobody wrote gives other pictures each time, and with them other worlds, judges and policies."""
+    """A coder that reads memory nobody wrote gives other pictures each time, and with them other worlds,
+    judges and policies.
+    """
     rng, frames = np.random.default_rng(5), np.full((40, 64, 64, 3), (155, 122, 108), np.uint8)
     for frame in frames:  # arms that jump
         for x, y, aside in zip((10, 44), rng.integers(40, 56, 2), rng.integers(-6, 7, 2), strict=True):
@@ -145,7 +174,8 @@ def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
             frame[y + 4 :, x + aside + 3 : x + aside + 7] = (200, 200, 205)
     path, found, held = tmp_path / "video.mp4", set(), []
     for _ in range(20):
-        held = [*held[-4:], rng.integers(0, 255, int(rng.integers(1_000, 3_000_000)), dtype=np.uint8)]  # memory changes hands
+        # memory changes hands
+        held = [*held[-4:], rng.integers(0, 255, int(rng.integers(1_000, 3_000_000)), dtype=np.uint8)]
         write_video(path, frames, 5)
         found.add(path.read_bytes())
     assert len(found) == 1

@@ -6,11 +6,13 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from envs.simulators.folding import at_detail, fold, unfold
-from envs.simulators.unet import _Embed
+from envs.simulators.unet.engine import _Embed
+from envs.simulators.unet.folding import at_detail, fold, unfold
 
 
-@pytest.mark.parametrize(("edge", "dtype"), [(4, torch.uint8), (8, torch.uint8), (4, torch.float32), (4, torch.bfloat16)])
+@pytest.mark.parametrize(
+    ("edge", "dtype"), [(4, torch.uint8), (8, torch.uint8), (4, torch.float32), (4, torch.bfloat16)]
+)
 def test_folding_is_torchs_unshuffling(edge: int, dtype: torch.dtype) -> None:
     pictures = (torch.rand(2, 3, 16, 24) * 255).to(dtype)
     squares = fold(pictures, edge)
@@ -30,7 +32,12 @@ def test_unfolding_passes_gradients_on() -> None:
 def test_looking_at_bytes_is_a_convolution_of_pictures(shrink: int) -> None:
     torch.manual_seed(0)
     embed = _Embed(6, 5, 8, shrink)
-    pictures, maps = torch.randint(0, 256, (2, 6, 16 * shrink, 24 * shrink), dtype=torch.uint8), torch.rand(2, 5, 16, 24) * 2 - 1
+    pictures, maps = (
+        torch.randint(0, 256, (2, 6, 16 * shrink, 24 * shrink), dtype=torch.uint8),
+        torch.rand(2, 5, 16, 24) * 2 - 1,
+    )
     small = at_detail(pictures, shrink) * 2 - 1
     weight = torch.cat((embed.pictures, embed.maps.unflatten(1, (5, 4, 4))), 1)
-    assert torch.allclose(embed(pictures, maps), F.conv2d(torch.cat((small, maps), 1), weight, embed.bias, stride=4), atol=1e-5)
+    assert torch.allclose(
+        embed(pictures, maps), F.conv2d(torch.cat((small, maps), 1), weight, embed.bias, stride=4), atol=1e-5
+    )

@@ -33,7 +33,7 @@ def test_follow_hands_moves_only_wrist_cameras() -> None:
 
 
 def test_projection_is_the_inverse_of_on_plane() -> None:
-    from envs.geometry import on_plane
+    from envs.geometry.cameras import on_plane
 
     intrinsic = torch.tensor([[50.0, 0, 32], [0, 50, 32], [0, 0, 1]])
     c2w = torch.eye(4)

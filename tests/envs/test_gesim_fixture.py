@@ -10,7 +10,7 @@ import pytest
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from envs.simulators.gesim_fixture import FixtureError, verify
+from envs.simulators.gesim.fixture import FixtureError, verify
 
 
 @pytest.fixture
@@ -18,12 +18,16 @@ def golden(shared: Path) -> Path:
     return shared / "golden/gesim_v2_tiny.safetensors"
 
 
-def changed(golden: Path, to: Path, meta: dict[str, str] | None = None, drop: str = "", **config: Any) -> Path:
+def changed(
+    golden: Path, to: Path, meta: dict[str, str] | None = None, drop: str = "", **config: Any
+) -> Path:
     """A copy without some tensors and with another configuration."""
     with safe_open(str(golden), "pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys() if not drop or not key.startswith(drop)}
         known = file.metadata()
-    save_file(tensors, to, {**known, "config": json.dumps(json.loads(known["config"]) | config), **(meta or {})})
+    save_file(
+        tensors, to, {**known, "config": json.dumps(json.loads(known["config"]) | config), **(meta or {})}
+    )
     return to
 
 

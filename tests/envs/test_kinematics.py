@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from envs.episodes import Episode
-from envs.geometry import rpy_to_matrix
-from envs.kinematics import Kinematics, KinematicsError, Robot
+from envs.geometry.cameras import rpy_to_matrix
+from envs.geometry.kinematics import Kinematics, KinematicsError, Robot
 from envs.layouts import JointLayout, Joints
 
 
@@ -20,7 +20,9 @@ def test_flanges_are_where_the_bench_measured_them(episodes: list[Episode]) -> N
     true = torch.from_numpy(episode.achieved)
     for arm in (0, 7):
         assert (poses[:, arm : arm + 3] - true[:, arm : arm + 3]).abs().max() < 2e-3
-        assert (rpy_to_matrix(poses[:, arm + 3 : arm + 6]) - rpy_to_matrix(true[:, arm + 3 : arm + 6])).abs().max() < 2e-2
+        assert (
+            rpy_to_matrix(poses[:, arm + 3 : arm + 6]) - rpy_to_matrix(true[:, arm + 3 : arm + 6])
+        ).abs().max() < 2e-2
     assert torch.allclose(poses[:, 6], torch.from_numpy(episode.states[:, 7]), atol=1e-6)
 
 
@@ -30,21 +32,26 @@ def _urdf(path: Path) -> Path:
         before = "base"
         for k in range(1, 8):
             name = f"link{k}_{side}"
-            links.append(f'<link name="{name}"><visual><geometry><mesh filename="nowhere/{name}.stl"/></geometry></visual></link>')
+            links.append(
+                f'<link name="{name}"><visual><geometry><mesh filename="nowhere/{name}.stl"/></geometry></visual></link>'
+            )
             offset = f"0 {y} 0" if k == 1 else "0 0 0.1"
             joints.append(
                 f'<joint name="joint{k}_{side}" type="revolute"><parent link="{before}"/><child link="{name}"/><origin xyz="{offset}" rpy="0 0 0"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>'
             )
             before = name
         links.append(f'<link name="tool_{side}"/>')
-        joints.append(f'<joint name="fixed_{side}" type="fixed"><parent link="{before}"/><child link="tool_{side}"/><origin xyz="0.05 0 0" rpy="0 0 0"/></joint>')
+        joints.append(
+            f'<joint name="fixed_{side}" type="fixed"><parent link="{before}"/><child link="tool_{side}"/><origin xyz="0.05 0 0" rpy="0 0 0"/></joint>'
+        )
     path.write_text(f'<robot name="two">{"".join(links)}{"".join(joints)}</robot>')
     return path
 
 
 def test_a_urdf_without_its_meshes(tmp_path: Path) -> None:
     names = tuple(tuple(f"joint{k}_{side}" for k in range(1, 8)) for side in "lr")
-    arms = Kinematics(Robot(str(_urdf(tmp_path / "two.urdf")), names, ("tool_l", "tool_r")))  # type: ignore[arg-type]
+    # type: ignore[arg-type]
+    arms = Kinematics(Robot(str(_urdf(tmp_path / "two.urdf")), names, ("tool_l", "tool_r")))
     turned = torch.zeros(2, 16)
     turned[1, 0], turned[1, 15] = np.pi / 2, 0.7
     poses = arms.flanges(Joints(turned, JointLayout.PER_ARM))

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from envs.geometry import project
-from envs.physics.behaviours import Behaviour
-from envs.physics.bench import Bench, BenchConfig
+from envs.geometry.cameras import project
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import BenchPool
-from envs.schema import CHUNK, COMMAND, EPISODE, IMAGE, STATE, SUCCESS
+from envs.physics.tabletop.bench import Bench, BenchConfig
+from envs.physics.tabletop.experts import Behaviour
+from envs.specs import CHUNK, COMMAND, EPISODE, IMAGE, STATE, SUCCESS
 
 
 def test_same_seed_same_episode_whatever_the_workers() -> None:
@@ -70,7 +70,7 @@ def test_a_chunk_is_carried_out_to_its_end() -> None:
 def test_dial_is_checked() -> None:
     bench = Bench(BenchConfig())
     bench.reset(0)
-    with pytest.raises(ValueError, match="dial"):
+    with pytest.raises(ValueError, match="noise_level"):
         Behaviour(bench.task, bench.layout, 1.5, np.random.default_rng(0))
 
 

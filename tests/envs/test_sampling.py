@@ -6,7 +6,7 @@ import pytest
 import torch
 from diffusers import FlowMatchEulerDiscreteScheduler
 
-from envs.simulators.sampling import EDM, Distilled, Euler
+from envs.simulators.samplers import EDM, Distilled, Euler
 
 
 def test_every_sampler_finds_the_data_of_an_exact_flow() -> None:

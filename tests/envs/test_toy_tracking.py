@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from envs.schema import CHUNK, STATE, SUCCESS
-from envs.toy_tracking import ToyTrackingEnv
+from envs.physics.toy_tracking import ToyTrackingEnv
+from envs.specs import CHUNK, STATE, SUCCESS
 
 
 def test_specs_and_targets_of_seeds() -> None:
@@ -14,7 +14,11 @@ def test_specs_and_targets_of_seeds() -> None:
     check_env_specs(env)
     env.schedule([1, 5, 2, 9, 3, 0])  # 1, 5 and 9 are the same start
     state = env.reset()[STATE]
-    assert torch.equal(state[0], state[1]) and torch.equal(state[0], state[3]) and not torch.equal(state[0], state[2])
+    assert (
+        torch.equal(state[0], state[1])
+        and torch.equal(state[0], state[3])
+        and not torch.equal(state[0], state[2])
+    )
     assert not torch.equal(ToyTrackingEnv(1, targets=1).targets, ToyTrackingEnv(1).targets)
 
 
@@ -25,7 +29,11 @@ def test_an_oracle_wins_a_coward_does_not() -> None:
     now[CHUNK] = now[STATE][:, None, 2:].expand(-1, 4, -1).clone()
     now[CHUNK][2:] = -1.0
     after = env.step(now)["next"]
-    assert after[SUCCESS].squeeze(-1).tolist() == [True, True, False, False] == after["reward"].squeeze(-1).bool().tolist()
+    assert (
+        after[SUCCESS].squeeze(-1).tolist()
+        == [True, True, False, False]
+        == after["reward"].squeeze(-1).bool().tolist()
+    )
     for _ in range(4):
         after[CHUNK] = torch.full((4, 4, 2), -1.0)
         after = env.step(after)["next"]

@@ -1,4 +1,6 @@
-"""Learned worlds: determinism in any slot, partial resets, specs with and without transforms, judges and rewards."""
+"""Learned worlds: determinism in any slot, partial resets, specs with and without transforms, judges and
+rewards.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +12,26 @@ from torchrl.envs.utils import check_env_specs
 from envs.episodes.clips import ClipSpec, ClipStore
 from envs.judges import LearnedJudge, RuleJudge
 from envs.judges.base import Verdict, frame_labels
-from envs.schema import CHUNK, COMMAND, EPISODE, IMAGE, JUDGE_STATUS, PROGRESS, STATE, SUCCESS, Rewards, Status
 from envs.simulators.replay import replay
-from envs.simulators.state_head import StateHead
-from envs.simulators.unet import UNetConfig, UNetSimulator
+from envs.simulators.state_experts.head import StateHead
+from envs.simulators.unet.engine import UNetConfig, UNetSimulator
+from envs.specs import CHUNK, COMMAND, EPISODE, IMAGE, JUDGE_STATUS, PROGRESS, STATE, SUCCESS, Rewards, Status
 from envs.transforms import world_transforms
-from envs.world import Starts, WorldEnv
+from envs.world import InitialStates, WorldEnv
 
 VIEWS = ("head", "hand_left", "hand_right")
 
 
-def world(simulator: UNetSimulator, store: ClipStore, batch: int, judge: LearnedJudge | None = None, horizon: int = 12) -> TransformedEnv:
+def world(
+    simulator: UNetSimulator,
+    store: ClipStore,
+    batch: int,
+    judge: LearnedJudge | None = None,
+    horizon: int = 12,
+) -> TransformedEnv:
     torch.manual_seed(1)
     decoder = StateHead(simulator.feature_shape[0], 4).eval()
-    base = WorldEnv(simulator, Starts.of(store), batch, horizon, bf16=False)
+    base = WorldEnv(simulator, InitialStates.of(store), batch, horizon, bf16=False)
     return TransformedEnv(base, world_transforms(decoder, judge or LearnedJudge().eval(), Rewards(), VIEWS))
 
 
@@ -38,7 +46,7 @@ def play(env: TransformedEnv, seeds: list[int], steps: int = 2) -> torch.Tensor:
 
 
 def test_specs_hold(simulator: UNetSimulator, store: ClipStore) -> None:
-    check_env_specs(WorldEnv(simulator, Starts.of(store), 2, 8, bf16=False))
+    check_env_specs(WorldEnv(simulator, InitialStates.of(store), 2, 8, bf16=False))
     env = world(simulator, store, 2, horizon=8)
     check_env_specs(env)
     assert sorted(map(str, env.action_keys)) == ["('vla_action', 'chunk')"]
@@ -49,7 +57,8 @@ def test_an_episode_is_the_same_in_any_slot_and_batch(simulator: UNetSimulator, 
     again = play(world(simulator, store, 3), [7, 5, 2])
     assert torch.equal(wide[IMAGE], again[IMAGE][[1, 2, 0]])
     assert torch.equal(wide[STATE], again[STATE][[1, 2, 0]])
-    assert (wide[IMAGE][1].int() - narrow[IMAGE][0].int()).abs().max() <= 1  # other batch sizes may round otherwise
+    # other batch sizes may round otherwise
+    assert (wide[IMAGE][1].int() - narrow[IMAGE][0].int()).abs().max() <= 1
 
 
 def test_partial_reset_touches_only_its_slots(simulator: UNetSimulator, store: ClipStore) -> None:
@@ -95,7 +104,13 @@ class Fixed(LearnedJudge):
         super().__init__()
         self.value, self.said = success, status
 
-    def score(self, frames: torch.Tensor, first: torch.Tensor, tokens: torch.Tensor, objects: torch.Tensor | None = None) -> Verdict:
+    def score(
+        self,
+        frames: torch.Tensor,
+        first: torch.Tensor,
+        tokens: torch.Tensor,
+        objects: torch.Tensor | None = None,
+    ) -> Verdict:
         batch, count = frames.shape[:2]
         filled = torch.full((batch, count), self.value)
         return Verdict(filled, filled, torch.full((batch,), self.said.value))
@@ -103,7 +118,11 @@ class Fixed(LearnedJudge):
 
 def test_success_ends_the_episode_and_pays(simulator: UNetSimulator, store: ClipStore) -> None:
     td = play(world(simulator, store, 2, Fixed(0.9)), [0, 1], 1)
-    assert bool(td[SUCCESS].all()) and bool(td["terminated"].all()) and torch.allclose(td["reward"], torch.ones(2, 1))
+    assert (
+        bool(td[SUCCESS].all())
+        and bool(td["terminated"].all())
+        and torch.allclose(td["reward"], torch.ones(2, 1))
+    )
 
 
 def test_a_judges_error_is_no_zero_reward(simulator: UNetSimulator, store: ClipStore) -> None:
@@ -123,7 +142,13 @@ def test_judge_compares_with_the_episodes_own_first_frame(simulator: UNetSimulat
     seen = []
 
     class Watching(Fixed):
-        def score(self, frames: torch.Tensor, first: torch.Tensor, tokens: torch.Tensor, objects: torch.Tensor | None = None) -> Verdict:
+        def score(
+            self,
+            frames: torch.Tensor,
+            first: torch.Tensor,
+            tokens: torch.Tensor,
+            objects: torch.Tensor | None = None,
+        ) -> Verdict:
             seen.append(first)
             return super().score(frames, first, tokens, objects)
 
@@ -141,9 +166,14 @@ def test_rule_judge_agrees_with_physics(store: ClipStore) -> None:
     judge = RuleJudge()
     rows = store.start[0] + torch.arange(int(store.length[0]))
     objects = store.arrays["objects"][rows][None]
-    verdict = judge.score(store.frames(rows)[None], store.frames(rows[:1]), torch.zeros(1, 12, dtype=torch.int64), objects)
+    verdict = judge.score(
+        store.frames(rows)[None], store.frames(rows[:1]), torch.zeros(1, 12, dtype=torch.int64), objects
+    )
     assert torch.allclose(verdict.progress[0], store.arrays["progress"][rows], atol=1e-4)
-    assert bool(judge.episode(verdict.success, torch.ones_like(verdict.success).bool())) == store.episodes[0]["success"]
+    assert (
+        bool(judge.episode(verdict.success, torch.ones_like(verdict.success).bool()))
+        == store.episodes[0]["success"]
+    )
     with pytest.raises(ValueError, match="judge=learned"):
         judge.score(store.frames(rows)[None], store.frames(rows[:1]), torch.zeros(1, 12, dtype=torch.int64))
 

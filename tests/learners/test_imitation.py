@@ -11,19 +11,28 @@ from actors.policies.chunk_gaussian import ChunkGaussianHead
 from actors.policies.vla import ChunkPolicy
 from envs.encoders import Gaze
 from envs.episodes.clips import ClipStore
-from envs.schema import TOKENS
-from learners.fit import FitConfig
+from envs.specs import TOKENS
 from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.pictures import sights
+from learners.training.fit import FitConfig
 
 
-def test_policies_learn_where_objects_are_from_frames_without_actions(store: ClipStore, tmp_path: Path) -> None:
+def test_policies_learn_where_objects_are_from_frames_without_actions(
+    store: ClipStore, tmp_path: Path
+) -> None:
     rows = store.rows(torch.arange(1, 8))
 
     def missed(watched: torch.Tensor | None) -> float:
         torch.manual_seed(0)
         policy = ChunkPolicy(3, partial(ChunkGaussianHead, chunk=4), width=32, points=4, channels=8, aims=2)
-        train_imitation(policy, store, torch.tensor([0]), FitConfig(steps=60, batch=16, lr=5e-3, bf16=False), tmp_path / str(watched is None), watched=watched)
+        train_imitation(
+            policy,
+            store,
+            torch.tensor([0]),
+            FitConfig(steps=60, batch=16, lr=5e-3, bf16=False),
+            tmp_path / str(watched is None),
+            watched=watched,
+        )
         with torch.no_grad():
             _, aimed = policy.perception.look(store.frames(rows), store.tokens[:1].expand(len(rows), -1))
         return float(Gaze.missed(aimed, sights(store, store.arrays["objects"][rows], rows, 2))[1])

@@ -6,15 +6,15 @@ import json
 from pathlib import Path
 
 import torch
+from envs.simulators.in_view import in_view
 from tensordict import TensorDict
 
 from envs.encoders import Gaze, to_signed
 from envs.episodes.clips import ClipStore
 from envs.judges import LearnedJudge
-from envs.simulators.in_view import in_view
-from learners.fit import FitConfig
 from learners.stages.judge import close_calls, train_judge, unseen_by_judge
 from learners.stages.pictures import sights, survey
+from learners.training.fit import FitConfig
 
 
 def test_sights_are_where_objects_are_drawn(store: ClipStore) -> None:
@@ -34,7 +34,8 @@ def test_a_surveyed_gaze_tells_gaps_in_metres(store: ClipStore) -> None:
     known = torch.isfinite(where).flatten(1).all(1)
     gaps = gaze.gaps_between(where[known]) / Gaze.GAIN * Gaze.SPAN
     truth = objects[known, 0, :2] - objects[known, 1, :2]
-    assert known.sum() > 20 and float((gaps[:, :2] - truth).norm(dim=-1).median()) < 2e-3  # a few were toppled
+    # a few were toppled
+    assert known.sum() > 20 and float((gaps[:, :2] - truth).norm(dim=-1).median()) < 2e-3
     assert torch.allclose(gaps[:, 2], gaps[:, :2].norm(dim=-1), atol=1e-6)
     before = gaze.plane.clone()
     gaze.survey(where * torch.nan, objects[:, :2, :2])  # of data that know nothing nothing is learned
@@ -72,10 +73,14 @@ def test_words_choose_the_two_things() -> None:
     torch.manual_seed(0)
     judge = LearnedJudge(hold=2, width=8, points=4, aims=3).eval()
     judge.main.surveyed.fill_(True)
-    frames, words = torch.randint(0, 256, (6, 3, 3, 64, 64), dtype=torch.uint8), torch.tensor([[1] * 12] * 3 + [[2] * 12] * 3)
+    frames, words = (
+        torch.randint(0, 256, (6, 3, 3, 64, 64), dtype=torch.uint8),
+        torch.tensor([[1] * 12] * 3 + [[2] * 12] * 3),
+    )
     with torch.no_grad():
         heard = judge.words(words)[[0, 3]]
-        judge.pair.copy_(torch.linalg.pinv(heard) @ torch.tensor([[100.0, 0.0, 0.0], [0.0, 0.0, 100.0]]))  # one names the first pair, two the last
+        # one names the first pair, two the last
+        judge.pair.copy_(torch.linalg.pinv(heard) @ torch.tensor([[100.0, 0.0, 0.0], [0.0, 0.0, 100.0]]))
         pictures = to_signed(frames)[:, 0]
         gaps = judge.main(torch.cat((pictures, pictures), 1))[0][:, -3:]
         logits = judge(frames, frames, words)[0]
@@ -86,8 +91,12 @@ def test_words_choose_the_two_things() -> None:
 def test_judge_learns_to_aim(store: ClipStore, tmp_path: Path) -> None:
     torch.manual_seed(0)
     judge = LearnedJudge(hold=2, width=8, points=4)
-    train_judge(judge, store, torch.arange(len(store)), FitConfig(steps=60, batch=16, lr=5e-3, bf16=False), tmp_path)
-    rows = [json.loads(line)["judge/aim_error"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    train_judge(
+        judge, store, torch.arange(len(store)), FitConfig(steps=60, batch=16, lr=5e-3, bf16=False), tmp_path
+    )
+    rows = [
+        json.loads(line)["judge/aim_error"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()
+    ]
     assert sum(rows[-5:]) < 0.5 * sum(rows[:5])
 
 
@@ -110,17 +119,31 @@ def test_objects_nobody_placed_leave_the_aims_alone() -> None:
 def test_what_nobody_labelled_teaches_no_verdict() -> None:
     judge = LearnedJudge(hold=2, width=8, points=4)
     frames = torch.randint(0, 256, (4, 3, 3, 64, 64), dtype=torch.uint8)
-    value, figures = judge.loss(batch_of(frames, torch.full((4,), torch.nan), where=torch.zeros(4, 2, 2)), 0.5)
+    value, figures = judge.loss(
+        batch_of(frames, torch.full((4,), torch.nan), where=torch.zeros(4, 2, 2)), 0.5
+    )
     value.backward()
     assert float(figures["success"]) == 0.0 and float(figures["aim_error"]) > 0.0
     assert not bool(judge.apart[-1].weight.grad.any())
 
 
 def batch_of(frames: torch.Tensor, label: torch.Tensor, where: torch.Tensor | None = None) -> TensorDict:
-    """A training batch of a judge with progress like success, in which nobody knows where things are unless told."""
+    """A training batch of a judge with progress like success, in which nobody knows where things are unless
+    told.
+    """
     unknown = torch.full((len(frames), 2, 2), torch.nan)
     pictures = {"frames": to_signed(frames), "first": to_signed(frames), "drill": to_signed(frames[:, :2])}
-    return TensorDict({**pictures, "tokens": torch.zeros(len(frames), 12, dtype=torch.int64), "label": label, "progress": label, "where": unknown if where is None else where, "drilled": unknown}, [len(frames)])
+    return TensorDict(
+        {
+            **pictures,
+            "tokens": torch.zeros(len(frames), 12, dtype=torch.int64),
+            "label": label,
+            "progress": label,
+            "where": unknown if where is None else where,
+            "drilled": unknown,
+        },
+        [len(frames)],
+    )
 
 
 def test_a_judge_without_aims_judges() -> None:

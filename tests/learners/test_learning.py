@@ -13,26 +13,26 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from actors.fleet import FleetError, LocalFleet
+from actors.fleets.fleet import FleetError, LocalFleet
 from actors.policies.chunk_gaussian import ChunkGaussian, ChunkGaussianHead, knot_basis
 from actors.policies.chunk_tokens import ChunkTokenHead
-from actors.policies.vla import SEEN, ChunkPolicy
-from actors.rollouts import Host, seen_next
+from actors.policies.vla import VISUAL_FEATURES, ChunkPolicy
+from actors.rollouts.host import Host, seen_next
 from envs.episodes.clips import ClipStore
 from envs.judges import LearnedJudge
-from envs.physics.bench import BenchConfig
 from envs.physics.env import PhysicsEnv
-from envs.schema import CHUNK, EPISODE, IMAGE, JUDGE_STATUS, LOG_PROB, STATE, SUCCESS, TOKENS, Status
-from envs.toy_tracking import ToyTrackingEnv
-from learners.alarms import Alarms
-from learners.algorithm import RLConfig, first_episode, judged
-from learners.filtered_bc import FilteredBC, FilteredBCConfig
-from learners.fit import FitConfig, TrainingDiverged, fit
-from learners.grpo import GRPO, GRPOConfig
-from learners.ppo import PPO, PPOConfig
-from learners.rl import train_rl
+from envs.physics.tabletop.bench import BenchConfig
+from envs.physics.toy_tracking import ToyTrackingEnv
+from envs.specs import CHUNK, EPISODE, IMAGE, JUDGE_STATUS, LOG_PROB, STATE, SUCCESS, TOKENS, Status
+from learners.rl.alarms import Alarms
+from learners.rl.algorithm import RLConfig, first_episode, judged
+from learners.rl.filtered_bc import FilteredBC, FilteredBCConfig
+from learners.rl.grpo import GRPO, GRPOConfig
+from learners.rl.loop import train_rl
+from learners.rl.ppo import PPO, PPOConfig
 from learners.stages.imitation import train_imitation
 from learners.stages.judge import calibrate
+from learners.training.fit import FitConfig, TrainingDiverged, fit
 
 
 class Stop(Exception):
@@ -72,7 +72,14 @@ def test_killed_and_resumed_training_equals_the_uninterrupted(tmp_path: Path) ->
 def test_divergence_stops_with_advice(tmp_path: Path) -> None:
     model = nn.Linear(1, 1)
     with pytest.raises(TrainingDiverged, match=r"toy\.lr"):
-        fit("toy", model, lambda s, g: torch.ones(1, 1), lambda d, g: (model(d).sum() * float("nan"), {}), FitConfig(steps=2, bf16=False), tmp_path)
+        fit(
+            "toy",
+            model,
+            lambda s, g: torch.ones(1, 1),
+            lambda d, g: (model(d).sum() * float("nan"), {}),
+            FitConfig(steps=2, bf16=False),
+            tmp_path,
+        )
 
 
 def small_policy() -> ChunkPolicy:
@@ -82,7 +89,13 @@ def small_policy() -> ChunkPolicy:
 
 def test_chunk_gaussian_is_smooth_and_its_density_consistent() -> None:
     gain = torch.tensor([1.0, 0.0, 2.0])
-    dist = ChunkGaussian(torch.zeros(5, 2, 3), torch.full((5, 2, 3), 0.5), knot_basis(4, 2), gain, torch.tensor([0.0, 7.0, 0.0]))
+    dist = ChunkGaussian(
+        torch.zeros(5, 2, 3),
+        torch.full((5, 2, 3), 0.5),
+        knot_basis(4, 2),
+        gain,
+        torch.tensor([0.0, 7.0, 0.0]),
+    )
     chunk = dist.sample()
     assert chunk.shape == (5, 4, 3) and bool((chunk[..., 1] == 7.0).all())
     assert torch.allclose(chunk[:, 0, 0] * 2, chunk[:, 1, 0], atol=1e-6)  # linear from rest to the first knot
@@ -94,7 +107,14 @@ def test_chunk_gaussian_is_smooth_and_its_density_consistent() -> None:
 def test_policy_writes_what_it_later_scores() -> None:
     policy = small_policy()
     policy.head.gain.data[2] = 0.0
-    td = TensorDict({IMAGE: torch.randint(0, 255, (6, 3, 3, 64, 64), dtype=torch.uint8), STATE: torch.randn(6, 16), TOKENS: torch.randint(0, 99, (6, 12))}, [6])
+    td = TensorDict(
+        {
+            IMAGE: torch.randint(0, 255, (6, 3, 3, 64, 64), dtype=torch.uint8),
+            STATE: torch.randn(6, 16),
+            TOKENS: torch.randint(0, 99, (6, 12)),
+        },
+        [6],
+    )
     out = policy(td.clone())
     assert out[CHUNK].shape == (6, 4, 14)
     assert torch.allclose(policy.get_dist(td.clone()).log_prob(out[CHUNK]), out[LOG_PROB], atol=1e-3)
@@ -105,11 +125,16 @@ def test_first_episode_and_judged_mask() -> None:
     assert first_episode(done).tolist() == [[True, True, False, False], [True] * 4]
     status = torch.full((2, 4, 1), Status.OK.value)
     status[0, 3] = Status.ERROR.value
-    batch = TensorDict({"next": TensorDict({JUDGE_STATUS: status, "done": done.unsqueeze(-1)}, [2, 4])}, [2, 4])
+    batch = TensorDict(
+        {"next": TensorDict({JUDGE_STATUS: status, "done": done.unsqueeze(-1)}, [2, 4])}, [2, 4]
+    )
     assert judged(batch).tolist() == [[True, True, False, False], [True] * 4]
 
 
-@pytest.mark.parametrize("head", [partial(ChunkTokenHead, chunk=4, bins=8, actions=2), partial(ChunkGaussianHead, chunk=4, actions=2)])
+@pytest.mark.parametrize(
+    "head",
+    [partial(ChunkTokenHead, chunk=4, bins=8, actions=2), partial(ChunkGaussianHead, chunk=4, actions=2)],
+)
 def test_episodes_with_nan_are_dropped_and_counted_until_they_are_too_many(tmp_path: Path, head: Any) -> None:
     torch.manual_seed(0)
     policy = ChunkPolicy(1, head, width=16, points=4, states=4, channels=16)
@@ -128,11 +153,18 @@ def test_episodes_with_nan_are_dropped_and_counted_until_they_are_too_many(tmp_p
         folder = tmp_path / str(share)
         if dropped == 2:
             stats = train_rl(fleet, policy, GRPO(policy, GRPOConfig(group=4)), config, folder, starts=4)
-            assert stats["books"]["dropped"] == {"NaN actions": 2} and stats["books"]["learned"] == 6
+            assert stats["ledger"]["dropped"] == {"NaN actions": 2} and stats["ledger"]["learned"] == 6
             assert all(bool(p.isfinite().all()) for p in policy.parameters())
         else:
             with pytest.raises(FleetError, match="NaN"):
-                train_rl(fleet, policy, GRPO(policy, GRPOConfig(group=4)), RLConfig(**{**asdict(config), "max_dropped": 0.04}), folder, starts=4)
+                train_rl(
+                    fleet,
+                    policy,
+                    GRPO(policy, GRPOConfig(group=4)),
+                    RLConfig(**{**asdict(config), "max_dropped": 0.04}),
+                    folder,
+                    starts=4,
+                )
 
 
 def rollout(rewards: list[list[float]], policy: ChunkPolicy) -> TensorDict:
@@ -141,12 +173,26 @@ def rollout(rewards: list[list[float]], policy: ChunkPolicy) -> TensorDict:
     size = reward.shape[:2]
     done = torch.zeros(*size, 1, dtype=torch.bool)
     done[:, -1] = True
-    obs = {IMAGE: torch.randint(0, 255, (*size, 3, 3, 64, 64), dtype=torch.uint8), STATE: torch.randn(*size, 16), TOKENS: torch.zeros(*size, 12, dtype=torch.int64)}
+    obs = {
+        IMAGE: torch.randint(0, 255, (*size, 3, 3, 64, 64), dtype=torch.uint8),
+        STATE: torch.randn(*size, 16),
+        TOKENS: torch.zeros(*size, 12, dtype=torch.int64),
+    }
     td = TensorDict({**obs, EPISODE: torch.arange(size[0]).reshape(-1, 1, 1).expand(*size, 1) * 5}, size)
     with torch.no_grad():
         td = policy(td)
-    td["next"] = TensorDict({**obs, "reward": reward, "done": done, "terminated": done, "truncated": torch.zeros_like(done), SUCCESS: (reward > 0.5) & done}, size)
-    td["next", SEEN] = seen_next(td, policy.perception)
+    td["next"] = TensorDict(
+        {
+            **obs,
+            "reward": reward,
+            "done": done,
+            "terminated": done,
+            "truncated": torch.zeros_like(done),
+            SUCCESS: (reward > 0.5) & done,
+        },
+        size,
+    )
+    td["next", VISUAL_FEATURES] = seen_next(td, policy.perception)
     return td
 
 
@@ -207,7 +253,7 @@ def test_threshold_is_where_success_is_as_likely_as_failure() -> None:
     assert calibrate(judge, frames, succeeded)
     assert abs(float(judge.threshold) - 0.7) < 0.02
     # A handful that scores part without fail: somewhere between them.
-    assert calibrate(judge, frames[best.argsort()][:: 400], torch.arange(10) >= 6)
+    assert calibrate(judge, frames[best.argsort()][::400], torch.arange(10) >= 6)
     assert 0.5 < float(judge.threshold) < 0.65
 
 
@@ -235,28 +281,41 @@ def test_alarms() -> None:
     for iteration in range(2):
         alarms.check({"reward_std": 0.0, "kl": 0.0, "entropy": 1.0}, iteration)
     alarms.check({"reward_std": 1.0, "kl": 3.0, "entropy": -50.0}, 3)
-    assert [text.split(" at ")[0] for text in alarms.raised] == ["no reward variance", "exploding KL", "collapsed entropy"]
+    assert [text.split(" at ")[0] for text in alarms.raised] == [
+        "no reward variance",
+        "exploding KL",
+        "collapsed entropy",
+    ]
     with pytest.raises(TrainingDiverged, match="kl"):
         alarms.check({"reward_std": 1.0, "kl": float("nan")}, 4)
 
 
 def test_imitation_sets_units_and_learns(store: ClipStore, tmp_path: Path) -> None:
     policy = small_policy()
-    train_imitation(policy, store, torch.tensor([0, 4]), FitConfig(steps=40, batch=16, lr=3e-3, bf16=False), tmp_path)
-    rows = [json.loads(line)["imitation/loss"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    train_imitation(
+        policy, store, torch.tensor([0, 4]), FitConfig(steps=40, batch=16, lr=3e-3, bf16=False), tmp_path
+    )
+    rows = [
+        json.loads(line)["imitation/loss"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()
+    ]
     assert sum(rows[-5:]) < 0.7 * sum(rows[:5])
     gain = policy.head.gain
-    assert bool((gain[[2, 3, 4, 5, 6]] == 0).all()) and bool((gain > 0).any())  # heights, angles and grippers never move
+    # heights, angles and grippers never move
+    assert bool((gain[[2, 3, 4, 5, 6]] == 0).all()) and bool((gain > 0).any())
 
 
 def rl_run(folder: Path, iterations: int, grouped: bool = False) -> list[dict[str, float]]:
     policy = small_policy()
-    fleet = LocalFleet(Host(PhysicsEnv(BenchConfig(), batch=2, chunk=4, horizon=8, workers=1), small_policy()))
-    settings = RLConfig(iterations=iterations, envs=4, shards=2, epochs=1, minibatch=8, checkpoint_every=1, lr=1e-3)
+    fleet = LocalFleet(
+        Host(PhysicsEnv(BenchConfig(), batch=2, chunk=4, horizon=8, workers=1), small_policy())
+    )
+    settings = RLConfig(
+        iterations=iterations, envs=4, shards=2, epochs=1, minibatch=8, checkpoint_every=1, lr=1e-3
+    )
     algorithm = GRPO(policy, GRPOConfig(group=2)) if grouped else PPO(policy, PPOConfig())
     stats = train_rl(fleet, policy, algorithm, settings, folder, seed_pool=range(100))
     fleet.close()
-    assert stats["books"]["learned"] == stats["books"]["asked"]
+    assert stats["ledger"]["learned"] == stats["ledger"]["asked"]
     rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     return [{k: v for k, v in row.items() if "/time/" not in k} for row in rows]
 
@@ -265,9 +324,11 @@ def test_groups_of_real_rollouts_share_their_start(tmp_path: Path) -> None:
     assert len(rl_run(tmp_path, 2, grouped=True)) == 2  # GRPO itself refuses groups of different starts
 
 
-def test_killed_and_resumed_rl_equals_the_uninterrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_killed_and_resumed_rl_equals_the_uninterrupted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole = rl_run(tmp_path / "whole", 3)
-    import learners.rl as module
+    import learners.rl.loop as module
 
     original, calls = module.update, []
 

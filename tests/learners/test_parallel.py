@@ -15,18 +15,20 @@ from torch import Tensor, nn
 
 from actors.factory import build_judge, build_policy, build_simulator, build_state_decoder
 from envs.episodes.clips import ClipStore
-from learners.fit import FitConfig, fit
 from learners.stages.imitation import train_imitation
 from learners.stages.judge import train_judge
 from learners.stages.state import train_state
 from learners.stages.vision import VisionConfig, train_vision
+from learners.training.fit import FitConfig, fit
 from pipeline.config import load_config
 
 STEPS = 8
 
 
 class Net(nn.Module):
-    """Blocks large enough to be gathered one by one, a frozen layer, a buffer, and a parameter shared by two layers."""
+    """Blocks large enough to be gathered one by one, a frozen layer, a buffer, and a parameter shared by two
+    layers.
+    """
 
     shift: Tensor
 
@@ -62,10 +64,21 @@ def train(folder: Path, stop_after: int | None = None) -> list[float]:
         return (net.score(data) - data.sum(1, keepdim=True) + 0.1 * noise).square().mean(), {}
 
     try:
-        fit("toy", net, batch, loss, FitConfig(STEPS, 8, microbatches=2, lr=1e-3, warmup=2, bf16=False, checkpoint_every=3), folder)
+        fit(
+            "toy",
+            net,
+            batch,
+            loss,
+            FitConfig(STEPS, 8, microbatches=2, lr=1e-3, warmup=2, bf16=False, checkpoint_every=3),
+            folder,
+        )
     except KeyboardInterrupt:
         return []
-    assert type(net.blocks[0]) is nn.Linear and type(net.leave.weight) is nn.Parameter and net.leave.weight is net.twin.weight
+    assert (
+        type(net.blocks[0]) is nn.Linear
+        and type(net.leave.weight) is nn.Parameter
+        and net.leave.weight is net.twin.weight
+    )
     rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == list(range(STEPS))
     return [row["toy/loss"] for row in rows] + [float(p.detach().abs().sum()) for p in net.parameters()]
@@ -91,10 +104,16 @@ def stages(folder: Path, dataset: Path) -> list[float]:
     train_vision(simulator, store, every, VisionConfig(alone=1.0), options, folder / "vision")
     train_state(decoder, simulator, store, every, options, folder / "state")
     train_judge(judge, store, every, options, folder / "judge")
-    return [json.loads(line)[f"{name}/loss"] for name in ("imitation", "vision", "state", "judge") for line in (folder / name / "metrics.jsonl").read_text().splitlines()]
+    return [
+        json.loads(line)[f"{name}/loss"]
+        for name in ("imitation", "vision", "state", "judge")
+        for line in (folder / name / "metrics.jsonl").read_text().splitlines()
+    ]
 
 
-def worker(rank: int, rendezvous: str, folder: str, work: Callable[..., list[float]], given: tuple[Any, ...]) -> None:
+def worker(
+    rank: int, rendezvous: str, folder: str, work: Callable[..., list[float]], given: tuple[Any, ...]
+) -> None:
     dist.init_process_group("gloo", init_method=f"file://{rendezvous}", rank=rank, world_size=2)
     values = work(Path(folder), *given)
     if values:

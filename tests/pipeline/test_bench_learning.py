@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from pipeline.bench_learning import learn
+from pipeline.benches.learning import learn
 
 
 def test_a_few_iterations_on_the_toy_task(tmp_path: Path) -> None:

@@ -9,15 +9,23 @@ import pytest
 import torch
 
 from actors.factory import ConfigError, build_simulator, build_state_decoder
-from envs.simulators.dit import DiTShape
+from envs.simulators.dit.network import DiTShape
 from pipeline import cli
-from pipeline.bench_gesim import FULL, count_flops
+from pipeline.benches.gesim import FULL, count_flops
 from pipeline.config import load_config
 from pipeline.finetune import build_finetune
 from pipeline.serving import build_session_host
 from tests.envs.gesim_tiny import NET, VAE, write_checkpoint
 
-WORDS = ["simulator=gesim", "task.size=[32,48]", "task.chunk=5", "task.control_hz=30", "task.horizon=10", "task.mode=absolute", "track=disabled"]
+WORDS = [
+    "simulator=gesim",
+    "task.size=[32,48]",
+    "task.chunk=5",
+    "task.control_hz=30",
+    "task.horizon=10",
+    "task.mode=absolute",
+    "track=disabled",
+]
 
 
 def test_convert_and_inspect(shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -31,8 +39,19 @@ def test_convert_and_inspect(shared: Path, tmp_path: Path, capsys: pytest.Captur
 def test_finetune_a_checkpoint_and_serve_what_came_of_it(shared: Path, tmp_path: Path) -> None:
     cli.convert([str(shared / "data/gesim_v2"), str(tmp_path / "data"), "frames=12", "size=[32,48]"])
     checkpoint = write_checkpoint(tmp_path / "released")
-    words = [*WORDS, f"simulator.checkpoint={checkpoint}", f"runs={tmp_path / 'runs'}", f"finetune.data=[{tmp_path / 'data'}]"]
-    words += ["finetune.vision.fit.steps=2", "finetune.vision.fit.batch=2", "finetune.vision.lora=2", "finetune.state.fit.steps=2", "finetune.state.fit.batch=2"]
+    words = [
+        *WORDS,
+        f"simulator.checkpoint={checkpoint}",
+        f"runs={tmp_path / 'runs'}",
+        f"finetune.data=[{tmp_path / 'data'}]",
+    ]
+    words += [
+        "finetune.vision.fit.steps=2",
+        "finetune.vision.fit.batch=2",
+        "finetune.vision.lora=2",
+        "finetune.state.fit.steps=2",
+        "finetune.state.fit.batch=2",
+    ]
     cfg = load_config(words)
     graph = build_finetune(cfg, tmp_path / "runs/default")
     done = graph.run()
@@ -59,8 +78,11 @@ def test_gesim_sizes_come_from_the_config() -> None:
 def test_the_floor_counts_what_the_network_does() -> None:
     small = count_flops(FULL, DiTShape(num_layers=2), 1, {"base_dim": 16})
     twice = count_flops(FULL, DiTShape(num_layers=4), 1, {"base_dim": 16})
-    # Per layer: 24 width^2 a token for attention and feed-forward to itself, and attention over 8448 or 25344 tokens.
+    # Per layer: 24 width^2 a token for attention and feed-forward to itself, and attention over 8448 or 25344
+    # tokens.
     tokens, width = 3 * 8448, 2048
     least = 2 * (4 + 8) * width**2 * tokens * 2
-    assert twice["trunk"] - small["trunk"] > least and torch.isfinite(torch.tensor(list(small.values()))).all()
+    assert (
+        twice["trunk"] - small["trunk"] > least and torch.isfinite(torch.tensor(list(small.values()))).all()
+    )
     assert json.dumps(small)

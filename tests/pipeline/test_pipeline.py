@@ -14,13 +14,13 @@ import pytest
 import torch
 
 from actors.factory import ConfigError, build_policy, build_simulator
-from learners.checkpoint import Checkpoints
+from learners.training.checkpoint import Checkpoints
 from pipeline.artefact import save_weights, write_text
 from pipeline.config import load_config
+from pipeline.evaluation.report import verdict
+from pipeline.evaluation.statistics import confusion, mcnemar, wilson
 from pipeline.graph import Graph, Stage
 from pipeline.loop import build_loop
-from pipeline.report import verdict
-from pipeline.statistics import confusion, mcnemar, wilson
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
@@ -101,7 +101,10 @@ def test_seconds_of_interrupted_attempts_count(tmp_path: Path) -> None:
 
 
 def test_keys_change_with_what_matters_only(tmp_path: Path) -> None:
-    base, other = (build_loop(load_config(words), tmp_path) for words in (["experiment=smoke"], ["experiment=smoke", "evaluate.episodes=30"]))
+    base, other = (
+        build_loop(load_config(words), tmp_path)
+        for words in (["experiment=smoke"], ["experiment=smoke", "evaluate.episodes=30"])
+    )
     assert base.key("rl-2") == other.key("rl-2")
     assert base.key("evaluate-after") != other.key("evaluate-after")
     seeded = build_loop(load_config(["experiment=smoke", "seed=1"]), tmp_path)
@@ -184,7 +187,9 @@ def test_the_verdict_can_say_no_and_why() -> None:
 
 
 def worldloop(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "pipeline", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [sys.executable, "-m", "pipeline", *words], cwd=ROOT, capture_output=True, text=True, check=False
+    )
 
 
 def test_command_line() -> None:
@@ -204,7 +209,10 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     assert result["physics_before"]["episodes"] == 20 and len(result["rounds"]) == 2
     assert set(result["rollout"]) >= {"expert", "noisy", "random", "on-policy"}
     page = (tmp_path / "smoke/report.html").read_text()
-    assert "data:video/mp4" in page and "http" not in page.replace("http://www.w3.org", "").split("<h2>Config")[0]
+    assert (
+        "data:video/mp4" in page
+        and "http" not in page.replace("http://www.w3.org", "").split("<h2>Config")[0]
+    )
     table = worldloop("compare", str(tmp_path / "smoke"), str(tmp_path / "smoke")).stdout
     assert "| engine; algorithm; seed | unet; ppo; 0 | unet; ppo; 0 |" in table
     missing = worldloop("compare", str(tmp_path))

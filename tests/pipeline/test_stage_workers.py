@@ -13,13 +13,24 @@ import torch
 from safetensors.torch import load_file
 
 from actors.factory import ConfigError
-from pipeline import work
+from pipeline import stages as work
 from pipeline.config import load_config
 from pipeline.demo_world import demo_recipe
 from pipeline.loop import build_loop
 from pipeline.stage_workers import run_stage
 
-WORDS = ["experiment=smoke", "launch=ray", "microbatches=2", "launch.cpus=4", "launch.object_store_mb=200", "launch.learners=2", "rl.shards=1", "imitation.demos=3", "evaluate.episodes=4", "evaluate.envs=4"]
+WORDS = [
+    "experiment=smoke",
+    "launch=ray",
+    "microbatches=2",
+    "launch.cpus=4",
+    "launch.object_store_mb=200",
+    "launch.learners=2",
+    "rl.shards=1",
+    "imitation.demos=3",
+    "evaluate.episodes=4",
+    "evaluate.envs=4",
+]
 
 
 @pytest.fixture
@@ -35,13 +46,31 @@ def losses(folder: Path, name: str) -> list[float]:
 def test_two_learners_and_an_evaluator_do_what_one_process_does(cluster: None, tmp_path: Path) -> None:
     cfg: dict[str, Any] = load_config([*WORDS, "rl.epochs=1", "launch.actors=1"])
     recipe = demo_recipe(cfg, tmp_path / "world", cfg["rl"]["envs"])
-    found = {name: Path(path).parent for name, path in (("policy", recipe.policy), ("vision", recipe.simulator), ("state", recipe.decoder), ("judge", recipe.judge))}
+    found = {
+        name: Path(path).parent
+        for name, path in (
+            ("policy", recipe.policy),
+            ("vision", recipe.simulator),
+            ("state", recipe.decoder),
+            ("judge", recipe.judge),
+        )
+    }
     found["data"] = Path(recipe.data[0]).parent
-    names: dict[str, Any] = {"data": ("data",), "vision": "vision", "state": "state", "judge": "judge", "policy": "policy", "iterations": 1, "number": 1}
+    names: dict[str, Any] = {
+        "data": ("data",),
+        "vision": "vision",
+        "state": "state",
+        "judge": "judge",
+        "policy": "policy",
+        "iterations": 1,
+        "number": 1,
+    }
     alone, both = tmp_path / "alone", tmp_path / "both"
     for folder in (alone, both):
         folder.mkdir()
-    one = work.rl(load_config([*WORDS, "rl.epochs=1", "launch.actors=1", "launch.learners=1"]), alone, found, **names)
+    one = work.rl(
+        load_config([*WORDS, "rl.epochs=1", "launch.actors=1", "launch.learners=1"]), alone, found, **names
+    )
     two = run_stage("rl", cfg, both, found, names)
     assert two.keys() == one.keys()
     assert losses(both, "rl/loss") == pytest.approx(losses(alone, "rl/loss"), rel=1e-3, abs=1e-5)
@@ -51,7 +80,10 @@ def test_two_learners_and_an_evaluator_do_what_one_process_does(cluster: None, t
     here, there = tmp_path / "here", tmp_path / "there"
     here.mkdir(), there.mkdir()
     said = run_stage("evaluate_physics", cfg, there, {"policy": found["policy"]}, {"policy": "policy"})
-    assert said["successes"] == work.evaluate_physics(cfg, here, {"policy": found["policy"]}, policy="policy")["successes"]
+    assert (
+        said["successes"]
+        == work.evaluate_physics(cfg, here, {"policy": found["policy"]}, policy="policy")["successes"]
+    )
     assert (there / "outcomes.pt").exists()
 
 

@@ -1,0 +1,227 @@
+"""Ray itself: start it on this machine or join a cluster, and refuse plans that cannot be scheduled."""
+
+from __future__ import annotations
+
+import platform
+import socket
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import ray
+import tensordict
+import torch
+
+from actors.factory import ConfigError
+from actors.fleets.reaper import reap_after_me
+from envs.physics.pool import available_cores
+
+ROLES = ("learner", "actors", "judge", "evaluator")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Who gets what: for every role how many processes, and of each process the CPUs and GPUs (fractions
+    allowed).
+
+    Strategies: "collocated" packs all roles on as few nodes as possible, "disaggregated" spreads them,
+    "hybrid" keeps
+    learner and judge together and spreads the actors.
+    """
+
+    strategy: str
+    counts: Mapping[str, int]
+    cpus: Mapping[str, float]
+    gpus: Mapping[str, float]
+
+    @classmethod
+    def of(cls, launch: Mapping[str, Any]) -> Plan:
+        """The plan of configs/launch.
+
+        Raises:
+            ConfigError: naming the key that is wrong.
+        """
+        place = launch["place"]
+        if launch["strategy"] not in ("collocated", "disaggregated", "hybrid"):
+            raise ConfigError(
+                f"launch.strategy={launch['strategy']!r} must be collocated, disaggregated or hybrid"
+            )
+        unknown = sorted(set(place) - set(ROLES))
+        if unknown or set(ROLES) - set(place):
+            raise ConfigError(f"launch.place must name {list(ROLES)}, it names {sorted(place)}")
+        counts = {
+            "learner": launch["learners"],
+            "actors": launch["actors"],
+            "judge": int(launch["judge_service"]),
+            "evaluator": 1,
+        }
+        for role in ROLES:
+            for key in ("num_cpus", "num_gpus"):
+                if place[role].get(key, 0) < 0:
+                    raise ConfigError(f"launch.place.{role}.{key}={place[role][key]} must not be negative")
+        return cls(
+            launch["strategy"],
+            counts,
+            {r: float(place[r]["num_cpus"]) for r in ROLES},
+            {r: float(place[r].get("num_gpus", 0)) for r in ROLES},
+        )
+
+    def bundles(self) -> list[dict[str, float]]:
+        """One bundle of resources per process."""
+        return [
+            {"CPU": self.cpus[role], "GPU": self.gpus[role]}
+            for role in ROLES
+            for _ in range(self.counts[role])
+        ]
+
+    def check(self, nodes: list[Mapping[str, float]]) -> None:
+        """Refuse a plan that these nodes can never run.
+
+        Args:
+            nodes: total resources of each node.
+
+        Raises:
+            ConfigError: naming the role, what it needs and what there is.
+        """
+        free = [dict(node) for node in nodes]
+        # The largest first, as a packer would.
+        wanted = sorted(
+            ((role, k) for role in ROLES for k in range(self.counts[role])),
+            key=lambda item: (-self.gpus[item[0]], -self.cpus[item[0]]),
+        )
+        for role, number in wanted:
+            need = {"CPU": self.cpus[role], "GPU": self.gpus[role]}
+            fits = [
+                node
+                for node in free
+                if all(node.get(key, 0.0) + 1e-6 >= value for key, value in need.items())
+            ]
+            if not fits:
+                total = {key: sum(node.get(key, 0.0) for node in nodes) for key in ("CPU", "GPU")}
+                asked = {key: sum(bundle[key] for bundle in self.bundles()) for key in ("CPU", "GPU")}
+                where = f"launch.place.{role}" + (
+                    f" (process {number + 1} of {self.counts[role]})" if self.counts[role] > 1 else ""
+                )
+                raise ConfigError(
+                    f"{where} needs {_say(need)}, which no node has left: all roles together ask for {_say(asked)}, the {len(nodes)} node(s) have {_say(total)}. "
+                    "Lower launch.actors or the shares in launch.place, or add nodes"
+                )
+            # Collocated fills the fullest node first, the others the emptiest.
+            fits.sort(key=lambda node: node.get("CPU", 0.0), reverse=self.strategy != "collocated")
+            for key, value in need.items():
+                fits[0][key] = fits[0].get(key, 0.0) - value
+
+    def options(self, role: str) -> dict[str, Any]:
+        """Options of that role's Ray actors."""
+        spread = {
+            "collocated": "DEFAULT",
+            "disaggregated": "SPREAD",
+            "hybrid": "SPREAD" if role == "actors" else "DEFAULT",
+        }[self.strategy]
+        return {"num_cpus": self.cpus[role], "num_gpus": self.gpus[role], "scheduling_strategy": spread}
+
+
+def _say(need: Mapping[str, float]) -> str:
+    return " and ".join(f"{value:g} {key}" for key, value in need.items() if value or key == "CPU")
+
+
+def versions() -> dict[str, str]:
+    """What must be alike on all nodes."""
+    from importlib.metadata import version
+
+    names = {
+        "python": platform.python_version(),
+        "torch": torch.__version__.split("+")[0],
+        "tensordict": str(tensordict.__version__).split("+")[0],
+    }
+    return {
+        **names,
+        "torchrl": version("torchrl").split("+")[0],
+        "ray": ray.__version__,
+        "worldloop": version("worldloop"),
+    }
+
+
+def connect(launch: Mapping[str, Any]) -> list[Mapping[str, float]]:
+    """Start Ray here, on loopback and without a dashboard, or join launch.address; returns the resources of
+    the nodes.
+
+    Raises:
+        ConfigError: if the cluster cannot be reached, refuses the token, or has other versions.
+    """
+    if not ray.is_initialized():
+        _knock(str(launch["address"]))
+        try:
+            if launch["address"] == "local":
+                cpus = launch["cpus"] or None
+                store = int(launch["object_store_mb"]) * 2**20
+                ray.init(
+                    address="local",
+                    num_cpus=cpus,
+                    include_dashboard=False,
+                    object_store_memory=store,
+                    _node_ip_address="127.0.0.1",
+                    log_to_driver=False,
+                    configure_logging=False,
+                )
+                reap_after_me()
+            else:
+                ray.init(address=launch["address"], log_to_driver=True, configure_logging=False)
+        except Exception as error:
+            raise ConfigError(_advice(str(launch["address"]), error)) from error
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    if launch["address"] != "local":
+        _compare(len(nodes))
+    return nodes
+
+
+def _knock(address: str) -> None:
+    """Fail in seconds where nobody listens; Ray itself tries for minutes."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if colon and port.isdigit():
+        try:
+            socket.create_connection((host, int(port)), timeout=5).close()
+        except OSError as error:
+            raise ConfigError(
+                f"launch.address={address} cannot be reached ({error}); is `ray start --head` running there, and the port open?"
+            ) from error
+
+
+def _advice(address: str, error: Exception) -> str:
+    said = str(error).splitlines()[0] if str(error) else ""
+    if "version" in said.lower():
+        return f"launch.address={address}: {said}; install the versions of constraints.txt on every node"
+    if isinstance(error, ConnectionError) or "token" in said.lower() or "unauthenticated" in said.lower():
+        # Ray logs InvalidAuthToken and then only says that it could not connect.
+        return (
+            f"launch.address={address} listens, but does not let us in; most often it refused our token: copy ~/.ray/auth_token of the head node to this machine, "
+            f"or set RAY_AUTH_MODE=disabled everywhere on a network you trust ({type(error).__name__}: {said})"
+        )
+    return f"launch.address={address}: {type(error).__name__}: {said}; see /tmp/ray/session_latest/logs"
+
+
+def _compare(nodes: int) -> None:
+    """Every node must have our versions: rollouts and weights of another would fail late and darkly."""
+    mine = versions()
+    probe = ray.remote(versions).options(num_cpus=0, scheduling_strategy="SPREAD")
+    for theirs in ray.get([probe.remote() for _ in range(2 * nodes)], timeout=120):
+        check_versions(mine, theirs)
+
+
+def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str]) -> None:
+    """Refuse a node whose versions differ.
+
+    Raises:
+        ConfigError: naming what differs.
+    """
+    wrong = {key: (theirs.get(key), value) for key, value in mine.items() if theirs.get(key) != value}
+    if wrong:
+        says = ", ".join(f"{key} {other} instead of {own}" for key, (other, own) in wrong.items())
+        raise ConfigError(
+            f"a node of the cluster has {says}; install the versions of constraints.txt on every node"
+        )
+
+
+def threads_of(cpus: float) -> int:
+    """Threads of a process with that share of CPUs; one at least."""
+    return max(1, int(cpus)) if cpus else available_cores()

@@ -1,0 +1,60 @@
+"""From a recipe and configs/launch to a running fleet."""
+
+from __future__ import annotations
+
+import uuid
+from dataclasses import replace
+from typing import Any
+
+from actors.factory import ConfigError, options
+from actors.fleets.fleet import Fleet, LocalFleet
+from actors.rollouts.recipe import Recipe, build_host
+
+
+def build_fleet(recipe: Recipe) -> Fleet:
+    """The fleet of launch.backend: one host in this process, or Ray actors.
+
+    Raises:
+        ConfigError: if the backend is unknown or the plan cannot be scheduled.
+    """
+    launch = recipe.config["launch"]
+    if launch["backend"] == "local":
+        return LocalFleet(build_host(recipe))
+    if launch["backend"] != "ray":
+        raise ConfigError(
+            f"launch.backend={launch['backend']!r} is unknown; choose launch=local or launch=ray"
+        )
+    # Ray takes seconds to import, which a local run need not spend.
+    from actors.fleets.cluster import Plan, connect, threads_of
+    from actors.fleets.ray_fleet import Patience, RayFleet
+    from actors.serving.judge_service import ServiceConfig, start_service
+
+    plan = Plan.of(launch)
+    nodes = connect(launch)
+    plan.check(nodes)
+    missing = recipe.missing()
+    if missing:
+        raise ConfigError(f"{missing} do not exist; run the stages that make them")
+    own = replace(recipe, threads=launch["threads"] or threads_of(plan.cpus["actors"]))
+    attached: tuple[Any, ...] = ()
+    if launch["judge_service"] and recipe.judge:
+        name = f"judge-{uuid.uuid4().hex[:8]}"
+        settings = options(ServiceConfig, launch["service"], "launch.service")
+        attached = (
+            start_service(
+                name,
+                recipe.config,
+                recipe.judge,
+                settings,
+                plan.options("judge"),
+                threads_of(plan.cpus["judge"]),
+            ),
+        )
+        own = replace(own, service=name)
+    return RayFleet(
+        own,
+        launch["actors"],
+        plan.options("actors"),
+        options(Patience, launch["patience"], "launch.patience"),
+        attached,
+    )

@@ -1,0 +1,110 @@
+"""What a host is built from, in any process: the resolved config and the paths of weights and data, nothing
+live.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from actors.factory import (
+    ConfigError,
+    build_judge,
+    build_physics,
+    build_policy,
+    build_simulator,
+    build_state_decoder,
+    build_world,
+    open_clips,
+    options,
+    prepare_process,
+)
+from actors.rollouts.host import Host
+from envs.judges import Judge
+from envs.world import InitialStates
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How to build a Host.
+
+    Args:
+        config: the resolved config, plain containers.
+        episodes: side by side.
+        policy: weights of the policy that RL starts from.
+        simulator, decoder, judge: weights of the imagined world; without a simulator it is physics.
+        data: data sets in whose first frames imagination begins.
+        freeze_perception, bootstrap: see RLConfig and Host.
+        later: let rewards arrive after the episode, see JudgeReward.
+        service: name of the judge service to ask instead of a judge of its own.
+        threads: of the process that hosts it, 0 for all cores.
+    """
+
+    config: Mapping[str, Any]
+    episodes: int
+    policy: str
+    simulator: str = ""
+    decoder: str = ""
+    judge: str = ""
+    data: tuple[str, ...] = ()
+    freeze_perception: bool = False
+    bootstrap: bool = True
+    later: bool = False
+    service: str = ""
+    threads: int = 0
+
+    def plain(self) -> dict[str, Any]:
+        """As a dictionary of plain containers, for the wire."""
+        return asdict(self)
+
+    def missing(self) -> list[str]:
+        """Paths that this machine does not have."""
+        return [
+            path
+            for path in (self.policy, self.simulator, self.decoder, self.judge, *self.data)
+            if path and not Path(path).exists()
+        ]
+
+
+def build_host(recipe: Recipe) -> Host:
+    """A host as the recipe says.
+
+    Raises:
+        ConfigError: if weights or data are missing here.
+    """
+    if recipe.missing():
+        raise ConfigError(
+            f"{recipe.missing()} are not on this machine; on a cluster, let `runs` be a folder that all nodes share"
+        )
+    cfg = recipe.config
+    policy = build_policy(cfg, Path(recipe.policy))
+    if recipe.freeze_perception:
+        policy.freeze_perception()
+    if not recipe.simulator:
+        return Host(build_physics(cfg, recipe.episodes), policy, recipe.bootstrap)
+    simulator = build_simulator(cfg, Path(recipe.simulator))
+    decoder = build_state_decoder(cfg, simulator, Path(recipe.decoder))
+    if recipe.service:
+        # Ray takes seconds to import, which a local run need not spend
+        from actors.serving.judge_service import JudgeClient, ServiceConfig
+
+        referee: Judge = JudgeClient(
+            recipe.service, options(ServiceConfig, cfg["launch"]["service"], "launch.service")
+        )
+    else:
+        referee = build_judge(cfg, Path(recipe.judge))
+    starts = InitialStates.of(open_clips(cfg, [Path(folder) for folder in recipe.data]))
+    return Host(
+        build_world(cfg, simulator, decoder, referee, starts, recipe.episodes, recipe.later),
+        policy,
+        recipe.bootstrap,
+    )
+
+
+def build_host_process(plain: Mapping[str, Any]) -> Host:
+    """build_host in a process of its own: from the wire's form of a recipe, with its threads."""
+    recipe = Recipe(**{**plain, "data": tuple(plain["data"])})
+    prepare_process(0, recipe.threads)
+    return build_host(recipe)

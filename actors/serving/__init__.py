@@ -1,0 +1,3 @@
+"""Any simulator behind GE-Sim's protocol: sessions, their shared forward passes, HTTP, and a page to watch
+them.
+"""

@@ -1,0 +1,328 @@
+"""The HTTP side of a served simulator: GE-Sim's endpoints, their status codes, and the live page.
+
+Clients written for the released server work unchanged. What is new is overlooked by them: many sessions
+instead of
+one, `seed` in /init, `state` beside the first frame, `chunk` in /step (a repeated step is answered again, not
+made
+again), and what /healthz says beside "ok".
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
+
+import cv2
+import numpy as np
+from aiohttp import web
+from numpy.typing import NDArray
+
+from actors.serving.page import PAGE
+from actors.serving.sessions import NoPlace, ServeConfig, Session, SessionHost, UnknownSession
+from envs.simulators.remote.protocol import (
+    ProtocolError,
+    decode_frame,
+    encode_frame,
+    floats,
+    numbers,
+    pack,
+    parse,
+    shape_in,
+    unpack,
+)
+
+logger = logging.getLogger("worldloop.serve")
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+def _json(status: int, value: Any) -> web.Response:
+    return web.Response(
+        status=status,
+        text=json.dumps(value),
+        content_type="application/json",
+        headers={"Cache-Control": "no-store"},
+    )
+
+
+@web.middleware
+async def _errors(request: web.Request, handler: Handler) -> web.StreamResponse:
+    """Status codes of the protocol: 403 unknown client, 400 bad input, 413 too large, 503 full, 500 model
+    failure; all say why in JSON.
+    """
+    try:
+        return await handler(request)
+    except UnknownSession as error:
+        return _json(403, {"error": str(error)})
+    except ProtocolError as error:
+        return _json(400, {"error": str(error)})
+    except NoPlace as error:
+        return _json(503, {"error": str(error)})
+    except web.HTTPException as error:
+        return _json(error.status, {"error": error.reason})
+    except (ConnectionResetError, asyncio.CancelledError):
+        raise
+    except Exception as error:
+        logger.exception("%s failed", request.path)
+        return _json(500, {"error": f"{type(error).__name__}: {error}"})
+
+
+class Server:
+    """Routes of the protocol over a SessionHost.
+
+    Args:
+        host: the sessions.
+        name: of the simulator, for the page.
+    """
+
+    def __init__(self, host: SessionHost, name: str):
+        self.host, self.name = host, name
+        self.limit = int(host.config.body_mb * 2**20)
+
+    def app(self) -> web.Application:
+        """The application, to be run by aiohttp."""
+        app = web.Application(middlewares=[_errors], client_max_size=self.limit)
+        for path, call in (
+            ("/init", self.init),
+            ("/reset", self.reset),
+            ("/set_task", self.set_task),
+            ("/set_camera_params", self.set_camera_params),
+            ("/close", self.close),
+            ("/set_episode_data", self.set_episode_data),
+            ("/set_episode_traj", self.set_episode_traj),
+            ("/step", self.step),
+        ):
+            app.router.add_post(path, call)
+        app.cleanup_ctx.append(self._sweep)
+        app.router.add_get("/healthz", self.healthz)
+        app.router.add_get("/", self.page)
+        app.router.add_get("/api/status", self.status)
+        app.router.add_get("/api/preview.jpg", self.preview)
+        return app
+
+    async def _sweep(self, app: web.Application) -> AsyncIterator[None]:
+        """End idle sessions for as long as the server runs."""
+
+        async def forever() -> None:
+            while True:
+                await asyncio.sleep(min(30.0, self.host.config.idle_s / 2))
+                self.host.expire()
+
+        task = asyncio.create_task(forever())
+        yield
+        task.cancel()
+
+    async def _body(self, request: web.Request) -> bytes:
+        if (request.content_length or 0) > self.limit:
+            # Refused by its own announcement, before a byte of it is kept.
+            raise web.HTTPRequestEntityTooLarge(
+                max_size=self.limit,
+                actual_size=request.content_length or 0,
+                reason=f"the body has {request.content_length} bytes, serve.body_mb={self.host.config.body_mb:g} allows {self.limit}",
+            )
+        return await request.read()
+
+    # -- JSON endpoints
+    # --------------------------------------------------------------------------------------------
+    async def init(self, request: web.Request) -> web.Response:
+        """Open a session."""
+        body = parse(await self._body(request))
+        seed = body.get("seed")
+        if seed is not None and (type(seed) is not int or not 0 <= seed < 2**62):
+            raise ProtocolError(f"seed must be a whole number from 0, got {str(seed)[:80]}")
+        session = self.host.open(str(body.get("user_name", "anonymous"))[:80], seed)
+        return _json(200, {"success": True, "client_id": session.client_id})
+
+    async def reset(self, request: web.Request) -> web.Response:
+        """Forget the episode of a session."""
+        session = self.host.get(parse(await self._body(request)).get("client_id"))
+        async with session.lock:
+            session.restart()
+        return _json(200, {"success": True})
+
+    async def set_task(self, request: web.Request) -> web.Response:
+        """Remember the task's words; no simulator reads them."""
+        body = parse(await self._body(request))
+        self.host.get(body.get("client_id")).task = str(body.get("task", ""))[:1000]
+        return _json(200, {"success": True})
+
+    async def set_camera_params(self, request: web.Request) -> web.Response:
+        """Intrinsics in pixels of the simulator's pictures, and cameras at the start if they are known."""
+        body = parse(await self._body(request))
+        session, views = self.host.get(body.get("client_id")), self.host.simulator.shape.views
+        if "intrinsic" not in body:
+            raise ProtocolError("intrinsic is missing")
+        intrinsic = numbers(body["intrinsic"], (views, 3, 3), "intrinsic")
+        if np.abs(np.linalg.det(intrinsic)).min() < 1e-6:
+            raise ProtocolError("intrinsic must be invertible")
+        extrinsic = (
+            None if body.get("extrinsic") is None else numbers(body["extrinsic"], (views, 4, 4), "extrinsic")
+        )
+        async with session.lock:
+            session.intrinsic, session.extrinsic = intrinsic, extrinsic
+        return _json(200, {"success": True})
+
+    async def close(self, request: web.Request) -> web.Response:
+        """End a session."""
+        session = self.host.get(parse(await self._body(request)).get("client_id"))
+        async with session.lock:
+            self.host.close(session.client_id)
+        return _json(200, {"success": True})
+
+    # -- binary endpoints
+    # ------------------------------------------------------------------------------------------
+    async def set_episode_data(self, request: web.Request) -> web.Response:
+        """The first frame; whatever came of an earlier one is forgotten."""
+        picture, said = unpack(await self._body(request), 2)
+        meta = parse(said)
+        session = self.host.get(meta.get("client_id"))
+        _, views, height, width = shape_in(meta, "frame_shape", f"3,{self.host.simulator.shape.views},H,W")
+        frame = await asyncio.to_thread(
+            lambda: self._sized(decode_frame(picture, views, height, width)[None])[0]
+        )
+        joints = None if meta.get("state") is None else numbers(meta["state"], (16,), "state")
+        async with session.lock:
+            # the released order of calls is data, then trajectory; either order works
+            traj, c2w = session.traj, session.c2w
+            session.restart()
+            session.first, session.joints, session.traj, session.c2w = frame, joints, traj, c2w
+        return _json(200, {"success": True})
+
+    async def set_episode_traj(self, request: web.Request) -> web.Response:
+        """Pose maps and cameras of a whole recording, or of the chunk to come."""
+        pictures, poses, said = unpack(await self._body(request), 3)
+        meta = parse(said)
+        session = self.host.get(meta.get("client_id"))
+        _, views, count, height, width = shape_in(
+            meta, "traj_shape", f"3,{self.host.simulator.shape.views},T,H,W"
+        )
+        shape_in(meta, "c2w_shape", f"{views},{count},4,4")
+        c2w = floats(poses, (views, count, 4, 4), "c2w").transpose(1, 0, 2, 3)
+
+        def read() -> NDArray[np.uint8]:
+            blocks = unpack(pictures)
+            if len(blocks) != count:
+                raise ProtocolError(f"traj_shape announces {count} pictures, {len(blocks)} came")
+            return np.concatenate(
+                [self._sized(decode_frame(block, views, height, width)[None]) for block in blocks]
+            )
+
+        maps = await asyncio.to_thread(read)
+        async with session.lock:
+            session.traj, session.c2w = maps, np.ascontiguousarray(c2w)
+        return _json(200, {"success": True})
+
+    def _sized(self, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Frames [T, V, 3, H, W] at the simulator's size."""
+        size = self.host.simulator.shape.size
+        if frames.shape[-2:] == size:
+            return frames
+        small = [
+            [
+                cv2.resize(
+                    view.transpose(1, 2, 0), (size[1], size[0]), interpolation=cv2.INTER_LINEAR
+                ).transpose(2, 0, 1)
+                for view in frame
+            ]
+            for frame in frames
+        ]
+        return np.array(small, np.uint8)
+
+    async def step(self, request: web.Request) -> web.Response:
+        """One chunk: frames as JPEGs, and joint states."""
+        body = await self._body(request)
+        values, said = unpack(body, 2)
+        meta = parse(said)
+        session = self.host.get(meta.get("client_id"))
+        actions = floats(values, shape_in(meta, "action_shape", "L,A"), "actions")
+        async with session.lock:
+            asked = meta.get("chunk")
+            if (
+                asked is not None
+                and session.reply is not None
+                and asked == session.reply[0]
+                and body == session.reply[1]
+            ):
+                return web.Response(body=session.reply[2], content_type="application/octet-stream")
+            if asked is not None and asked != session.chunk:
+                raise ProtocolError(f"chunk {asked} was asked for, this session is at {session.chunk}")
+            frames, states = await self.host.step(session, actions)
+            answer, session.preview = await asyncio.to_thread(_answer, frames, states)
+            session.reply = (session.chunk - 1, body, answer)
+            session.last_action, session.last_state = (
+                actions[-1].tolist(),
+                None if states is None else states[-1].tolist(),
+            )
+        self.host.latest = session
+        return web.Response(body=answer, content_type="application/octet-stream")
+
+    # -- to look at
+    # ------------------------------------------------------------------------------------------------
+    async def healthz(self, request: web.Request) -> web.Response:
+        """Whether it lives, how many sessions it holds, and that repeated steps are known apart."""
+        return _json(200, {"status": "ok", "sessions": self.host.config.sessions, "repeatable": True})
+
+    async def page(self, request: web.Request) -> web.Response:
+        """The live page."""
+        return web.Response(text=PAGE, content_type="text/html")
+
+    def _chosen(self, request: web.Request) -> Session | None:
+        number = request.query.get("session")
+        known = list(self.host.sessions.values())
+        if number is not None and number.isdigit() and int(number) < len(known):
+            return known[int(number)]
+        return self.host.latest if self.host.latest in known else (known[-1] if known else None)
+
+    async def status(self, request: web.Request) -> web.Response:
+        """What the page shows: of one session what the released server says, and a line for each."""
+        session = self._chosen(request)
+        one = {
+            "model": self.name,
+            "phase": "running" if any(s.lock.locked() for s in self.host.sessions.values()) else "idle",
+            "chunk_size": self.host.simulator.shape.chunk,
+            "step_count": session.chunk if session else 0,
+            "frames_generated": session.frames if session else 0,
+            "has_preview": bool(session and session.preview),
+            "state": session.last_state if session else None,
+            "action": session.last_action if session else None,
+            "task": session.task if session else "",
+        }
+        # no client_id: who knows one may drive it
+        rows = [
+            {"user": s.user, "task": s.task, "steps": s.chunk, "frames": s.frames}
+            for s in self.host.sessions.values()
+        ]
+        return _json(200, {**one, "sessions": rows, "passes": self.host.passes, "steps": self.host.steps})
+
+    async def preview(self, request: web.Request) -> web.Response:
+        """The last frame of a session."""
+        session = self._chosen(request)
+        if session is None or not session.preview:
+            return web.Response(status=204)
+        return web.Response(
+            body=session.preview, content_type="image/jpeg", headers={"Cache-Control": "no-store"}
+        )
+
+
+def _answer(frames: NDArray[np.uint8], states: NDArray[np.float32] | None) -> tuple[bytes, bytes]:
+    """The body that answers /step, and its last picture."""
+    count, views, _, height, width = frames.shape
+    meta = {
+        "frame_shape": [count, 3, views, height, width],
+        "state_shape": None if states is None else list(states.shape),
+    }
+    pictures = [encode_frame(frame) for frame in frames]
+    return pack(
+        [json.dumps(meta).encode(), *pictures, b"" if states is None else states.astype("<f4").tobytes()]
+    ), pictures[-1]
+
+
+def serve(host: SessionHost, name: str, config: ServeConfig) -> None:
+    """Serve until interrupted.
+
+    Raises:
+        OSError: if the port is taken.
+    """
+    web.run_app(Server(host, name).app(), host=config.host, port=config.port, print=None, access_log=None)

@@ -1,0 +1,214 @@
+"""One judge for all hosts: a Ray actor that gathers clips from many callers into batches, and the Judge that
+asks it.
+
+Verdicts are remembered by content, so the same video is never paid for twice. A caller waits until a
+deadline, tries
+again with growing pauses, and then says ERROR, upon which learners drop the episode and count it; a spent
+budget says
+ABSTAIN. The service is a named actor that Ray restarts when it dies; callers find it again by name.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import time
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import ray
+import torch
+from ray.exceptions import GetTimeoutError, RayActorError, RayTaskError
+from torch import Tensor
+
+from actors.factory import ConfigError, build_judge, prepare_process
+from envs.judges import Judge, Verdict
+from envs.specs import Status
+
+
+@dataclass(frozen=True)
+class ServiceConfig:
+    """Options of the service and of those who ask it.
+
+    Args:
+        batch: clips judged at once at most.
+        wait_ms: how long the first clip of a batch waits for others.
+        cache: verdicts remembered.
+        budget: clips that may be judged, remembered ones not counted; 0 for any number.
+        deadline: seconds a caller waits for an answer.
+        retries: times it asks again.
+        pause: seconds before the first of these; doubles each time.
+    """
+
+    batch: int = 64
+    wait_ms: float = 5.0
+    cache: int = 20_000
+    budget: int = 0
+    deadline: float = 60.0
+    retries: int = 3
+    pause: float = 0.5
+
+
+class JudgeServer:
+    """The actor's code; `score` runs concurrently for many callers, the judge itself in one batch after
+    another.
+    """
+
+    def __init__(self, config: Mapping[str, Any], weights: str, options: ServiceConfig, threads: int):
+        prepare_process(0, threads)
+        self.judge = build_judge(config, Path(weights)).eval()
+        self.options = options
+        self.cache: OrderedDict[bytes, tuple[np.ndarray, np.ndarray, int]] = OrderedDict()
+        self.waiting: list[tuple[tuple[np.ndarray, ...], asyncio.Future[Any]]] = []
+        self.counts = {"clips": 0, "judged": 0, "remembered": 0, "batches": 0, "refused": 0}
+        self.worker: asyncio.Task[None] | None = None
+
+    async def describe(self) -> dict[str, Any]:
+        """Threshold and hold of the judge, by which callers turn frames into episodes."""
+        return {"threshold": float(self.judge.threshold), "hold": self.judge.hold}
+
+    async def stats(self) -> dict[str, int]:
+        """How many clips came, were judged or remembered, in how many batches."""
+        return dict(self.counts)
+
+    async def score(
+        self, frames: np.ndarray, first: np.ndarray, tokens: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Success and progress [B, T] and status [B] of clips; see Judge.score."""
+        answers = await asyncio.gather(
+            *(self._clip(*parts) for parts in zip(frames, first, tokens, strict=True))
+        )
+        success, progress, status = zip(*answers, strict=True)
+        return np.stack(success), np.stack(progress), np.array(status)
+
+    async def _clip(
+        self, frames: np.ndarray, first: np.ndarray, tokens: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, int]:
+        self.counts["clips"] += 1
+        digest = hashlib.blake2b(digest_size=16)
+        for part in (frames, first, tokens):
+            digest.update(str(part.shape).encode())
+            digest.update(np.ascontiguousarray(part).tobytes())
+        key = digest.digest()
+        if key in self.cache:
+            self.counts["remembered"] += 1
+            self.cache.move_to_end(key)
+            return self.cache[key]
+        if self.options.budget and self.counts["judged"] + len(self.waiting) >= self.options.budget:
+            self.counts["refused"] += 1
+            return np.zeros(len(frames), np.float32), np.zeros(len(frames), np.float32), Status.ABSTAIN.value
+        future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+        self.waiting.append(((frames, first, tokens), future))
+        if self.worker is None or self.worker.done():
+            self.worker = asyncio.create_task(self._work())
+        answer = await future
+        self.cache[key] = answer
+        while len(self.cache) > self.options.cache:
+            self.cache.popitem(last=False)
+        return answer
+
+    async def _work(self) -> None:
+        """Judge what waits, batch by batch; clips of another length wait for a batch of their own."""
+        while self.waiting:
+            if len(self.waiting) < self.options.batch:
+                await asyncio.sleep(self.options.wait_ms / 1e3)
+            shape = self.waiting[0][0][0].shape
+            chosen = [item for item in self.waiting if item[0][0].shape == shape][: self.options.batch]
+            self.waiting = [item for item in self.waiting if not any(item is other for other in chosen)]
+            parts = [
+                torch.tensor(np.stack(arrays)) for arrays in zip(*(item[0] for item in chosen), strict=True)
+            ]
+            try:
+                # type: ignore[misc]
+                verdict = await asyncio.get_running_loop().run_in_executor(
+                    None, lambda p=parts: self.judge.score(*p)
+                )
+            except Exception as error:
+                for _, future in chosen:
+                    future.set_exception(error)
+                continue
+            self.counts["judged"] += len(chosen)
+            self.counts["batches"] += 1
+            rows = zip(
+                verdict.success.numpy(), verdict.progress.numpy(), verdict.status.tolist(), strict=True
+            )
+            for (_, future), row in zip(chosen, rows, strict=True):
+                future.set_result(row)
+
+
+class JudgeClient(Judge):
+    """A Judge that asks the service of a name.
+
+    Args:
+        service: name of the actor.
+        options: deadline and retries.
+
+    Raises:
+        ConfigError: if there is no such service.
+    """
+
+    def __init__(self, service: str, options: ServiceConfig):
+        self.service, self.options = service, options
+        try:
+            about: Any = ray.get(ray.get_actor(service).describe.remote(), timeout=options.deadline)
+        except (ValueError, RayActorError, GetTimeoutError) as error:
+            raise ConfigError(
+                f"the judge service {service!r} does not answer: {error}; start it first, or use launch.judge_service=false"
+            ) from error
+        super().__init__(about["threshold"], about["hold"])
+
+    def begin(self, frames: Tensor, first: Tensor, tokens: Tensor) -> Any:
+        """See Judge.begin; the service begins at once."""
+        arrays = tuple(value.cpu().numpy() for value in (frames, first, tokens))
+        ref: Any = None  # stays so if it is down just now; `end` asks again
+        with contextlib.suppress(ValueError, RayActorError):
+            ref = ray.get_actor(self.service).score.remote(*arrays)
+        return arrays, ref, frames.device
+
+    def end(self, ticket: Any) -> Verdict:
+        """See Judge.end; what no attempt answered is an ERROR."""
+        arrays, ref, device = ticket
+        for attempt in range(self.options.retries + 1):
+            try:
+                if ref is None:
+                    ref = ray.get_actor(self.service).score.remote(*arrays)
+                success, progress, status = ray.get(ref, timeout=self.options.deadline)
+            except (ValueError, RayActorError, RayTaskError, GetTimeoutError):
+                ref = None
+                if attempt < self.options.retries:
+                    time.sleep(self.options.pause * 2**attempt)
+                continue
+            return Verdict(
+                torch.tensor(success, device=device),
+                torch.tensor(progress, device=device),
+                torch.tensor(status, device=device),
+            )
+        batch, count = arrays[0].shape[:2]
+        nothing = torch.zeros(batch, count, device=device)
+        return Verdict(nothing, nothing.clone(), torch.full((batch,), Status.ERROR.value, device=device))
+
+    def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
+        """See Judge.score; `objects` is ignored."""
+        return self.end(self.begin(frames, first, tokens))
+
+
+def start_service(
+    name: str,
+    config: Mapping[str, Any],
+    weights: str,
+    options: ServiceConfig,
+    resources: Mapping[str, Any],
+    threads: int,
+) -> Any:
+    """Start the named service and wait until it answers; returns the actor, which lives until it is killed."""
+    server: Any = ray.remote(JudgeServer)
+    actor = server.options(name=name, max_restarts=-1, max_concurrency=256, **resources).remote(
+        config, weights, options, threads
+    )
+    ray.get(actor.describe.remote(), timeout=180)
+    return actor

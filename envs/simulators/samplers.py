@@ -1,0 +1,115 @@
+"""From noise to latents: the three ways a velocity network is followed, each a few lines over the same call.
+
+A velocity network sees z at level s in 0..1, z = (1 - s) x + s e of data x and noise e, and says e - x.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+Velocity = Callable[[Tensor, float], Tensor]
+
+# Sigmas of the released four-step student: TrigFlow times pi/2, atan 15, atan 5, atan 5/3 as s = sigma / (1 +
+# sigma).
+DISTILLED = (1.0, 0.9375, 0.8333, 0.625)
+
+
+class Sampler(Protocol):
+    """Turns standard normal noise into data by asking for velocities."""
+
+    def __call__(self, velocity: Velocity, noise: Tensor) -> Tensor:
+        """Data like `noise`; `velocity` is called with z and its level, last with the level whose features
+        are kept.
+        """
+
+
+@dataclass(frozen=True)
+class Euler:
+    """Straight steps along the flow (flow matching, Lipman et al. 2022).
+
+    Args:
+        steps: of the solver.
+        shift: above 1 spends more steps near noise.
+    """
+
+    steps: int = 4
+    shift: float = 1.0
+
+    def __call__(self, velocity: Velocity, noise: Tensor) -> Tensor:
+        """See Sampler."""
+        even = torch.linspace(1.0, 0.0, self.steps + 1)
+        levels = (self.shift * even / (1 + (self.shift - 1) * even)).tolist()
+        z = noise
+        for level, following in pairwise(levels):
+            z = z + (following - level) * velocity(z, level)
+        return z
+
+
+@dataclass(frozen=True)
+class Distilled:
+    """The few-step student of GE-Sim 2.0: jump to the data, and back to the next level with the same noise
+    each time.
+
+    Args:
+        sigmas: levels in falling order, below 1 but for the first.
+    """
+
+    sigmas: tuple[float, ...] = DISTILLED
+
+    def __post_init__(self) -> None:
+        if (
+            not self.sigmas
+            or any(not 0 < s <= 1 for s in self.sigmas)
+            or list(self.sigmas) != sorted(self.sigmas, reverse=True)
+        ):
+            raise ValueError(f"sigmas={list(self.sigmas)} must fall from at most 1 and stay above 0")
+
+    def __call__(self, velocity: Velocity, noise: Tensor) -> Tensor:
+        """See Sampler."""
+        z = noise
+        for level, following in pairwise((*self.sigmas, 0.0)):
+            data = z - level * velocity(z, level)
+            z = (1 - following) * data + following * noise
+        return z
+
+
+@dataclass(frozen=True)
+class EDM:
+    """The undistilled sampler: Euler steps in the variance-exploding frame of Karras et al. 2022, y = x +
+    sigma e.
+
+    Args:
+        steps: of the solver; GE-Sim 1 uses 15.
+        sigma_max, sigma_min: noise at the first and at the last step; the last step has no length, as
+            released.
+        rho: spacing of the levels.
+    """
+
+    steps: int = 15
+    sigma_max: float = 80.0
+    sigma_min: float = 0.002
+    rho: float = 7.0
+
+    def sigmas(self) -> list[float]:
+        """Noise of each step in falling order."""
+        high, low = self.sigma_max ** (1 / self.rho), self.sigma_min ** (1 / self.rho)
+        return (
+            (high + torch.linspace(0, 1, self.steps, dtype=torch.float64) * (low - high)) ** self.rho
+        ).tolist()
+
+    def __call__(self, velocity: Velocity, noise: Tensor) -> Tensor:
+        """See Sampler."""
+        sigmas = self.sigmas()
+        y = noise * sigmas[0]
+        for sigma, following in pairwise((*sigmas, sigmas[-1])):
+            level = sigma / (sigma + 1)
+            z = y * (1 - level)  # the same point in the flow's frame
+            data = z - level * velocity(z, level)
+            y = y + (following - sigma) * (y - data) / sigma
+        return y

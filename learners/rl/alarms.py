@@ -1,0 +1,62 @@
+"""Watches a run of reinforcement learning for the ways it goes wrong quietly."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from tqdm import tqdm
+
+from learners.training.fit import TrainingDiverged
+
+
+@dataclass
+class Alarms:
+    """Watches an RL run for the ways it goes wrong quietly.
+
+    Args:
+        patience: iterations in a row without reward variance before the alarm.
+        kl: KL per iteration that counts as exploding.
+        entropy_drop: fall of entropy (nats) from the first iteration that counts as collapse.
+    """
+
+    patience: int = 3
+    kl: float = 0.5
+    entropy_drop: float = 12.0
+    silent: int = 0
+    entropy: float | None = None
+    raised: list[str] = field(default_factory=list)
+
+    def check(self, figures: dict[str, float], iteration: int) -> None:
+        """Look at one iteration's figures; warns once per kind, stops the run on numbers that are not finite."""
+        bad = [key for key, value in figures.items() if not math.isfinite(value)]
+        if bad:
+            raise TrainingDiverged(
+                f"rl: {bad} not finite at iteration {iteration}; lower rl.lr or raise algorithm clipping; the last checkpoint is kept"
+            )
+        self.silent = self.silent + 1 if figures["reward_std"] < 1e-6 else 0
+        if self.silent == self.patience:
+            self._warn(
+                "no reward variance",
+                iteration,
+                "every episode scores the same; check the judge, or start from a policy that succeeds sometimes",
+            )
+        if figures.get("kl", 0.0) > self.kl:
+            self._warn(
+                "exploding KL",
+                iteration,
+                f"KL {figures['kl']:.3g} in one iteration; lower rl.lr or rl.epochs",
+            )
+        if "entropy" in figures:
+            self.entropy = figures["entropy"] if self.entropy is None else self.entropy
+            if self.entropy - figures["entropy"] > self.entropy_drop:
+                self._warn(
+                    "collapsed entropy",
+                    iteration,
+                    "exploration is gone; raise algorithm.entropy or policy.std",
+                )
+
+    def _warn(self, kind: str, iteration: int, advice: str) -> None:
+        if kind not in [text.split(" at ")[0] for text in self.raised]:
+            self.raised.append(f"{kind} at iteration {iteration}: {advice}")
+            tqdm.write(f"ALARM rl: {self.raised[-1]}")

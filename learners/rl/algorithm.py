@@ -1,0 +1,169 @@
+"""What reinforcement-learning algorithms are made of: the contract, the options they share, and the masks of
+a rollout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from tensordict import NestedKey, TensorDict
+from torch import Tensor, nn
+
+from envs.specs import CHUNK, INVALID_ACTION, JUDGE_STATUS, LOG_PROB, Status
+
+
+@dataclass(frozen=True)
+class RLConfig:
+    """Options of the loop, shared by all algorithms.
+
+    Args:
+        iterations: rounds of collecting and updating.
+        envs: episodes side by side over all hosts, and so the least number of episodes per iteration.
+        shards: jobs an iteration is cut into, each of envs / shards episodes; results depend on this, not on
+            who runs them.
+        schedule: "sync" learns from rollouts of the newest policy only; "async" lets hosts run on meanwhile.
+        max_policy_lag: versions a rollout may be behind, if async.
+        queue: jobs submitted and not yet learned from at most, if async.
+        max_dropped: share of all episodes that may be lost (dead judges, NaN actions) before the run stops.
+        epochs: passes over each iteration's data.
+        minibatch: transitions per update.
+        microbatches: parts a minibatch is cut into, each with a backward pass of its own, to save memory or
+            to be shared out to workers.
+        lr: learning rate of the policy.
+        clip: largest gradient norm.
+        kl_stop: mean KL to the behaviour policy at which an iteration's epochs end early.
+        anchor: weight of cloning what is known to have worked in physics (the newest deployed policy's true
+            successes) beside the algorithm's loss; it keeps RL from wandering where only the simulator says
+            it works.
+        anchor_batch: frames of that per update.
+        rewards_later: let rollouts go on without waiting for the judge, whose verdicts are filled in at their
+            end.
+        freeze_perception: train only what follows the policy's encoder, so that no picture is encoded twice.
+        checkpoint_every: iterations between checkpoints.
+        seed: of start frames, exploration and minibatches.
+    """
+
+    iterations: int = 40
+    envs: int = 128
+    shards: int = 1
+    schedule: str = "sync"
+    max_policy_lag: int = 2
+    queue: int = 8
+    max_dropped: float = 0.05
+    epochs: int = 3
+    minibatch: int = 256
+    microbatches: int = 1
+    lr: float = 2e-4
+    clip: float = 1.0
+    kl_stop: float = 0.15
+    anchor: float = 0.0
+    anchor_batch: int = 96
+    rewards_later: bool = False
+    freeze_perception: bool = False
+    checkpoint_every: int = 5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.schedule not in ("sync", "async"):
+            raise ValueError(f"schedule={self.schedule!r} must be sync or async")
+        if self.envs % self.shards:
+            raise ValueError(f"envs={self.envs} must be a multiple of shards={self.shards}")
+
+
+class Algorithm(Protocol):
+    """What tells algorithms apart; one file each.
+
+    Attributes:
+        name: in the config.
+        bootstraps: whether it values next observations, so that rollouts must say what perception makes of
+            them.
+        supports_delayed_reward: whether it learns from whole first episodes only, so that rewards may arrive
+            after them.
+        group_size: consecutive episodes that belong together, such as a group.
+    """
+
+    name: str
+    bootstraps: bool
+    supports_delayed_reward: bool
+    group_size: int
+
+    def seeds(self, starts: int, envs: int, generator: torch.Generator) -> list[int]:
+        """Episode seeds of one iteration, more than `envs` where early endings should be refilled."""
+        ...
+
+    def prepare(self, batch: TensorDict) -> tuple[TensorDict, dict[str, float]]:
+        """Turn a rollout [B, T] into a flat set of transitions with everything `loss` needs."""
+        ...
+
+    def loss(self, minibatch: TensorDict) -> tuple[Tensor, dict[str, float]]:
+        """Scalar loss of some transitions and figures to log."""
+        ...
+
+    def modules(self) -> nn.Module:
+        """All that is trained, the policy included."""
+        ...
+
+    def groups(self, lr: float) -> list[dict[str, Any]]:
+        """Parameter groups for the optimiser; `lr` is the policy's."""
+        ...
+
+
+class Anchor(Protocol):
+    """Something with batches and a loss that is added to the algorithm's."""
+
+    def sample(self, count: int, generator: torch.Generator) -> TensorDict:
+        """A batch."""
+        ...
+
+    def loss(self, data: TensorDict, generator: torch.Generator) -> Tensor:
+        """Its scalar loss."""
+        ...
+
+
+def first_episode(done: Tensor) -> Tensor:
+    """Which steps [B, T] belong to the first episode of their slot, from done flags [B, T]."""
+    before = torch.cat([torch.zeros_like(done[:, :1]), done[:, :-1]], 1)
+    return before.long().cumsum(1) == 0
+
+
+def judged(batch: TensorDict) -> Tensor:
+    """Which steps [B, T] belong to episodes that no judge's error or abstention has spoiled."""
+    if JUDGE_STATUS not in batch["next"].keys(True, True):
+        return torch.ones(batch.shape, dtype=torch.bool, device=batch.device)
+    return ~_episodes_with(
+        batch["next", JUDGE_STATUS].squeeze(-1) != Status.OK.value, batch["next", "done"].squeeze(-1)
+    )
+
+
+def finite(batch: TensorDict) -> Tensor:
+    """Which steps [B, T] belong to episodes in which the policy never said NaN."""
+    if INVALID_ACTION not in batch.keys(True, True):
+        return torch.ones(batch.shape, dtype=torch.bool, device=batch.device)
+    return ~_episodes_with(batch[INVALID_ACTION].squeeze(-1), batch["next", "done"].squeeze(-1))
+
+
+def sound(batch: TensorDict) -> Tensor:
+    """Which steps [B, T] may be learned from."""
+    return judged(batch) & finite(batch)
+
+
+def _episodes_with(bad: Tensor, done: Tensor) -> Tensor:
+    """Spreads a flag [B, T] to all steps of the episode it is raised in."""
+    number = torch.cat([torch.zeros_like(done[:, :1]), done[:, :-1]], 1).long().cumsum(1)
+    hit = torch.zeros(bad.shape, dtype=torch.long, device=bad.device).scatter_add(1, number, bad.long())
+    return hit.gather(1, number) > 0
+
+
+def transitions(batch: TensorDict, keep: Tensor, keys: Iterable[NestedKey], **extra: Tensor) -> TensorDict:
+    """The flat set of kept steps: what losses read by key, chunk and behaviour log-probability, plus tensors
+    [B, T, ...] by name.
+    """
+    flat = keep.reshape(-1).nonzero().squeeze(-1)
+    source = {key: batch[key].flatten(0, 1)[flat] for key in (*keys, CHUNK, LOG_PROB)}
+    out = TensorDict(source, [len(flat)])
+    for key, value in extra.items():
+        out[key] = value.flatten(0, 1)[flat]
+    return out

@@ -1,0 +1,140 @@
+"""GRPO on chunks (Shao et al. 2024): maximise E[min(r A, clip(r, 1-e_low, 1+e_high) A)] - b KL(policy ||
+start policy).
+
+A is an episode's return against the others of its group, which began from the same frame; there is no critic.
+Groups whose episodes all scored alike teach nothing and are dropped (Yu et al. 2025, DAPO), as are higher
+clips theirs.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torch.distributions import kl_divergence
+from torchrl.objectives import ClipPPOLoss
+
+from actors.policies.vla import ChunkPolicy
+from envs.specs import CHUNK, EPISODE, LOG_PROB
+from learners.rl.algorithm import first_episode, sound, transitions
+
+
+@dataclass(frozen=True)
+class GRPOConfig:
+    """Options of GRPO.
+
+    Args:
+        group: episodes per start frame.
+        normalise: divide by the group's standard deviation; without, advantages keep the reward's unit (Liu
+            et al. 2025).
+        clip_low, clip_high: bounds of the likelihood ratio below and above one.
+        kl: weight of the KL to the policy that RL started from.
+        entropy: weight of the entropy bonus.
+        shaped: credit each chunk with the reward that is still to come instead of the whole episode's.
+    """
+
+    group: int = 8
+    normalise: bool = True
+    clip_low: float = 0.2
+    clip_high: float = 0.28
+    kl: float = 0.0
+    entropy: float = 0.0
+    shaped: bool = True
+
+
+class GRPO:
+    """See the module's docstring; an Algorithm of learners.rl.loop."""
+
+    name = "grpo"
+    supports_delayed_reward = True
+    bootstraps = False
+
+    def __init__(self, policy: ChunkPolicy, config: GRPOConfig):
+        self.policy, self.config = policy.trained, config
+        self.reference = copy.deepcopy(self.policy).requires_grad_(False) if config.kl else None
+        self.objective = ClipPPOLoss(
+            self.policy,
+            None,
+            clip_epsilon=(config.clip_low, config.clip_high),
+            entropy_bonus=config.entropy > 0,
+            entropy_coeff=config.entropy,
+            functional=False,
+        )
+        self.objective.set_keys(action=CHUNK, sample_log_prob=LOG_PROB)
+        self.starts, self.group_size = 1, config.group
+
+    def modules(self) -> nn.Module:
+        """The policy."""
+        return self.policy
+
+    def groups(self, lr: float) -> list[dict[str, Any]]:
+        """One group."""
+        return [{"params": list(self.policy.parameters()), "lr": lr}]
+
+    def seeds(self, starts: int, envs: int, generator: torch.Generator) -> list[int]:
+        """Groups of equal starts; the members' seeds differ by multiples of the number of starts (see
+        WorldEnv).
+
+        Raises:
+            ValueError: if rl.envs is not a multiple of algorithm.group.
+        """
+        if envs % self.config.group:
+            raise ValueError(f"rl.envs={envs} must be a multiple of algorithm.group={self.config.group}")
+        self.starts = starts
+        order = torch.randint(starts, (envs // self.config.group,), generator=generator)
+        return [int(start) + starts * member for start in order for member in range(self.config.group)]
+
+    def prepare(self, batch: TensorDict) -> tuple[TensorDict, dict[str, float]]:
+        """Group-relative advantages of the first episode of every slot; what a slot does after that belongs
+        to no group.
+        """
+        done = batch["next", "done"].squeeze(-1)
+        mine = first_episode(done) & sound(batch)
+        reward = batch["next", "reward"].squeeze(-1) * mine
+        size = self.config.group
+        togo = reward.flip(1).cumsum(1).flip(1)
+        score = togo if self.config.shaped else togo[:, :1].expand_as(togo)
+        groups = score.unflatten(0, (-1, size))  # [G, size, T]
+        there = mine.unflatten(0, (-1, size)).float()
+        count = there.sum(1, keepdim=True).clamp(min=1)
+        mean = (groups * there).sum(1, keepdim=True) / count
+        spread = (((groups - mean).square() * there).sum(1, keepdim=True) / count).sqrt()
+        advantage = (groups - mean) / (spread + 1e-2) if self.config.normalise else groups - mean
+        total = reward.sum(1).unflatten(0, (-1, size))
+        alike = (total.amax(1) - total.amin(1)) < 1e-4
+        keep = (
+            mine & (~alike).repeat_interleave(size)[:, None] & (there.sum(1) > 1).repeat_interleave(size, 0)
+        )
+        if not keep.any():
+            # nothing to learn from, and advantages are zero: the update is a no-op that alarms report
+            keep = mine
+        data = transitions(batch, keep, self.policy.in_keys, advantage=advantage.flatten(0, 1).unsqueeze(-1))
+        same = batch[EPISODE][:, 0, 0] % self.starts
+        assert bool((same.unflatten(0, (-1, size)) == same.unflatten(0, (-1, size))[:, :1]).all()), (
+            "a group holds different starts"
+        )
+        return data, {
+            "groups_dropped": float(alike.float().mean()),
+            "advantage_std": float(data["advantage"].std()),
+        }
+
+    def loss(self, minibatch: TensorDict) -> tuple[Tensor, dict[str, float]]:
+        """The clipped objective, the KL to the start policy and the entropy bonus."""
+        out = self.objective(minibatch)
+        total = out["loss_objective"]
+        figures = {"kl": float(out["kl_approx"]), "clip_fraction": float(out["clip_fraction"])}
+        if "loss_entropy" in out.keys():
+            total = total + out["loss_entropy"]
+            figures["entropy"] = float(out["entropy"])
+        if self.reference is not None:
+            now = self.policy.get_dist(minibatch.clone(False))
+            with torch.no_grad():
+                start = self.reference.get_dist(minibatch.clone(False))
+            distance = kl_divergence(now, start).mean()
+            total = total + self.config.kl * distance
+            figures["kl_start"] = float(distance.detach())
+        return total, figures

@@ -1,0 +1,231 @@
+"""The reinforcement-learning loop: collect whole episodes, let an algorithm turn them into updates, watch for
+trouble.
+
+Rollouts come from a fleet (actors/fleet.py): this process or any number of Ray actors, in any world of this
+project;
+update.py learns from them. Every iteration starts fresh episodes and draws its randomness from (seed,
+iteration), so a
+run resumed from its checkpoint repeats what it would have done, and so do any number of actors. Of several
+workers that
+learn together (parallel.py), the first one has the fleet and shows the others what came.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from tqdm import tqdm
+
+from actors.fleets.fleet import EpisodeLedger, Fleet
+from actors.policies.vla import ChunkPolicy
+from actors.rollouts.host import Weights, trained_weights
+from learners.rl.alarms import Alarms
+from learners.rl.algorithm import Algorithm, Anchor, RLConfig
+from learners.rl.feed import AsyncFeed, Feed
+from learners.rl.update import update
+from learners.training.checkpoint import Checkpoints, adam_moments, buffers_of, truncate_log
+from learners.training.interrupt import deferred_sigterm
+from learners.training.parallel import Trainee, from_leader, leads
+
+
+def train_rl(
+    fleet: Fleet | None,
+    policy: ChunkPolicy,
+    algorithm: Algorithm,
+    config: RLConfig,
+    folder: Path,
+    starts: int | None = None,
+    name: str = "rl",
+    seed_pool: Sequence[int] | None = None,
+    anchor: Anchor | None = None,
+    until: Callable[[int], bool] | None = None,
+) -> dict[str, Any]:
+    """Improve `policy` in place.
+
+    Args:
+        fleet: hosts of config.envs / config.shards episodes each; the policy's trained tensors are published
+            to it.
+            Of several workers only the leading one has one.
+        starts: number of start frames in imagination; None in physics, where `seed_pool` says which seeds may
+            be used.
+        folder: receives checkpoints, metrics.jsonl and learned.jsonl, the jobs that were learned from; a
+            checkpoint found there is resumed.
+        anchor: what RLConfig.anchor speaks of.
+        until: asked after every iteration, with its number; true ends the run early.
+
+    Returns:
+        Seconds spent, episodes used, alarms, the fleet's ledger, and the metrics of the last iteration.
+
+    Raises:
+        TrainingDiverged: on numbers that are not finite.
+        FleetError: if too many episodes are lost.
+        SystemExit: after SIGTERM, once a checkpoint is written.
+    """
+    if fleet is not None:
+        _check(fleet, algorithm, config)
+    folder.mkdir(parents=True, exist_ok=True)
+    checkpoints, log, learned = Checkpoints(folder), folder / "metrics.jsonl", folder / "learned.jsonl"
+    trainee = Trainee(algorithm.modules())
+    optimiser = torch.optim.Adam(algorithm.groups(config.lr), lr=config.lr, eps=1e-5)
+    alarms, ledger, first, episodes, wave = Alarms(), EpisodeLedger(), 0, 0, 0
+    spent = {"rollout": 0.0, "update": 0.0}
+
+    def state() -> dict[str, Any]:
+        return {
+            "modules": trainee.parameters,
+            "buffers": buffers_of(trainee.module),
+            "optimiser": adam_moments(optimiser, trainee.trained),
+        }
+
+    if checkpoints.newest is not None:
+        facts = checkpoints.load(state())
+        assert facts is not None
+        first, episodes, spent, wave = facts["iteration"], facts["episodes"], facts["spent"], facts["wave"]
+        alarms.entropy, alarms.silent, alarms.raised = facts["entropy"], facts["silent"], facts["raised"]
+        ledger = EpisodeLedger(**facts["ledger"])
+        ledger.drop("learner died", ledger.asked - ledger.learned - sum(ledger.dropped.values()))
+        if leads():
+            truncate_log(log, first)
+            truncate_log(learned, first)
+
+    def seeds(iteration: int) -> list[int]:
+        pool = starts or len(seed_pool or ())
+        drawn = algorithm.seeds(
+            pool, config.envs, torch.Generator().manual_seed(config.seed * 1_000_003 + iteration)
+        )
+        return drawn if seed_pool is None else [seed_pool[s % pool] for s in drawn]
+
+    def sampling(iteration: int, shard: int) -> int:
+        return config.seed * 7_919 + iteration + shard * 1_000_000_007
+
+    feed: Feed | None = None
+    if fleet is not None:
+        fleet.ledger = ledger
+        common = (fleet, config.shards, seeds, sampling, config.max_dropped, wave)
+        feed = (
+            Feed(*common)
+            if config.schedule == "sync"
+            else AsyncFeed(*common, config.max_policy_lag, config.queue)
+        )
+
+    def gather(iteration: int, weights: Weights) -> tuple[TensorDict, dict[str, float]]:
+        assert feed is not None, "only the leading worker is asked"
+        return feed.gather(iteration, weights)
+
+    def save(iteration: int) -> None:
+        facts = {
+            "iteration": iteration,
+            "episodes": episodes,
+            "spent": spent,
+            "ledger": asdict(ledger),
+            "entropy": alarms.entropy,
+            "silent": alarms.silent,
+            "raised": alarms.raised,
+        }
+        if feed is not None:
+            facts |= {"wave": feed.upcoming(iteration), "episodes_per_job": feed.fleet.episodes}
+        checkpoints.save(iteration, state(), facts)
+
+    bar = tqdm(
+        total=config.iterations, initial=first, desc=name, unit="it", dynamic_ncols=True, disable=not leads()
+    )
+    figures: dict[str, float] = {}
+    nowhere = Path(os.devnull)
+    with (
+        (log if leads() else nowhere).open("a") as rows,
+        (learned if leads() else nowhere).open("a") as jobs,
+        deferred_sigterm() as asked,
+    ):
+        for iteration in range(first, config.iterations):
+            began = time.perf_counter()
+            batch, supply = from_leader(partial(gather, iteration, trainee(trained_weights, policy)))
+            collected = time.perf_counter()
+            # Minibatches are drawn by the iteration alone, whatever collecting has used up.
+            figures = update(
+                batch, algorithm, trainee, optimiser, config, config.seed * 2_000_003 + iteration, anchor
+            )
+            updated = time.perf_counter()
+            spent["rollout"] += collected - began
+            spent["update"] += updated - collected
+            done = batch["next", "done"]
+            episodes += int(done.sum() + (~done[:, -1]).sum())
+            ledger.settle(
+                len(batch),
+                {"judge": int(figures["dropped_by_judge"]), "NaN actions": int(figures["dropped_nan"])},
+            )
+            if feed is not None:
+                feed.check_losses("judges that gave no verdict, or a policy that says NaN")
+            figures |= supply | {"time/rollout": collected - began, "time/update": updated - collected}
+            if feed is not None:
+                figures["time/actors_idle_share"] = max(
+                    0.0, 1 - supply["time/actors_busy"] / (feed.fleet.size * (updated - began))
+                )
+                jobs.write(
+                    json.dumps(
+                        {
+                            "step": iteration,
+                            "jobs": [job for job, _ in feed.learned],
+                            "versions": [version for _, version in feed.learned],
+                        }
+                    )
+                    + "\n"
+                )
+                jobs.flush()
+            alarms.check(figures, iteration)
+            rows.write(
+                json.dumps({"step": iteration, **{f"{name}/{k}": v for k, v in figures.items()}}) + "\n"
+            )
+            rows.flush()
+            bar.update()
+            bar.set_postfix_str(f"success {figures['success']:.2f}", refresh=False)
+            if iteration == first and leads():
+                tqdm.write(
+                    f"{name}: about {(updated - began) * (config.iterations - first - 1) / 60:.1f} min for {config.iterations - first - 1} more iterations"
+                )
+            stop = from_leader(asked)
+            if (iteration + 1) % config.checkpoint_every == 0 or stop:
+                save(iteration + 1)
+            if until is not None and until(iteration):
+                break
+            if stop and iteration + 1 < config.iterations:
+                bar.close()
+                tqdm.write(
+                    f"{name}: SIGTERM; stopped after iteration {iteration}, the same command goes on from there"
+                )
+                raise SystemExit(143)
+    bar.close()
+    trainee.release()
+    checkpoints.clear()
+    # What was submitted ahead and never learned from is no loss, but it was asked for.
+    ledger.drop("unused", ledger.asked - ledger.learned - sum(ledger.dropped.values()))
+    return {
+        **{f"{k}_seconds": v for k, v in spent.items()},
+        "episodes": episodes,
+        "alarms": alarms.raised,
+        "ledger": asdict(ledger),
+        "last": figures,
+    }
+
+
+def _check(fleet: Fleet, algorithm: Algorithm, config: RLConfig) -> None:
+    if config.envs // config.shards != fleet.episodes:
+        raise ValueError(
+            f"rl.envs={config.envs} in rl.shards={config.shards} jobs are {config.envs // config.shards} episodes each, but the hosts hold {fleet.episodes}"
+        )
+    if fleet.episodes % algorithm.group_size:
+        raise ValueError(
+            f"rl.envs / rl.shards = {fleet.episodes} must be a multiple of algorithm.group={algorithm.group_size}, or groups would be torn apart"
+        )
+    if config.rewards_later and not algorithm.supports_delayed_reward:
+        raise ValueError(
+            f"rl.rewards_later=true, but algorithm={algorithm.name} learns from every step as it was rewarded; use grpo or filtered_bc"
+        )

@@ -1,0 +1,101 @@
+"""Where a policy is updated: the optimisation of one iteration, by the losses of ppo.py, grpo.py and
+filtered_bc.py.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from envs.specs import SUCCESS
+from learners.rl.algorithm import Algorithm, Anchor, RLConfig, finite, first_episode, judged
+from learners.training.fit import TrainingDiverged, step_generator
+from learners.training.parallel import Trainee, averaged, clip_gradients, my_share
+
+
+def update(
+    batch: TensorDict,
+    algorithm: Algorithm,
+    trainee: Trainee,
+    optimiser: torch.optim.Optimizer,
+    config: RLConfig,
+    seed: int,
+    anchor: Anchor | None = None,
+) -> dict[str, float]:
+    """One iteration's optimisation on a rollout [B, T]; returns its figures.
+
+    Args:
+        trainee: algorithm.modules() in training.
+        seed: of minibatches and of what the anchor draws.
+    """
+    figures = outcome(batch)
+    data, extra = trainee(algorithm.prepare, batch)
+    figures |= extra
+    shuffle = torch.Generator().manual_seed(seed)
+    sums: dict[str, float] = {}
+    count, stopped = 0, False
+    for _ in range(config.epochs):
+        order = torch.randperm(len(data), generator=shuffle)
+        for pick in order.split(config.minibatch):
+            if not len(pick) or len(pick) < 16 <= len(data):  # nothing, or a rest too small for a step
+                continue
+            optimiser.zero_grad(set_to_none=True)
+            rows, parts, mine = [], pick.tensor_split(config.microbatches), my_share(config.microbatches)
+            for part in mine:
+                generator = step_generator(seed, count, part)
+                loss, row = trainee(_loss, algorithm, data[parts[part]], config, generator, anchor)
+                (loss / len(mine)).backward()
+                rows.append(row)
+            means = averaged(rows)
+            if means.get("kl", 0.0) > config.kl_stop:
+                stopped = True
+                break
+            norm = clip_gradients(
+                [p for group in optimiser.param_groups for p in group["params"]], config.clip
+            )
+            if not math.isfinite(norm):
+                raise TrainingDiverged(f"rl: gradient norm {norm}; lower rl.lr; the last checkpoint is kept")
+            optimiser.step()
+            for key, value in {**means, "grad_norm": norm}.items():
+                sums[key] = sums.get(key, 0.0) + value
+            count += 1
+        if stopped:
+            break
+    figures |= {key: value / max(1, count) for key, value in sums.items()}
+    return figures | {"updates": float(count), "transitions": float(len(data))}
+
+
+def _loss(
+    algorithm: Algorithm,
+    minibatch: TensorDict,
+    config: RLConfig,
+    generator: torch.Generator,
+    anchor: Anchor | None,
+) -> tuple[Tensor, dict[str, float]]:
+    loss, row = algorithm.loss(minibatch)
+    if anchor is not None and config.anchor:
+        pull = anchor.loss(anchor.sample(config.anchor_batch // config.microbatches, generator), generator)
+        loss = loss + config.anchor * pull
+        row["anchor"] = float(pull.detach())
+    return loss, {**row, "loss": float(loss.detach())}
+
+
+def outcome(batch: TensorDict) -> dict[str, float]:
+    """Success and return of the first episodes of a rollout [B, T] that nothing has spoiled, and how many
+    something has.
+    """
+    done, success = batch["next", "done"].squeeze(-1), batch["next", SUCCESS].squeeze(-1)
+    mine, said = first_episode(done), finite(batch)[:, 0]
+    kept = said & judged(batch)[:, 0]
+    reward = (batch["next", "reward"].squeeze(-1) * mine).sum(1)[kept]
+    there = bool(kept.any())
+    return {
+        "success": float((success & mine).any(1)[kept].float().mean()) if there else 0.0,
+        "return": float(reward.mean()) if there else 0.0,
+        "reward_std": float(reward.std(unbiased=False)) if there else 0.0,
+        "dropped_nan": float((~said).sum()),
+        "dropped_by_judge": float((said & ~kept).sum()),
+    }

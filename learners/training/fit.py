@@ -1,0 +1,218 @@
+"""The one training loop: every supervised stage is a module, a loss and a FitConfig given to `fit`.
+
+Batches and noise are functions of (seed, step, microbatch), so a run that was killed and resumed has the loss
+stream of
+one that was not, and so have, up to rounding, several workers (parallel.py).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from envs.precision import mixed_precision
+from learners.training.checkpoint import Checkpoints, adam_moments, buffers_of, truncate_log
+from learners.training.parallel import Trainee, averaged, clip_gradients, leads, local, my_share, twin
+
+Batch = Callable[[int, torch.Generator], Any]
+
+
+class TrainingDiverged(RuntimeError):
+    """Loss or gradients became NaN or infinite; the last good checkpoint is kept."""
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Options of the training loop.
+
+    Args:
+        steps: optimiser steps in all.
+        batch: samples per step.
+        lr: peak learning rate; warms up over `warmup` steps and falls by a cosine to a twentieth.
+        weight_decay: of AdamW, on matrices only.
+        ema: decay of the weights' moving average, 0 for none; the average is what a stage hands on.
+        clip: largest gradient norm.
+        bf16: run forward passes in bfloat16 where the device computes in it.
+        checkpoint_every: steps between checkpoints.
+        seed: of batches and noise.
+        microbatches: parts a batch is cut into, each with a backward pass of its own, to save memory or to be
+            shared out to workers.
+    """
+
+    steps: int
+    batch: int = 32
+    lr: float = 1e-3
+    warmup: int = 50
+    weight_decay: float = 1e-4
+    ema: float = 0.995
+    clip: float = 1.0
+    bf16: bool = True
+    checkpoint_every: int = 200
+    seed: int = 0
+    microbatches: int = 1
+
+    def __post_init__(self) -> None:
+        if self.microbatches < 1 or self.batch % self.microbatches:
+            raise ValueError(f"batch={self.batch} must be a multiple of microbatches={self.microbatches}")
+
+    @property
+    def part(self) -> int:
+        """Samples of a microbatch."""
+        return self.batch // self.microbatches
+
+
+def step_generator(seed: int, step: int, part: int = 0) -> torch.Generator:
+    """The generator of one microbatch; equal seeds, steps and parts give equal numbers wherever and whenever."""
+    return torch.Generator().manual_seed(
+        (seed * 1_000_003 + step + part * 7_368_787_000_003) & 0x7FFF_FFFF_FFFF
+    )
+
+
+def _rate(config: FitConfig, step: int) -> float:
+    if step < config.warmup:
+        return config.lr * (step + 1) / config.warmup
+    share = (step - config.warmup) / max(1, config.steps - config.warmup)
+    return config.lr * (0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * min(1.0, share))))
+
+
+def fit(
+    name: str,
+    module: nn.Module,
+    batch: Batch,
+    loss: Callable[[Any, torch.Generator], tuple[Tensor, dict[str, Any]]],
+    config: FitConfig,
+    folder: Path,
+    watch: str = "loss",
+) -> dict[str, float]:
+    """Train `module` in place and leave it with its averaged weights.
+
+    Args:
+        name: shown in the progress bar and used as the metrics' prefix.
+        module: what is trained; parameters without gradient are left alone.
+        batch: (step, generator) -> config.part samples of anything `loss` understands.
+        loss: (batch, generator) -> scalar loss and figures to log.
+        folder: receives checkpoints and metrics.jsonl; a checkpoint found there is resumed.
+        watch: the figure shown while it runs.
+
+    Returns:
+        Seconds spent: total, data, compute; and the last smoothed loss.
+
+    Raises:
+        TrainingDiverged: on a loss or gradient that is not finite.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    checkpoints, log = Checkpoints(folder), folder / "metrics.jsonl"
+    device = next(module.parameters()).device
+    trainee, mine = Trainee(module), my_share(config.microbatches)
+    trained = trainee.trained
+    groups = [
+        {"params": [p for p in trained.values() if p.ndim >= 2], "weight_decay": config.weight_decay},
+        {"params": [p for p in trained.values() if p.ndim < 2], "weight_decay": 0.0},
+    ]
+    optimiser = torch.optim.AdamW(groups, lr=config.lr, betas=(0.9, 0.99), fused=True)
+    average = twin(trained)
+    first, spent = 0, {"data": 0.0, "compute": 0.0}
+
+    def state() -> dict[str, Any]:
+        return {
+            "module": trainee.parameters,
+            "buffers": buffers_of(module),
+            "average": average,
+            "optimiser": adam_moments(optimiser, trained),
+        }
+
+    if checkpoints.newest is not None:
+        facts = checkpoints.load(state())
+        assert facts is not None
+        first, spent = int(facts["step"]), dict(facts["spent"])
+        if leads():
+            truncate_log(log, first)
+    module.train()
+    bar = tqdm(
+        total=config.steps,
+        initial=first,
+        desc=name,
+        unit="step",
+        mininterval=1.0,
+        dynamic_ncols=True,
+        disable=not leads(),
+    )
+    smooth: float | None = None
+    with (log if leads() else Path(os.devnull)).open("a") as stream:
+        for step in range(first, config.steps):
+            began, waited = time.perf_counter(), 0.0
+            for group in optimiser.param_groups:
+                group["lr"] = _rate(config, step)
+            optimiser.zero_grad(set_to_none=True)
+            rows = []
+            for part in mine:
+                generator, asked = step_generator(config.seed, step, part), time.perf_counter()
+                data = batch(step, generator)
+                if hasattr(data, "to"):
+                    data = data.to(device)
+                waited += time.perf_counter() - asked
+                with mixed_precision(device, config.bf16):
+                    value, more = trainee(loss, data, generator)
+                (value / len(mine)).backward()
+                rows.append(
+                    {"loss": float(value.detach()), **{key: float(item) for key, item in more.items()}}
+                )
+            norm, figures = clip_gradients(trained.values(), config.clip), averaged(rows)
+            figure = figures.pop("loss")
+            if not math.isfinite(norm) or not math.isfinite(figure):
+                raise TrainingDiverged(
+                    f"{name}: loss {figure:.4g}, gradient norm {norm:.4g} at step {step}; lower {name}.lr or switch {name}.bf16 off"
+                )
+            optimiser.step()
+            decay = min(config.ema, (1 + step) / (10 + step))
+            torch._foreach_lerp_(
+                [local(value) for value in average.values()],
+                [local(p.detach()) for p in trained.values()],
+                1.0 - decay,
+            )
+            took = time.perf_counter() - began
+            spent["data"] += waited
+            spent["compute"] += took - waited
+            smooth = figure if smooth is None else 0.98 * smooth + 0.02 * figure
+            row = {
+                "step": step,
+                f"{name}/loss": figure,
+                f"{name}/grad_norm": norm,
+                f"{name}/lr": optimiser.param_groups[0]["lr"],
+            }
+            stream.write(json.dumps(row | {f"{name}/{key}": item for key, item in figures.items()}) + "\n")
+            bar.update()
+            # the first step warms caches up; the next two are the calibration
+            if step - first == 2 and leads():
+                _announce(name, config.steps - step - 1, took)
+            bar.set_postfix_str(f"{watch} {figures.get(watch, smooth):.4g}", refresh=False)
+            if (step + 1) % config.checkpoint_every == 0 and step + 1 < config.steps:
+                stream.flush()
+                checkpoints.save(step + 1, state(), {"step": step + 1, "spent": spent})
+    bar.close()
+    if config.ema:
+        with torch.no_grad():
+            for key, parameter in trained.items():
+                parameter.copy_(average[key])
+    trainee.release()
+    module.eval()
+    checkpoints.clear()
+    return {
+        **{f"{key}_seconds": value for key, value in spent.items()},
+        "loss": smooth if smooth is not None else math.nan,
+    }
+
+
+def _announce(name: str, steps: int, seconds: float) -> None:
+    total = steps * seconds
+    tqdm.write(f"{name}: about {total / 60:.1f} min for {steps} more steps at {seconds * 1e3:.0f} ms")
