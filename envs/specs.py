@@ -1,46 +1,50 @@
-"""Names and layouts that every part of Worldloop shares: TensorDict keys, action and state layouts, rewards.
+"""Names that every part of Worldloop shares: TensorDict keys, what a world shows, how chunks are meant,
+rewards.
 
 Keys are those of TorchRL's VLA stack (torchrl.data.vla) where one exists, so that its policies and losses
 plug in.
+B is a batch of episodes, K the actions of a chunk, V cameras, A numbers of an action, S of a state
+(embodiment.py).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
-from torchrl.data.vla import ACTION_CHUNK_KEY, IMAGE_KEY, STATE_KEY
+from torchrl.data.vla import ACTION_CHUNK_KEY, IMAGE_KEY, INSTRUCTION_KEY, STATE_KEY
 
-from envs.layouts import CommandLayout
+from envs.embodiment import Embodiment
 
-# [x, y, z, roll, pitch, yaw, gripper] of the left, then the right arm; metres, radians, 0 open..1 closed
-ACTION_DIM = 14
-# [x, y, z, heading] of a thing; metres, and radians about the vertical; what is not known is NaN
-OBJECT_DIM = 4
-STATE_DIM = 16  # [left joints 7, left gripper, right joints 7, right gripper]; radians, 0 open..1 closed
-
-CHUNK = ACTION_CHUNK_KEY  # ("vla_action", "chunk") float32 [B, K, 14]
+CHUNK = ACTION_CHUNK_KEY  # ("vla_action", "chunk") float32 [B, K, A]
 LOG_PROB = ("vla_action", "log_probs")  # float32 [B]
-# bool [B, 1]: the policy said NaN, and rested instead; nobody may learn from the episode
-INVALID_ACTION = ("policy", "invalid_action")
 IMAGE = IMAGE_KEY  # ("observation", "image") uint8 [B, V, 3, H, W]: the last frame of each view
-STATE = STATE_KEY  # ("observation", "state") float32 [B, 16]
-COMMAND = ("observation", "command")  # float32 [B, 14]: the absolute command now in force
-TOKENS = ("observation", "tokens")  # int64 [B, WORDS]: the instruction as numbers (language.tokenize)
-INTRINSIC = ("camera", "intrinsic")  # float32 [B, V, 3, 3] pixels
-C2W = ("camera", "c2w")  # float32 [B, V, 4, 4] camera to world, OpenCV convention, at the last frame
+STATE = STATE_KEY  # ("observation", "state") float32 [B, S]
+INSTRUCTION = (
+    INSTRUCTION_KEY  # "language_instruction": text, made from INSTRUCTION_UTF8 for whoever reads text
+)
+# uint8 [B, TEXT_BYTES]: the same text, as rollouts carry it
+INSTRUCTION_UTF8 = ("observation", "instruction_utf8")
+# float32 [B, A]: the last action taken; of absolute actions the one in force
+COMMAND = ("observation", "command")
+# bool [B, 1]: the policy said NaN; nobody may learn from the episode
+INVALID_ACTION = ("policy", "invalid_action")
+INTRINSIC = ("camera", "intrinsic")  # float32 [B, V, 3, 3] pixels; only of calibrated robots
+C2W = ("camera", "c2w")  # float32 [B, V, 4, 4] camera to world, OpenCV convention; only of calibrated robots
 EPISODE = "episode_seed"  # int64 [B, 1]: episodes with equal seeds start from the same frame
 SUCCESS = "success"  # bool [B, 1]
 PROGRESS = "progress"  # float32 [B, 1] in 0..1
 JUDGE_STATUS = "judge_status"  # int64 [B, 1], see Status
-COMMANDS = "commands"  # float32 [B, K, 14] absolute, on the inverse path only
+COMMANDS = "commands"  # float32 [B, K, A], what a chunk comes to, on the inverse path only
 POSE_MAP = "pose_map"  # uint8 [B, K, V, 3, H, W], on the inverse path only
 CHUNK_C2W = "chunk_c2w"  # float32 [B, K, V, 4, 4], on the inverse path only
 FRAMES = ("world", "frames")  # uint8 [B, K, V, 3, H, W], between simulator and transforms only
 FEATURES = ("world", "features")  # float32 [B, F], between simulator and transforms only
+
+TEXT_BYTES = 256  # of an instruction; longer ones are cut
 
 
 class Status(Enum):
@@ -52,44 +56,115 @@ class Status(Enum):
 
 
 class ActionMode(str, Enum):
-    """How the numbers of a chunk are meant.
+    """How the numbers of a policy's chunk are meant.
 
-    RELATIVE: offsets from the command in force when the chunk starts, added number by number (Euler angles
-    and grippers too).
-    ABSOLUTE: end-effector poses in the world frame.
+    RELATIVE: offsets from the command in force when the chunk begins, number by number; for absolute actions
+    only.
+    ABSOLUTE: commands as the robot takes them (for a robot whose actions are deltas: those deltas).
     """
 
     RELATIVE = "relative"
     ABSOLUTE = "absolute"
 
 
-def to_absolute(chunk: Tensor, command: Tensor, mode: ActionMode) -> Tensor:
-    """Absolute commands [..., K, 14] of a chunk [..., K, 14], given the command in force [..., 14]."""
-    if mode is ActionMode.ABSOLUTE:
-        return chunk
-    return chunk + command.unsqueeze(-2)
+@dataclass(frozen=True)
+class WorldSpec:
+    """What a world shows of which robot, and how it is conditioned; simulators, judges and policies are built
+    from it.
+
+    Args:
+        embodiment: the robot.
+        size: (height, width) of every view in pixels, to which pictures are brought on reading.
+        chunk: actions, and so frames, per step, K.
+        pose_map: whether commanded grippers are drawn into each view; needs calibrated cameras and known
+            flange poses.
+        ray_map: whether networks are told where each pixel looks; needs calibrated cameras.
+
+    Raises:
+        ValueError: if the embodiment does not allow the conditioning.
+    """
+
+    embodiment: Embodiment
+    size: tuple[int, int]
+    chunk: int
+    pose_map: bool = False
+    ray_map: bool = False
+
+    def __post_init__(self) -> None:
+        robot = self.embodiment
+        if (self.pose_map or self.ray_map) and not robot.calibrated:
+            bare = [camera.name for camera in robot.cameras if not camera.calibrated]
+            raise ValueError(
+                f"simulator.pose_map and simulator.ray_map need calibrated cameras, and {bare} of {robot.robot} are not;"
+                " set both to false"
+            )
+        if self.pose_map and not robot.commands_poses:
+            raise ValueError(
+                f"simulator.pose_map needs end-effector poses, which the actions of {robot.robot} do not say; set"
+                " simulator.pose_map=false, or simulator.kinematics for joint commands"
+            )
+
+    @property
+    def views(self) -> int:
+        """Number of cameras, V."""
+        return len(self.embodiment.cameras)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return self.embodiment.fps
+
+    @property
+    def action_dim(self) -> int:
+        """Numbers of an action, A."""
+        return self.embodiment.action_dim
+
+    @property
+    def state_dim(self) -> int:
+        """Numbers of a state, S."""
+        return self.embodiment.state_dim
 
 
-def to_relative(commands: Tensor, command: Tensor) -> Tensor:
-    """The inverse of `to_absolute` for ActionMode.RELATIVE."""
-    return commands - command.unsqueeze(-2)
+def to_commands(chunk: Tensor, command: Tensor, mode: ActionMode) -> Tensor:
+    """Commands [..., K, A] of a policy's chunk [..., K, A], given the command in force [..., A]."""
+    return chunk if mode is ActionMode.ABSOLUTE else chunk + command.unsqueeze(-2)
 
 
-def check_chunk(chunk: Tensor, layout: CommandLayout = CommandLayout.EEF) -> None:
+def to_chunk(commands: Tensor, command: Tensor, mode: ActionMode) -> Tensor:
+    """The inverse of `to_commands`."""
+    return commands if mode is ActionMode.ABSOLUTE else commands - command.unsqueeze(-2)
+
+
+def check_chunk(chunk: Tensor, embodiment: Embodiment) -> None:
     """Refuse chunks of the wrong width or with NaN.
 
     Raises:
         ValueError: naming what is wrong.
     """
-    if chunk.shape[-1] != layout.size:
+    if chunk.shape[-1] != embodiment.action_dim:
         raise ValueError(
-            f"an action chunk is [..., K, {layout.size}] = {'[x,y,z,roll,pitch,yaw,g]x2' if layout is CommandLayout.EEF else '[L7,Lg,R7,Rg]'}, got {tuple(chunk.shape)}"
+            f"an action chunk of {embodiment.robot} is [..., K, {embodiment.action_dim}]"
+            f" = {list(embodiment.action_names)}, got {tuple(chunk.shape)}"
         )
     if not torch.isfinite(chunk).all():
         bad = int((~torch.isfinite(chunk)).sum())
         raise ValueError(
             f"an action chunk holds {bad} values that are NaN or infinite; the policy has diverged"
         )
+
+
+def text_to_bytes(texts: Sequence[str]) -> Tensor:
+    """Texts as uint8 [N, TEXT_BYTES], UTF-8 padded with zeros; longer ones are cut at a character."""
+    out = torch.zeros(len(texts), TEXT_BYTES, dtype=torch.uint8)
+    for row, text in zip(out, texts, strict=True):
+        raw = text.encode()[:TEXT_BYTES].decode(errors="ignore").encode()
+        row[: len(raw)] = torch.tensor(list(raw), dtype=torch.uint8)
+    return out
+
+
+def bytes_to_text(rows: Tensor) -> list[str]:
+    """The inverse of `text_to_bytes` for uint8 [N, TEXT_BYTES]."""
+    return [bytes(row).rstrip(b"\0").decode() for row in rows.cpu().numpy()]
 
 
 @dataclass(frozen=True)
@@ -102,15 +177,9 @@ class Rewards:
         success: bonus at success.
     """
 
-    progress: float = 1.0
-    success: float = 1.0
+    progress: float
+    success: float
 
     def __call__(self, before: Tensor, after: Tensor, success: Tensor) -> Tensor:
         """Reward float32 [..., 1] from progress before and after [..., 1] and success bool [..., 1]."""
         return self.progress * (after - before) + self.success * success.to(after.dtype)
-
-
-def first_objects(objects: Tensor, count: int) -> Tensor:
-    """The first `count` of objects [..., N, OBJECT_DIM], NaN where there are fewer, [..., count, OBJECT_DIM]."""
-    kept = objects[..., :count, :]
-    return F.pad(kept, (0, 0, 0, count - kept.shape[-2]), value=torch.nan)

@@ -1,8 +1,15 @@
-"""Action conditioning as pictures: where the grippers will be (pose map) and where each pixel looks (ray
-map).
-"""
+"""Action conditioning: pose maps, ray maps, action vectors; whatever the embodiment allows."""
 
+from envs.conditioning.action_vector import ActionVector
 from envs.conditioning.pose_map import CANVAS, PoseMapStyle, render_pose_map
+from envs.conditioning.poses import end_effector_poses
 from envs.conditioning.ray_map import render_ray_map
 
-__all__ = ["CANVAS", "PoseMapStyle", "render_pose_map", "render_ray_map"]
+__all__ = [
+    "CANVAS",
+    "ActionVector",
+    "PoseMapStyle",
+    "end_effector_poses",
+    "render_pose_map",
+    "render_ray_map",
+]

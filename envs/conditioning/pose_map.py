@@ -15,12 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envs.geometry.cameras import eef_transforms
+from envs.geometry.rotations import pose_transforms
 
 CANVAS = 50  # of 255, where nothing is drawn
 _AXIS = 0.1  # m
-# RGB of the x, y and z axis lines of the left and of the right arm
+# RGB of the x, y and z axis lines, and colour map of the circle, of the first arm (GE-Sim's left), the second
+# (its
+# right); further arms, of which GE-Sim has none, begin anew.
 AXIS_RGB = (((0, 0, 255), (255, 255, 0), (0, 255, 255)), ((255, 0, 255), (255, 0, 0), (0, 255, 0)))
+_COLOUR_MAPS = ("Greens", "Reds")
 _REFERENCE_HEIGHT = 384  # the picture height for which radii and thickness are given
 
 
@@ -32,14 +35,12 @@ class PoseMapStyle:
         tool_offset: metres from wrist to fingertip along the wrist's z (GE-Sim 1: 0.23).
         radius_law: "released" draws 100 * clip(1 - d - 0.07/0.73, 0, 1) pixels, "paper" 100 * clip(1 - (d -
             0.07)/0.73, 0, 1).
-        gripper_range: the gripper values that mean open and closed.
         cull_behind: leave out what lies behind the camera; the released code does not ask.
         scale: factor on radii and thickness; None scales them with the picture's height.
     """
 
     tool_offset: float = 0.15
     radius_law: str = "released"
-    gripper_range: tuple[float, float] = (0.0, 1.0)
     cull_behind: bool = False
     scale: float | None = None
 
@@ -50,33 +51,25 @@ class PoseMapStyle:
 
 @lru_cache(maxsize=1)
 def arm_shades() -> np.ndarray:
-    """Fill colours [2, 256, 3] RGB of the left (Greens) and right (Reds) circle, by colour-map index."""
+    """Fill colours [2, 256, 3] RGB of the first and the second arm's circle, by colour-map index."""
     import matplotlib
 
-    return np.stack(
-        [
-            (matplotlib.colormaps[name](np.arange(256))[:, :3] * 255).astype(np.uint8)
-            for name in ("Greens", "Reds")
-        ]
-    )
+    maps = [matplotlib.colormaps[name] for name in _COLOUR_MAPS]
+    return np.stack([(shades(np.arange(256))[:, :3] * 255).astype(np.uint8) for shades in maps])
 
 
 def render_pose_map(
-    eef_poses: Tensor,
-    c2w: Tensor,
-    intrinsic: Tensor,
-    size: tuple[int, int] = (384, 512),
-    tool_offset: float | None = None,
-    style: PoseMapStyle | None = None,
+    poses: Tensor, c2w: Tensor, intrinsic: Tensor, size: tuple[int, int], style: PoseMapStyle | None = None
 ) -> Tensor:
     """Draw the grippers of every time step into every camera.
 
     Args:
-        eef_poses: [..., T, 14] wrist poses [x,y,z,roll,pitch,yaw,g]x2, metres and radians, world frame.
+        poses: [..., T, arms, 7] flange poses [x, y, z, roll, pitch, yaw, gripper], metres and radians, world
+            frame;
+            gripper 0 open .. 1 closed, values beyond take the colour map's ends.
         c2w: [..., V, T, 4, 4] camera to world, OpenCV convention.
         intrinsic: [..., V, 3, 3] in pixels of `size`.
         size: (height, width) in pixels.
-        tool_offset: shorthand for `style` with this tool offset.
         style: how to draw.
 
     Returns:
@@ -86,61 +79,60 @@ def render_pose_map(
         ValueError: if shapes do not fit or poses are not finite.
     """
     style = style or PoseMapStyle()
-    offset = style.tool_offset if tool_offset is None else tool_offset
-    if eef_poses.shape[-1] != 14 or c2w.shape[-2:] != (4, 4) or intrinsic.shape[-2:] != (3, 3):
+    if poses.shape[-1] != 7 or c2w.shape[-2:] != (4, 4) or intrinsic.shape[-2:] != (3, 3):
         raise ValueError(
-            "pose map wants eef_poses [..., T, 14], c2w [..., V, T, 4, 4], intrinsic [..., V, 3, 3]; "
-            f"got {tuple(eef_poses.shape)}, {tuple(c2w.shape)}, {tuple(intrinsic.shape)}"
+            "pose map wants poses [..., T, arms, 7], c2w [..., V, T, 4, 4], intrinsic [..., V, 3, 3]; "
+            f"got {tuple(poses.shape)}, {tuple(c2w.shape)}, {tuple(intrinsic.shape)}"
         )
-    if eef_poses.shape[-2] != c2w.shape[-3] or c2w.shape[-4] != intrinsic.shape[-3]:
+    if poses.shape[-3] != c2w.shape[-3] or c2w.shape[-4] != intrinsic.shape[-3]:
         raise ValueError(
-            f"eef_poses has T={eef_poses.shape[-2]}, c2w V,T={tuple(c2w.shape[-4:-2])}, intrinsic V={intrinsic.shape[-3]}"
+            f"poses have T={poses.shape[-3]}, c2w V, T={tuple(c2w.shape[-4:-2])},"
+            f" intrinsic V={intrinsic.shape[-3]}"
         )
-    if not torch.isfinite(eef_poses).all() or not torch.isfinite(c2w).all():
-        raise ValueError("pose map: eef_poses or c2w hold NaN or infinite values")
-    lead, views, steps = c2w.shape[:-4], c2w.shape[-4], c2w.shape[-3]
-    pixels, radii, shades, visible = layout(eef_poses, c2w, intrinsic, size, offset, style)
+    if not torch.isfinite(poses).all() or not torch.isfinite(c2w).all():
+        raise ValueError("pose map: poses or c2w hold NaN or infinite values")
+    lead, views, steps, count = c2w.shape[:-4], c2w.shape[-4], c2w.shape[-3], poses.shape[-2]
+    pixels, radii, shades, visible = layout(poses, c2w, intrinsic, size, style)
     scale = size[0] / _REFERENCE_HEIGHT if style.scale is None else style.scale
     thickness = max(1, round(8 * scale))
-    count = int(np.prod(lead)) * views * steps
-    canvas = np.full((count, 3, *size), CANVAS, np.uint8)
+    total = int(np.prod(lead)) * views * steps
+    canvas = np.full((total, 3, *size), CANVAS, np.uint8)
     lut = arm_shades().tolist()
-    flat_pixels = pixels.reshape(count, 2, 4, 2).tolist()
-    flat_radii, flat_shades = radii.reshape(count, 2).tolist(), shades.reshape(count, 2).tolist()
-    flat_visible = visible.reshape(count, 2).tolist()
+    flat_pixels = pixels.reshape(total, count, 4, 2).tolist()
+    flat_radii, flat_shades = radii.reshape(total, count).tolist(), shades.reshape(total, count).tolist()
+    flat_visible = visible.reshape(total, count).tolist()
     circle, line = cv2.circle, cv2.line
-    for n in range(count):
-        planes, points, seen = canvas[n], flat_pixels[n], flat_visible[n]
-        arms = [arm for arm in (0, 1) if seen[arm]]
+    for n in range(total):
+        planes, points = canvas[n], flat_pixels[n]
+        arms = [arm for arm in range(count) if flat_visible[n][arm]]
         if not arms:
             continue
         for channel in range(3):
             plane = planes[channel]
             for arm in arms:
-                circle(plane, points[arm][0], flat_radii[n][arm], lut[arm][flat_shades[n][arm]][channel], -1)
+                shade = lut[arm % 2][flat_shades[n][arm]][channel]
+                circle(plane, points[arm][0], flat_radii[n][arm], shade, -1)
             for arm in arms:
                 origin = points[arm][0]
                 for axis in range(3):
-                    line(plane, origin, points[arm][axis + 1], AXIS_RGB[arm][axis][channel], thickness)
+                    line(plane, origin, points[arm][axis + 1], AXIS_RGB[arm % 2][axis][channel], thickness)
     return torch.from_numpy(canvas).reshape(*lead, views, steps, 3, *size)
 
 
 def layout(
-    eef_poses: Tensor,
-    c2w: Tensor,
-    intrinsic: Tensor,
-    size: tuple[int, int],
-    offset: float,
-    style: PoseMapStyle,
+    poses: Tensor, c2w: Tensor, intrinsic: Tensor, size: tuple[int, int], style: PoseMapStyle
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Integer pixels [..., V, T, 2, 4, 2] of origin and axis tips, radii, shade indices and visibility [...,
-    V, T, 2].
+    """Where things are drawn; arguments as of `render_pose_map`.
+
+    Returns:
+        Integer pixels [..., V, T, arms, 4, 2] of origin and axis tips, radii, shade indices and visibility
+        [..., V, T, arms].
     """
     height, width = size
-    wrist = eef_transforms(eef_poses.double())  # [..., T, 2, 4, 4]
-    origin = wrist[..., :3, 3] + offset * wrist[..., :3, 2]
+    wrist = pose_transforms(poses.double())  # [..., T, arms, 4, 4]
+    origin = wrist[..., :3, 3] + style.tool_offset * wrist[..., :3, 2]
     tips = origin.unsqueeze(-2) + _AXIS * wrist[..., :3, :3].transpose(-1, -2)  # rows are the axes
-    points = torch.cat((origin.unsqueeze(-2), tips), -2).unsqueeze(-5)  # [..., 1, T, 2, 4, 3]
+    points = torch.cat((origin.unsqueeze(-2), tips), -2).unsqueeze(-5)  # [..., 1, T, arms, 4, 3]
     # NumPy's float64 inverse and matrix products set the last bit, and truncation to int makes it visible.
     w2c = torch.linalg.inv(c2w.double()).unsqueeze(-3)  # [..., V, T, 1, 4, 4]
     camera = points @ w2c[..., :3, :3].transpose(-1, -2) + w2c[..., None, :3, 3]
@@ -161,7 +153,6 @@ def layout(
     law = 1 - distance - 0.07 / 0.73 if style.radius_law == "released" else 1 - (distance - 0.07) / 0.73
     scale = height / _REFERENCE_HEIGHT if style.scale is None else style.scale
     radii = (100 * scale * law.clamp(0, 1)).long()
-    low, high = style.gripper_range
-    closed = ((eef_poses.double()[..., [6, 13]] - low) / (high - low)).clamp(0, 1)
-    shades = (((closed * 85 + 35) / 120) * 256).long().clamp(0, 255).unsqueeze(-3).expand(radii.shape)
+    shades = (((poses.double()[..., 6] * 85 + 35) / 120) * 256).long().clamp(0, 255)
+    shades = shades.unsqueeze(-3).expand(radii.shape)
     return pixels.numpy(), radii.numpy(), shades.numpy(), visible.numpy()

@@ -1,0 +1,1 @@
+"""Rigid motions, pinhole cameras and forward kinematics."""

@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from envs.conditioning import PoseMapStyle, render_pose_map, render_ray_map
+from envs.conditioning import (
+    ActionVector,
+    PoseMapStyle,
+    end_effector_poses,
+    render_pose_map,
+    render_ray_map,
+)
+from envs.conditioning.pose_map import layout
+from envs.embodiment import EmbodimentError
+from tests.embodiments import EMBODIMENTS
 
 
 @pytest.fixture(scope="module")
@@ -17,10 +26,10 @@ def golden(shared: Path) -> dict[str, np.ndarray]:
 
 
 def test_pose_map_equals_the_public_one_in_every_pixel(golden: dict[str, np.ndarray]) -> None:
-    drawn = render_pose_map(
-        *(torch.from_numpy(golden[k]) for k in ("eef_poses", "c2w", "intrinsic")),
-        tool_offset=float(golden["gripper_offset"]),
-    )
+    poses = torch.from_numpy(golden["eef_poses"]).unflatten(-1, (2, 7))
+    c2w, intrinsic = torch.from_numpy(golden["c2w"]), torch.from_numpy(golden["intrinsic"])
+    style = PoseMapStyle(tool_offset=float(golden["gripper_offset"]))
+    drawn = render_pose_map(poses, c2w, intrinsic, (384, 512), style)
     assert np.array_equal(drawn.numpy(), golden["pose_map_uint8"].transpose(1, 2, 0, 3, 4))
 
 
@@ -32,7 +41,11 @@ def test_ray_map_equals_the_public_one(golden: dict[str, np.ndarray]) -> None:
 
 
 def scene(steps: int = 3) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    poses = torch.tensor([[0.0, 0.1, 0.5, 0, 0, 0, 0.0, 0.0, -0.1, 0.5, 0, 0, 0, 1.0]]).repeat(steps, 1)
+    poses = (
+        torch.tensor([[0.0, 0.1, 0.5, 0, 0, 0, 0.0, 0.0, -0.1, 0.5, 0, 0, 0, 1.0]])
+        .repeat(steps, 1)
+        .unflatten(-1, (2, 7))
+    )
     intrinsic = torch.tensor([[[60.0, 0, 32], [0, 60, 32], [0, 0, 1]]])
     c2w = torch.eye(4).expand(1, steps, 4, 4).clone()
     return poses, c2w, intrinsic
@@ -55,14 +68,16 @@ def test_batch_dimensions_and_any_size() -> None:
 def test_options_change_what_they_say() -> None:
     poses, c2w, intrinsic = scene(1)
     base = render_pose_map(poses, c2w, intrinsic, (64, 64))
-    assert not torch.equal(base, render_pose_map(poses, c2w, intrinsic, (64, 64), tool_offset=0.3))
+    assert not torch.equal(
+        base, render_pose_map(poses, c2w, intrinsic, (64, 64), PoseMapStyle(tool_offset=0.3))
+    )
     near = poses.clone()
-    near[:, [2, 9]] = 0.25
+    near[..., 2] = 0.25
     released = render_pose_map(near, c2w, intrinsic, (64, 64), style=PoseMapStyle(scale=0.3))
     paper = render_pose_map(near, c2w, intrinsic, (64, 64), style=PoseMapStyle(scale=0.3, radius_law="paper"))
     assert not torch.equal(released, paper)
     behind = poses.clone()
-    behind[:, [2, 9]] = -0.5
+    behind[..., 2] = -0.5
     culled = render_pose_map(behind, c2w, intrinsic, (64, 64), style=PoseMapStyle(cull_behind=True))
     assert bool((culled == 50).all())
     assert bool((render_pose_map(behind, c2w, intrinsic, (64, 64)) != 50).any())
@@ -70,11 +85,56 @@ def test_options_change_what_they_say() -> None:
 
 def test_bad_input_is_named() -> None:
     poses, c2w, intrinsic = scene()
-    with pytest.raises(ValueError, match="eef_poses"):
-        render_pose_map(poses[:, :13], c2w, intrinsic)
+    with pytest.raises(ValueError, match="arms, 7"):
+        render_pose_map(poses[..., :6], c2w, intrinsic, (64, 64))
     with pytest.raises(ValueError, match="NaN"):
-        render_pose_map(poses * float("nan"), c2w, intrinsic)
+        render_pose_map(poses * float("nan"), c2w, intrinsic, (64, 64))
     with pytest.raises(ValueError, match="T=2"):
-        render_pose_map(poses[:2], c2w, intrinsic)
+        render_pose_map(poses[:2], c2w, intrinsic, (64, 64))
     with pytest.raises(ValueError, match="radius_law"):
         PoseMapStyle(radius_law="round")
+
+
+@pytest.mark.parametrize("arms", [1, 3])
+def test_any_number_of_arms(arms: int) -> None:
+    poses, c2w, intrinsic = scene(1)
+    some = poses[:, :1].repeat(1, arms, 1)
+    some[..., 0] = torch.linspace(-0.1, 0.1, arms)
+    drawn = render_pose_map(some, c2w, intrinsic, (64, 64))
+    alone = render_pose_map(some[:, :1], c2w, intrinsic, (64, 64))
+    assert bool((drawn != 50).any()) and torch.equal(drawn, alone) == (arms == 1)
+
+
+def test_grippers_beyond_their_range_take_the_ends_of_the_colour_map() -> None:
+    poses, c2w, intrinsic = scene(1)
+    shades = []
+    for grip in (-1.0, -0.035, 0.0, 1.0, 1.5):
+        poses[..., 6] = grip
+        shades.append(layout(poses, c2w, intrinsic, (64, 64), PoseMapStyle())[2][0, 0, 0])
+    assert shades == [0, 68, 74, 255, 255]
+
+
+@pytest.mark.parametrize("name", sorted(EMBODIMENTS))
+def test_action_vectors_of_any_robot(name: str) -> None:
+    robot = EMBODIMENTS[name]
+    commands = torch.randn(5, 4, robot.action_dim) * 0.1 + 0.3
+    commands[..., 0] = 0.2  # never varies
+    vector = ActionVector(robot)
+    now = commands[:, 0]
+    vector.normalise(commands.flatten(0, 1), (commands - now[:, None]).flatten(0, 1))
+    told = vector(commands, now)
+    assert told.shape == (5, 4, vector.size) and torch.isfinite(told).all()
+    assert bool((told[..., 0] == 0).all()) and float(told[..., -1].std()) == pytest.approx(1.0, abs=0.15)
+
+
+def test_end_effector_poses_are_the_robots_own_affair() -> None:
+    for robot in EMBODIMENTS.values():
+        commands = torch.rand(3, robot.action_dim)
+        if robot.commands_poses and robot.kinematics is None:
+            poses = end_effector_poses(robot, commands)
+            assert poses.shape == (3, len(robot.arms), 7)
+            arm = robot.arms[-1]
+            assert torch.equal(poses[:, -1, :6], commands[:, list(arm.numbers)])
+        elif robot.kinematics is None:
+            with pytest.raises(EmbodimentError, match="simulator.pose_map=false"):
+                end_effector_poses(robot, commands)

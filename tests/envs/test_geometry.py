@@ -5,41 +5,53 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from envs import geometry
-from envs.physics import arms
+from scipy.spatial.transform import Rotation
+
+from envs.geometry.cameras import follow_wrists, on_plane, project, resize_intrinsics
+from envs.geometry.rotations import invert, pose_transforms, rpy_to_matrix
 
 
-def test_torch_and_numpy_rotations_agree() -> None:
+def test_rotations_are_scipys() -> None:
     angles = np.random.default_rng(0).uniform(-3, 3, (50, 3))
-    assert np.allclose(geometry.rpy_to_matrix(torch.from_numpy(angles)).numpy(), arms.rpy_to_matrix(angles))
+    wanted = Rotation.from_euler("xyz", angles).as_matrix()
+    assert np.allclose(rpy_to_matrix(torch.from_numpy(angles)).numpy(), wanted)
 
 
-def test_angles_come_back_near_where_they_were() -> None:
-    for rpy in np.random.default_rng(1).uniform(-1.5, 1.5, (50, 3)) + np.array([np.pi, 0, 0]):
-        assert np.allclose(arms.matrix_to_rpy(arms.rpy_to_matrix(rpy), rpy), rpy, atol=1e-9)
+def test_inverses_invert() -> None:
+    poses = torch.randn(20, 6, dtype=torch.float64)
+    moves = pose_transforms(poses)
+    assert torch.allclose(
+        moves @ invert(moves), torch.eye(4, dtype=torch.float64).expand(20, 4, 4), atol=1e-12
+    )
 
 
-def test_follow_hands_moves_only_wrist_cameras() -> None:
-    start = torch.zeros(14)
-    commands = torch.zeros(2, 14)
-    commands[1, 0], commands[1, 12] = 0.3, 0.5  # the left hand moves along x, the right one turns
+def test_wrist_cameras_follow_their_flange_and_others_stay() -> None:
+    start = torch.zeros(2, 7)
+    poses = torch.zeros(2, 2, 7)
+    poses[1, 0, 0], poses[1, 1, 5] = 0.3, 0.5  # the first arm moves along x, the second one turns
     c2w = torch.eye(4).repeat(3, 1, 1)
     c2w[1:, 0, 3] = 0.1
-    out = geometry.follow_hands(c2w, start, commands, geometry.hands_of(("head", "hand_left", "hand_right")))
+    out = follow_wrists(c2w, start, poses, (None, 0, 1))
     assert torch.allclose(out[0], c2w)
     assert torch.allclose(out[1, 0], c2w[0])
     assert torch.allclose(out[1, 1, :3, 3], torch.tensor([0.4, 0.0, 0.0]))
     assert torch.allclose(out[1, 2, :3, 3], torch.tensor([0.1 * np.cos(0.5), 0.1 * np.sin(0.5), 0.0]).float())
 
 
-def test_projection_is_the_inverse_of_on_plane() -> None:
-    from envs.geometry.cameras import on_plane
+def test_resized_pictures_show_the_same_point_at_the_same_share() -> None:
+    intrinsic = torch.tensor([[50.0, 0, 32], [0, 40, 24], [0, 0, 1]])
+    point = torch.tensor([0.2, -0.1, 1.5])
+    small = resize_intrinsics(intrinsic, (48, 64), (96, 96))
+    before, after = intrinsic @ point, small @ point
+    assert torch.allclose(before[:2] / before[2] / torch.tensor([64, 48]), after[:2] / after[2] / 96)
 
+
+def test_projection_is_the_inverse_of_on_plane() -> None:
     intrinsic = torch.tensor([[50.0, 0, 32], [0, 50, 32], [0, 0, 1]])
     c2w = torch.eye(4)
     c2w[:3, :3] = torch.tensor([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
     c2w[:3, 3] = torch.tensor([0.2, 0.0, 1.0])
     points = torch.tensor([[0.1, 0.2, 0.03], [0.3, -0.1, 0.03]])
-    pixels, depth = geometry.project(points, intrinsic, c2w)
+    pixels, depth = project(points, intrinsic, c2w)
     assert bool((depth > 0).all())
     assert torch.allclose(on_plane(pixels, 0.03, intrinsic, c2w), points, atol=1e-5)

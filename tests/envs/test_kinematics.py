@@ -8,22 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from envs.episodes import Episode
-from envs.geometry.cameras import rpy_to_matrix
-from envs.geometry.kinematics import Kinematics, KinematicsError, Robot
-from envs.layouts import JointLayout, Joints
-
-
-def test_flanges_are_where_the_bench_measured_them(episodes: list[Episode]) -> None:
-    episode = episodes[0]
-    poses = Kinematics().flanges(Joints(torch.from_numpy(episode.states), JointLayout.PER_ARM))
-    true = torch.from_numpy(episode.achieved)
-    for arm in (0, 7):
-        assert (poses[:, arm : arm + 3] - true[:, arm : arm + 3]).abs().max() < 2e-3
-        assert (
-            rpy_to_matrix(poses[:, arm + 3 : arm + 6]) - rpy_to_matrix(true[:, arm + 3 : arm + 6])
-        ).abs().max() < 2e-2
-    assert torch.allclose(poses[:, 6], torch.from_numpy(episode.states[:, 7]), atol=1e-6)
+from envs.embodiment import Robot
+from envs.geometry.kinematics import Kinematics, KinematicsError
 
 
 def _urdf(path: Path) -> Path:
@@ -50,18 +36,21 @@ def _urdf(path: Path) -> Path:
 
 def test_a_urdf_without_its_meshes(tmp_path: Path) -> None:
     names = tuple(tuple(f"joint{k}_{side}" for k in range(1, 8)) for side in "lr")
-    # type: ignore[arg-type]
     arms = Kinematics(Robot(str(_urdf(tmp_path / "two.urdf")), names, ("tool_l", "tool_r")))
-    turned = torch.zeros(2, 16)
-    turned[1, 0], turned[1, 15] = np.pi / 2, 0.7
-    poses = arms.flanges(Joints(turned, JointLayout.PER_ARM))
-    assert torch.allclose(poses[0, :6], torch.tensor([0.05, 0.2, 0.6, 0, 0, 0]), atol=1e-6)
-    assert torch.allclose(poses[1, :6], torch.tensor([0.0, 0.25, 0.6, 0, 0, np.pi / 2]), atol=1e-5)
-    assert poses[1, 13] == pytest.approx(0.7) and torch.allclose(poses[1, 7:13], poses[0, 7:13])
+    turned = torch.zeros(2, 7)
+    turned[1, 0] = np.pi / 2
+    poses = arms.flanges([turned, torch.zeros(2, 7)])
+    assert torch.allclose(poses[0, 0], torch.tensor([0.05, 0.2, 0.6, 0, 0, 0]), atol=1e-6)
+    assert torch.allclose(poses[1, 0], torch.tensor([0.0, 0.25, 0.6, 0, 0, np.pi / 2]), atol=1e-5)
+    assert torch.allclose(poses[1, 1], poses[0, 1])
+    with pytest.raises(KinematicsError, match="7 joints of arm 0"):
+        arms.flanges([turned[:, :6], turned])
+    one = Kinematics(Robot(str(tmp_path / "two.urdf"), names[1:], ("tool_r",)))
+    assert torch.allclose(one.flanges([torch.zeros(7)])[0], poses[0, 1])
     with pytest.raises(KinematicsError, match="no joint 'elbow'"):
         Kinematics(Robot(str(tmp_path / "two.urdf"), (("elbow",) * 7, names[1]), ("tool_l", "tool_r")))
     with pytest.raises(KinematicsError, match="no link or site 'hand'"):
-        Kinematics(Robot(str(tmp_path / "two.urdf"), names, ("hand", "tool_r")))  # type: ignore[arg-type]
+        Kinematics(Robot(str(tmp_path / "two.urdf"), names, ("hand", "tool_r")))
     with pytest.raises(KinematicsError, match="does not exist"):
         Kinematics(Robot(str(tmp_path / "none.urdf")))
     (tmp_path / "bad.urdf").write_text("<robot")

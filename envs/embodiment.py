@@ -1,0 +1,305 @@
+"""What a robot is, as data: the names and kinds of its action and state, its cameras, its rate.
+
+Every shape, head, encoder, transform, server and test is built from an `Embodiment`. It is written to and
+read from
+the `info.json` of a LeRobot v3.0 data set: feature names and shapes are most of it, the rest stands under the
+key
+"worldloop", which may be missing. Nothing here imports torch, so physics workers start fast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from enum import Enum
+from typing import Any
+
+INFO_KEY = "worldloop"  # of info.json, for what LeRobot has no place for
+IMAGE_PREFIX = "observation.images."
+
+
+class EmbodimentError(ValueError):
+    """A description of a robot contradicts itself or its data; the message names the key and the fix."""
+
+
+class ActionKind(str, Enum):
+    """What the numbers of an action are.
+
+    END_EFFECTOR: per arm a flange pose [x, y, z, roll, pitch, yaw] in metres and radians (or fewer of them),
+    and a gripper.
+    JOINTS: per arm joint positions in radians, and a gripper.
+    OTHER: numbers whose meaning is the robot's own affair.
+    """
+
+    END_EFFECTOR = "end_effector"
+    JOINTS = "joints"
+    OTHER = "other"
+
+
+@dataclass(frozen=True)
+class Arm:
+    """The part of an action that moves one arm.
+
+    Args:
+        name: such as "left".
+        numbers: positions of its pose or joints in the action vector, in order.
+        gripper: position of its gripper in the action vector, None without one.
+        gripper_range: the gripper's values when open and when closed.
+    """
+
+    name: str
+    numbers: tuple[int, ...]
+    gripper: int | None = None
+    gripper_range: tuple[float, float] = (0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera.
+
+    Args:
+        name: as in observation.images.<name>.
+        size: (height, width) in pixels, as recorded.
+        wrist: name of the arm it is mounted on; None if it stands still or moves by itself.
+        calibrated: whether intrinsics and camera-to-world poses are known.
+    """
+
+    name: str
+    size: tuple[int, int]
+    wrist: str | None = None
+    calibrated: bool = False
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot description file and the names in it, for forward kinematics of joint commands.
+
+    Args:
+        model: path of a URDF or MJCF file.
+        joints: per arm the names of its joints, in the action's order.
+        flanges: per arm the body (URDF link) or site whose pose is the end-effector pose.
+        held: joints that stand still, such as head and waist, and their values in radians.
+    """
+
+    model: str
+    joints: tuple[tuple[str, ...], ...]
+    flanges: tuple[str, ...]
+    held: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Embodiment:
+    """A robot as far as learning it needs to know.
+
+    Args:
+        robot: its name, LeRobot's `robot_type`.
+        action_names: a name for each of the A numbers of an action.
+        action_kind: what they are.
+        delta: whether an action is a change (of pose or joints) instead of a target.
+        arms: which numbers belong to which arm; () if unknown.
+        state_names: a name for each of the S numbers of observation.state.
+        cameras: V of them, in the order in which views are stacked.
+        fps: frames, and so actions, per second.
+        main_camera: name of the camera to look at first, where one must be chosen; "" is the first fixed one.
+        kinematics: of the robot, if known; makes end-effector poses of joint commands.
+
+    Raises:
+        EmbodimentError: if positions lie outside the action, or names are unknown or doubled.
+    """
+
+    robot: str
+    action_names: tuple[str, ...]
+    action_kind: ActionKind
+    delta: bool
+    arms: tuple[Arm, ...]
+    state_names: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    fps: float
+    main_camera: str = ""
+    kinematics: Robot | None = None
+
+    def __post_init__(self) -> None:
+        names = [camera.name for camera in self.cameras]
+        if not names or len(set(names)) != len(names):
+            raise EmbodimentError(f"{self.robot}: cameras {names} must be at least one, with different names")
+        if self.main_camera and self.main_camera not in names:
+            raise EmbodimentError(f"{self.robot}: main_camera={self.main_camera!r} is not one of {names}")
+        known = {arm.name for arm in self.arms}
+        for camera in self.cameras:
+            if camera.wrist is not None and camera.wrist not in known:
+                raise EmbodimentError(
+                    f"{self.robot}: camera {camera.name} is on the wrist of {camera.wrist!r}, arms are {known}"
+                )
+        for arm in self.arms:
+            used = [*arm.numbers, *([] if arm.gripper is None else [arm.gripper])]
+            if any(not 0 <= number < self.action_dim for number in used):
+                raise EmbodimentError(
+                    f"{self.robot}: arm {arm.name} uses numbers {used} of an action of {self.action_dim}"
+                )
+            if arm.gripper_range[0] == arm.gripper_range[1]:
+                raise EmbodimentError(
+                    f"{self.robot}: arm {arm.name} has gripper_range={arm.gripper_range}, which is empty"
+                )
+
+    # -- sizes
+    # -----------------------------------------------------------------------------------------------------
+    @property
+    def action_dim(self) -> int:
+        """Numbers of an action, A."""
+        return len(self.action_names)
+
+    @property
+    def state_dim(self) -> int:
+        """Numbers of observation.state, S."""
+        return len(self.state_names)
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of the cameras, in order."""
+        return tuple(camera.name for camera in self.cameras)
+
+    @property
+    def main_view(self) -> int:
+        """Position of the main camera."""
+        if self.main_camera:
+            return self.views.index(self.main_camera)
+        return next((k for k, camera in enumerate(self.cameras) if camera.wrist is None), 0)
+
+    @property
+    def wrists(self) -> tuple[int | None, ...]:
+        """Per camera the position of the arm it is mounted on, None where it stands still."""
+        arms = [arm.name for arm in self.arms]
+        return tuple(None if camera.wrist is None else arms.index(camera.wrist) for camera in self.cameras)
+
+    @property
+    def grippers(self) -> tuple[int, ...]:
+        """Positions of the grippers in the action vector."""
+        return tuple(arm.gripper for arm in self.arms if arm.gripper is not None)
+
+    # -- what it allows
+    # --------------------------------------------------------------------------------------------
+    @property
+    def calibrated(self) -> bool:
+        """Whether every camera is calibrated: ray maps can be made."""
+        return all(camera.calibrated for camera in self.cameras)
+
+    @property
+    def commands_poses(self) -> bool:
+        """Whether a command says, or kinematics tell, where every flange will be: pose maps can be drawn."""
+        if self.delta or not self.arms:
+            return False
+        if self.action_kind is ActionKind.END_EFFECTOR:
+            return all(len(arm.numbers) == 6 for arm in self.arms)
+        return self.action_kind is ActionKind.JOINTS and self.kinematics is not None
+
+    # -- LeRobot's info.json
+    # -----------------------------------------------------------------------------------------
+    def to_info(self) -> dict[str, Any]:
+        """What stands under INFO_KEY of info.json: all that feature names and shapes do not say."""
+        plain = asdict(self)
+        for known in ("robot", "action_names", "state_names", "fps"):
+            plain.pop(known)
+        plain["action_kind"] = self.action_kind.value
+        plain["cameras"] = {
+            camera.name: {"wrist": camera.wrist, "calibrated": camera.calibrated} for camera in self.cameras
+        }
+        return plain
+
+    @classmethod
+    def from_info(cls, info: Mapping[str, Any]) -> Embodiment:
+        """The robot that a LeRobot v3.0 data set was recorded with.
+
+        Args:
+            info: its info.json.
+
+        Raises:
+            EmbodimentError: naming the feature that is missing.
+        """
+        features = info["features"]
+        missing = [name for name in ("action", "observation.state") if name not in features]
+        cameras = [name for name in features if name.startswith(IMAGE_PREFIX)]
+        if not cameras:
+            missing.append(f"{IMAGE_PREFIX}*")
+        if missing:
+            raise EmbodimentError(
+                f"features {missing} are missing from info.json; Worldloop needs images, action and state"
+            )
+        own = dict(info.get(INFO_KEY, {}).get("embodiment", {}))
+        action, state = (feature_names(features[name]) for name in ("action", "observation.state"))
+        about = own.get("cameras", {})
+        arms = tuple(
+            Arm(a["name"], tuple(a["numbers"]), a["gripper"], tuple(a["gripper_range"]))
+            for a in own.get("arms", ())
+        )
+        views = []
+        for key in cameras:
+            name, shape = key[len(IMAGE_PREFIX) :], _image_size(features[key])
+            views.append(Camera(name, shape, **about.get(name, {})))
+        kind, delta = guess_action(action)
+        robot = own.get("kinematics")
+        return cls(
+            robot=str(info.get("robot_type") or "unknown"),
+            action_names=action,
+            action_kind=ActionKind(own.get("action_kind", kind)),
+            delta=bool(own.get("delta", delta)),
+            arms=arms,
+            state_names=state,
+            cameras=tuple(views),
+            fps=float(info["fps"]),
+            main_camera=own.get("main_camera", ""),
+            kinematics=None
+            if robot is None
+            else Robot(
+                robot["model"], tuple(map(tuple, robot["joints"])), tuple(robot["flanges"]), robot["held"]
+            ),
+        )
+
+    def at(self, size: tuple[int, int]) -> Embodiment:
+        """The same robot whose pictures are brought to one size (height, width)."""
+        return replace(self, cameras=tuple(replace(camera, size=size) for camera in self.cameras))
+
+    def differs(self, other: Embodiment) -> str:
+        """The first thing in which another robot's numbers or cameras mean something else, in words; "" if
+        nothing.
+        """
+        for name in ("action_names", "action_kind", "delta", "state_names", "views", "fps"):
+            mine, theirs = getattr(self, name), getattr(other, name)
+            if mine != theirs:
+                return f"{name} is {mine} of {self.robot}, but {theirs} of {other.robot}"
+        return ""
+
+
+def feature_names(feature: Mapping[str, Any]) -> tuple[str, ...]:
+    """A name for every number of a feature of info.json: LeRobot has lists, nested lists, and dictionaries of
+    lists.
+    """
+    (size,) = feature["shape"]
+    names = feature.get("names")
+    if isinstance(names, Mapping):  # {"motors": [...]} or {"axes": [...]}
+        names = [name for part in names.values() for name in part]
+    if names and isinstance(names[0], (list, tuple)):
+        names = [name for part in names for name in part]
+    if not names or len(names) != size:
+        return tuple(f"{k}" for k in range(size))
+    return tuple(str(name) for name in names)
+
+
+def guess_action(names: tuple[str, ...]) -> tuple[ActionKind, bool]:
+    """Kind of an action and whether it is a change, as far as its names tell; what they do not tell is OTHER."""
+    words = [name.lower() for name in names]
+    delta = any("delta" in word for word in words)
+    tails = {word.replace("delta", "").split(".")[-1].split("_")[-1] for word in words}
+    if {"x", "y", "z"} <= tails:
+        return ActionKind.END_EFFECTOR, delta
+    jointed = ("joint", "waist", "shoulder", "elbow", "wrist", "forearm", "motor", ".pos")
+    if sum(any(part in word for part in jointed) for word in words) > len(words) // 2:
+        return ActionKind.JOINTS, delta
+    return ActionKind.OTHER, delta
+
+
+def _image_size(feature: Mapping[str, Any]) -> tuple[int, int]:
+    """(height, width) of an image feature, whose shape may be [H, W, C] or [C, H, W]; `names` says which."""
+    shape, names = list(feature["shape"]), feature.get("names")
+    if names and names[0] in ("channel", "channels", "c"):
+        return shape[1], shape[2]
+    return shape[0], shape[1]

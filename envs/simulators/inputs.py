@@ -1,0 +1,57 @@
+"""Training inputs: the inputs of Simulator.predict for a chunk of a recorded clip."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from envs.specs import WorldSpec
+
+
+def build_inputs(
+    spec: WorldSpec,
+    clip: TensorDict,
+    number: int,
+    drawn: Tensor | None = None,
+    generator: torch.Generator | None = None,
+) -> TensorDict:
+    """The inputs of `predict` for chunk `number` of a training clip [B] (see episodes/clips.py).
+
+    Args:
+        drawn: uint8 [B, number * K, V, 3, H, W], the model's own frames of the chunks before; memory then
+            shows these
+            instead of true ones.
+        generator: draws the noise seeds; without one they are zero.
+    """
+    size = clip.shape
+    part = slice(number * spec.chunk, (number + 1) * spec.chunk)
+    maps = [name for name in ("pose_map", "c2w") if name in clip["future"].keys()]
+    memory = TensorDict(
+        {name: clip["memory", name][:, number] for name in ("frames", "commands", *maps)}, size
+    )
+    if drawn is not None:
+        rows = torch.arange(len(clip), device=clip.device)[:, None]
+        ahead = clip["memory", "index"][:, number] - clip["begin"][:, None] - 1
+        own = drawn[rows, ahead.clamp(min=0)]
+        memory["frames"] = torch.where((ahead >= 0)[..., None, None, None, None], own, memory["frames"])
+    if number == 0:
+        now = {"command": clip["now", "command"], "state": clip["now", "state"]}
+    else:
+        before = clip["future"][:, part.start - 1]
+        now = {"command": before["commands"], "state": before["states"]}
+    zero = torch.zeros(size, dtype=torch.int64)
+    seed = zero if generator is None else torch.randint(2**40, size, generator=generator)
+    inputs = TensorDict(
+        {
+            "memory": memory,
+            "future": TensorDict({name: clip["future", name][:, part] for name in ("commands", *maps)}, size),
+            "now": TensorDict(now, size),
+            "seed": seed.to(clip.device),
+            "chunk_index": zero.to(clip.device),
+        },
+        size,
+    )
+    if "intrinsic" in clip.keys():
+        inputs["intrinsic"] = clip["intrinsic"]
+    return inputs
