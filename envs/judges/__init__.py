@@ -1,4 +1,4 @@
-"""Who says "done": a learned judge over video, and the rule judge that knows the truth."""
+"""Judges: from video and an instruction to success and progress."""
 
 from envs.judges.base import Judge, Verdict
 from envs.judges.learned import LearnedJudge

@@ -1,4 +1,4 @@
-"""The contract of a judge, and how frame verdicts become an episode's success."""
+"""The contract of a judge (reward model), and how verdicts on frames become an episode's success."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from envs.specs import Status
 
 
 class Verdict(NamedTuple):
-    """success float32 [B, T] (probability in 0..1), progress float32 [B, T] in 0..1, status int64 [B]
-    (schema.Status).
+    """What a judge says of clips.
+
+    success float32 [B, T] in 0..1, the probability that the task is done in a frame; progress float32 [B, T]
+    in 0..1; status int64 [B] (specs.Status). Where the status is not OK the numbers mean nothing.
     """
 
     success: Tensor
@@ -21,50 +23,55 @@ class Verdict(NamedTuple):
 
 
 class Judge(nn.Module):
-    """Scores video against an instruction.
+    """Scores video against an instruction; subclasses implement `score`.
 
     Args:
-        threshold: frame probability from which a frame counts as success.
-        hold: frames in a row that must count before the episode does.
+        hold: frames in a row that must count as success before the episode does.
+        threshold: probability from which a frame counts as success; calibration sets it later.
+
+    Raises:
+        ValueError: if hold is less than one frame.
     """
 
     threshold: Tensor
 
-    def __init__(self, threshold: float = 0.5, hold: int = 4):
+    def __init__(self, hold: int, threshold: float = 0.5):
         super().__init__()
-        self.register_buffer("threshold", torch.tensor(threshold))
+        if hold < 1:
+            raise ValueError(f"judge.hold={hold} must be at least 1 frame")
         self.hold = hold
+        self.register_buffer("threshold", torch.tensor(threshold))
 
-    def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
+    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Verdict:
         """Judge clips.
 
         Args:
             frames: uint8 [B, T, V, 3, H, W].
-            first: uint8 [B, V, 3, H, W], the episode's first frame, in which everything can still be seen.
-            tokens: int64 [B, WORDS], the instruction (language.tokenize).
-            objects: float32 [B, T, 2, 4] true places of block and target (schema.OBJECT_DIM); only the rule
-                judge looks.
+            first: uint8 [B, V, 3, H, W], the first frame of each episode.
+            instruction: B texts.
         """
         raise NotImplementedError
 
-    def begin(self, frames: Tensor, first: Tensor, tokens: Tensor) -> Any:
-        """Hand clips over for a verdict that is fetched later with `end`; a judge in this process puts it off
-        until then.
-        """
-        return frames, first, tokens
+    def submit(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Any:
+        """Hand clips over (see `score`) and get a ticket for `fetch`.
 
-    def end(self, ticket: Any) -> Verdict:
-        """The verdict on what `begin` was given."""
+        A judge in another process works meanwhile; one in this process puts it off until then.
+        """
+        return frames, first, instruction
+
+    def fetch(self, ticket: Any) -> Verdict:
+        """The verdict on what `submit` was given."""
         return self.score(*ticket)
 
     def streak(self, success: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         """Whether `hold` frames in a row were successes by the end of each frame.
 
         Args:
-            success: [B, T] probabilities; before: int64 [B], the run of successes that precedes them.
+            success: [B, T] probabilities.
+            before: int64 [B], length of the run of successes that precedes them.
 
         Returns:
-            done bool [B, T] and the run at the end, int64 [B].
+            done bool [B, T], and the run at the end, int64 [B].
         """
         run, done = before, []
         for frame in (success >= self.threshold).unbind(1):
@@ -73,23 +80,13 @@ class Judge(nn.Module):
         return torch.stack(done, 1), run
 
     def episode(self, success: Tensor, valid: Tensor) -> Tensor:
-        """Episode success bool [B] from frame probabilities [B, T] and which frames exist [B, T]."""
+        """Episode success bool [B] from frame probabilities [B, T]; frames exist where valid [B, T]."""
         masked = torch.where(valid, success, 0.0)
         done, _ = self.streak(masked, torch.zeros(len(success), dtype=torch.int64, device=success.device))
         return done.any(1)
 
 
-def frame_labels(success: Tensor, hold: int) -> Tensor:
-    """Frame targets y_i = 1[i >= i_success], float32 [B, T], from the recorded success [B, T].
-
-    Recorded success turns true at the end of the hold; i_success is the first frame of that hold.
-    """
-    ever = success.cummax(-1).values.float()
-    ahead = torch.nn.functional.pad(ever, (0, hold - 1), mode="replicate") if ever.ndim > 1 else ever
-    return ahead[..., hold - 1 :]
-
-
-def ok_status(success: Tensor) -> Tensor:
-    """Status int64 [B]: ERROR where a probability is not finite, OK elsewhere."""
+def verdict_status(success: Tensor) -> Tensor:
+    """Status int64 [B] of probabilities [B, T]: ERROR where one is not finite, OK elsewhere."""
     bad = ~torch.isfinite(success).all(1)
     return torch.where(bad, Status.ERROR.value, Status.OK.value)

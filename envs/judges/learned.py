@@ -1,15 +1,7 @@
-"""The learned judge: every frame gets a success probability and a progress, given the episode's first frame
-and the instruction.
+"""The learned judge: each frame gets a success probability and a progress, from pixels and words alone.
 
-The first frame says where things were before an arm stood in front of them or a block lay upon the target.
-Whether
-it is done is a matter of millimetres between things, so some of the judge's key-points are taught to lie on
-them, as
-far as the data say where they are, and it looks closely there. How far they lie apart on the ground decides
-on
-success, and nothing else: whatever was learned beside it cost verdicts. Progress, and success where the data
-say
-nothing of places, take in all that is seen.
+The episode's first frame is shown beside each frame, because it says where things were before something moved
+or hid them (GE-Sim 2.0 judges video so, with a large vision-language model).
 """
 
 from __future__ import annotations
@@ -21,131 +13,104 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from envs.encoders import Gaze, PatchEncoder, WordEncoder, to_signed
-from envs.judges.base import Judge, Verdict, ok_status
-from envs.specs import Status
+from envs.encoders import MultiViewEncoder, to_signed
+from envs.judges.base import Judge, Verdict, verdict_status
+from envs.language import TextEncoder
+from envs.specs import Status, WorldSpec, text_to_bytes
+
+_AT_ONCE = 512  # frames per forward pass of `score`, so that long clips of many episodes fit into memory
 
 
 class LearnedJudge(Judge):
-    """Convolutional frame judge with a success and a progress head (GE-Sim 2.0's judge, at a small size).
+    """Convolutional frame judge with a success and a progress head.
 
     Args:
-        views: cameras per frame; the first is looked at closely, the others in passing.
+        spec: what frames show; any number of views of any size.
         hold: frames in a row that make an episode a success.
         margin: half-width of the band around the threshold in which a clip's best frame makes the judge
             abstain.
-        width, points: of the encoder of the first view.
-        aims: key-points that are taught to lie on the objects of the data, in their order; 0 where no gap
-            between things makes a success.
+        discount: per frame, of the progress target: discount ** (frames until success).
+        width: channels of the encoder at half resolution.
+        points: soft key-points of the encoder.
+        text: size of the encoded instruction.
+        hidden: width of the last layers.
     """
 
     def __init__(
         self,
-        views: int = 3,
-        hold: int = 4,
-        margin: float = 0.0,
-        width: int = 24,
-        points: int = 24,
-        aims: int = 2,
+        spec: WorldSpec,
+        hold: int,
+        margin: float,
+        discount: float,
+        width: int,
+        points: int,
+        text: int,
+        hidden: int,
     ):
-        super().__init__(0.5, hold)
-        self.margin, self.aims = margin, aims
-        self.main = Gaze(points, width, aims, pictures=2)
-        self.sides = nn.ModuleList(PatchEncoder(16, 8) for _ in range(views - 1))
-        self.words = WordEncoder(16)
-        self.apart = nn.Sequential(
-            nn.Linear(self.main.gaps + 16, 64), nn.SiLU(), nn.Linear(64, 64), nn.SiLU(), nn.Linear(64, 1)
-        )
-        self.look = nn.Sequential(
-            nn.Linear(self.main.out_features + 16 * views, 128),
+        super().__init__(hold)
+        self.spec, self.margin, self.discount = spec, margin, discount
+        self.encoder = MultiViewEncoder(spec, points, width, pictures=2)
+        self.words = TextEncoder(text)
+        self.head = nn.Sequential(
+            nn.Linear(self.encoder.out_features + text, hidden),
             nn.SiLU(),
-            nn.Linear(128, 128),
+            nn.Linear(hidden, hidden),
             nn.SiLU(),
-            nn.Linear(128, 1),
+            nn.Linear(hidden, 2),
         )
-        self.sharpness = nn.Parameter(torch.tensor([2.0]))  # FSDP2 takes no scalars
-        self.enough = nn.Linear(16, 1)
-        # Words say which two things it is about, not how near is near: that they learned from colours by
-        # heart.
-        self.pair = nn.Parameter(torch.zeros(16, self.main.gaps))
-        self.near = nn.Parameter(torch.ones(self.main.gaps))
-        self.strictness = nn.Parameter(torch.tensor([2.5]))
 
-    def forward(
-        self, frames: Tensor, first: Tensor, tokens: Tensor, generator: torch.Generator | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Logits of success and of progress, float32 [N], and where it sees the objects, at a first look and
-        closely, [N, 2, aims, 2] in half-pictures from the middle.
+    def forward(self, frames: Tensor, first: Tensor, text: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits of success and of progress, each float32 [N].
 
         Args:
-            frames, first: uint8 or float (-1..1) [N, V, 3, H, W]; tokens: int64 [N, WORDS].
-            generator: draws what is left out in training; see also CloseUp.
+            frames, first: [N, V, 3, H, W], uint8 or float in -1..1.
+            text: uint8 [N, TEXT_BYTES], the instructions (specs.text_to_bytes).
         """
-        pictures = to_signed(frames)
-        pair = torch.cat((pictures[:, 0], to_signed(first[:, 0])), 1)
-        seen, aimed = self.main(pair, generator)
-        parts = [seen, *(side(pictures[:, k + 1]) for k, side in enumerate(self.sides))]
-        words = self.words(tokens)
-        look = self.look(torch.cat([*parts, words], -1)).float()
-        # what is seen can be learned by heart: half of the time the gaps must do without it
-        if generator is not None:
-            look = look * (torch.rand((len(look), 1), generator=generator) < 0.5).to(look.device)
-        gaps = seen[:, seen.shape[1] - self.main.gaps :]
-        progress = (self.apart(torch.cat((gaps, words), -1)).float() + look)[:, 0]
-        # Success is progress beyond what the words call enough; progress is taught by every frame, and by
-        # centimetres only:
-        # taught by successes too, it saw things closer together than they are. Gaps are detached for the same
-        # reason.
-        success = self.sharpness * progress.detach() + self.enough(words)[:, 0].float()
-        if self.main.gaps:
-            nearer = ((words @ self.pair).softmax(-1) * (self.near - gaps.detach())).sum(-1).float()
-            success = torch.where(self.main.surveyed.all(), self.strictness.exp() * nearer, success)
-        return success, progress, aimed
+        seen = self.encoder(torch.cat((to_signed(frames), to_signed(first)), 2))
+        success, progress = self.head(torch.cat((seen, self.words(text)), -1)).float().unbind(-1)
+        return success, progress
 
     @torch.no_grad()
-    def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
-        """See Judge.score; `objects` is ignored."""
-        batch, count = frames.shape[:2]  # of the first frames only the first view is looked at
-        logit, progress, _ = self(
-            frames.flatten(0, 1), first[:, :1].repeat_interleave(count, 0), tokens.repeat_interleave(count, 0)
-        )
-        success = logit.sigmoid().unflatten(0, (batch, count))
-        status = ok_status(success)
-        if self.margin:
-            near = ((success.amax(1) - self.threshold).abs() < self.margin) & (status == Status.OK.value)
-            status = torch.where(near, Status.ABSTAIN.value, status)
-        return Verdict(success, progress.sigmoid().unflatten(0, (batch, count)), status)
+    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Verdict:
+        """See Judge.score; frames may lie on another device than the judge, which the verdict then lies on."""
+        batch, count = frames.shape[:2]
+        device, text = self.threshold.device, text_to_bytes(instruction)
+        rows = torch.arange(batch).repeat_interleave(count)
+        shown, parts = frames.flatten(0, 1), []
+        for number, some in enumerate(rows.split(_AT_ONCE)):
+            seen = shown[number * _AT_ONCE : number * _AT_ONCE + len(some)]
+            beside = first[some.to(first.device)]
+            parts.append(torch.stack(self(seen.to(device), beside.to(device), text[some].to(device))))
+        success, progress = torch.cat(parts, 1).sigmoid().to(frames.device).unflatten(1, (batch, count))
+        return Verdict(success, progress, self._status(success))
 
-    def loss(
-        self, data: TensorDict, share: float, generator: torch.Generator | None = None
-    ) -> tuple[Tensor, dict[str, Any]]:
-        """Class-balanced cross-entropy of success plus the absolute errors of progress and of where things
-        are seen.
+    def _status(self, success: Tensor) -> Tensor:
+        """Status [B] of probabilities [B, T]."""
+        status = verdict_status(success)
+        if not self.margin:
+            return status
+        near = (success.amax(1) - self.threshold.to(success.device)).abs() < self.margin
+        return torch.where(near & (status == Status.OK.value), Status.ABSTAIN.value, status)
+
+    def loss(self, data: TensorDict, share: float) -> tuple[Tensor, dict[str, Any]]:
+        """Class-balanced cross-entropy of success plus cross-entropy of progress.
 
         Args:
-            data: TensorDict [N] with frames, first and tokens as in `forward`, label float in {0, 1} and
-                progress float in 0..1, both NaN
-                where nobody knows, where float [aims, 2], half-pictures from the middle of the first view,
-                NaN where nobody knows, and
-                drill, pictures [2, 3, H, W] of the first view now and at first, with drilled [aims, 2], where
-                things are in them.
-            share: fraction of positive frames in the data, by which the classes are balanced.
-            generator: see `forward`.
+            data: TensorDict [N] with frames, first and text as in `forward`, label float32 in {0, 1} and
+                progress float32 in 0..1, both NaN where nobody labelled the episode: such frames teach
+                nothing.
+            share: fraction of successes among the labels, by which the classes are balanced.
         """
-        logit, towards, aimed = self(data["frames"], data["first"], data["tokens"], generator)
+        logit, nearing = self(data["frames"], data["first"], data["text"])
         known = torch.isfinite(data["label"])
         count, label = known.sum().clamp(min=1), torch.nan_to_num(data["label"])
         weight = torch.where(label > 0.5, 0.5 / max(share, 1e-3), 0.5 / max(1 - share, 1e-3)) * known
         success = (F.binary_cross_entropy_with_logits(logit, label, reduction="none") * weight).sum() / count
-        # Cross-entropy hardly minds a few hundredths of progress, which are the centimetre that decides.
-        shaped = ((towards.sigmoid() - torch.nan_to_num(data["progress"])).abs() * known).sum() / count
-        right = (((logit > 0) == (label > 0.5)) & known).sum() / count
-        off = Gaze.missed(aimed, data["where"])
-        more = self.main.drill(data["drill"].flatten(1, 2), data["drilled"], generator)
+        target = torch.nan_to_num(data["progress"])
+        shaped = F.binary_cross_entropy_with_logits(nearing, target, reduction="none") * known
         figures = {
             "success": success.detach(),
-            "frame_accuracy": right,
-            "progress_error": shaped.detach(),
-            "aim_error": off[1].detach(),
+            "frame_accuracy": (((logit > 0) == (label > 0.5)) & known).sum() / count,
+            "progress_error": ((nearing.detach().sigmoid() - target).abs() * known).sum() / count,
         }
-        return success + 10.0 * shaped + 48.0 * (off.sum() + more), figures
+        return success + shaped.sum() / count, figures

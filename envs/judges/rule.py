@@ -1,39 +1,31 @@
-"""The rule judge: the true distance between block and target, behind the interface of the learned one."""
+"""The judge that asks physics: a task suite's own success and progress as verdicts."""
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from envs.judges.base import Judge, Verdict, ok_status
-from envs.physics.tabletop.tasks import Push
+from envs.judges.base import Judge, Verdict, verdict_status
 
 
 class RuleJudge(Judge):
-    """Applies the task's own rule to true positions; can judge physics only.
+    """The verdict of a task suite itself; it can judge physics only, because no picture shows it.
 
     Args:
-        task: whose radius, hold and scale apply.
-        control_hz: frames per second.
+        hold: 1 where the suite counts the hold itself, as suites here do.
     """
 
-    def __init__(self, task: Push | None = None, control_hz: float = 10.0):
-        self.task = task or Push()
-        super().__init__(threshold=0.5, hold=max(1, round(self.task.hold * control_hz)))
-
-    def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
-        """See Judge.score.
+    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Verdict:
+        """Refused: see `verdict`.
 
         Raises:
-            ValueError: without true positions, as in imagination.
+            ValueError: always; generated video has no rule to ask.
         """
-        if objects is None:
-            raise ValueError(
-                "judge=rule needs true object positions, which only physics has; use judge=learned for imagined video"
-            )
-        distance = (objects[..., 0, :2] - objects[..., 1, :2]).norm(dim=-1)
-        success = (distance < self.task.radius).float()
-        progress = (1 - distance / self.task.scale).clamp(0, 1)
-        return Verdict(
-            success, progress, ok_status(torch.where(torch.isfinite(distance), success, torch.nan))
+        raise ValueError(
+            "judge=rule reads the task suite's own success and cannot judge pictures; use judge=learned for"
+            " generated video"
         )
+
+    def verdict(self, success: Tensor, progress: Tensor) -> Verdict:
+        """Verdicts on what PhysicsEnv says: success bool [B, T] and progress float32 [B, T] in 0..1."""
+        probability = success.float()
+        return Verdict(probability, progress.clamp(0, 1), verdict_status(progress + probability))

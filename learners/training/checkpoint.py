@@ -1,28 +1,29 @@
-"""Checkpoints as folders of torch.distributed.checkpoint: written by any number of workers, read by any other
-number.
+"""Checkpoints as folders of safetensors and JSON: written by any number of workers, read by any other number.
 
-A checkpoint is written beside its predecessor and renamed when it is whole, so a process killed at any
-moment, or a
-full disk, leaves the last good one.
+Nothing in them is code, so a checkpoint from anywhere can be read. A checkpoint is written beside its
+predecessor and renamed when it is whole, so a process killed at any moment, or a full disk, leaves the last
+good one. Workers that hold shards gather one tensor after the other; the leading one keeps them in main
+memory, a file at a time.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 import torch.distributed as dist
-import torch.distributed.checkpoint as dcp
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor, nn
-from torch.distributed.checkpoint.api import CheckpointException
+from torch.distributed.tensor import DTensor, distribute_tensor
 
-from learners.training.parallel import leads, workers
+from envs.files import atomic, write_text
+from learners.training.optimisers import optimiser_state
+from learners.training.parallel import leads, whole, workers
 
 
 class Checkpoints:
@@ -49,56 +50,46 @@ class Checkpoints:
 
         Args:
             step: names it; later ones are greater.
-            tensors: by name, nested as one likes; shards are written by the workers that hold them.
+            tensors: dictionaries of tensors, or of such dictionaries, by name; each becomes a file.
             facts: what JSON can hold.
 
         Raises:
             OSError: if it cannot be written, a full disk for example; the predecessor is kept.
         """
-        part, final = self.folder / ".checkpoint.part", self.folder / f"checkpoint-{step:09d}"
-        if leads():
-            shutil.rmtree(part, ignore_errors=True)
+        final = self.folder / f"checkpoint-{step:09d}"
         _wait()
-        try:
-            with warnings.catch_warnings():
-                # as it is meant to be
-                warnings.filterwarnings("ignore", message="torch.distributed is disabled")
-                dcp.save(dict(tensors), checkpoint_id=part, no_dist=workers() == 1)
-            if leads():
-                (part / "facts.json").write_text(json.dumps(dict(facts)))
-        except (OSError, RuntimeError, CheckpointException) as error:
-            shutil.rmtree(part, ignore_errors=True)
-            raise OSError(
-                f"cannot write {final}: {str(error).splitlines()[0]}; free disk space and start again, finished work is kept"
-            ) from error
         if leads():
             older = list(self.folder.glob("checkpoint-*"))
-            if final in older:  # of a run that was resumed from an earlier one
-                shutil.rmtree(final)
-            os.replace(part, final)
+            with atomic(final) as part:
+                part.mkdir()
+                for name, held in tensors.items():
+                    _write(part / f"{name}.safetensors", gathered(held))
+                (part / "facts.json").write_text(json.dumps(dict(facts)))
             for path in older:
                 if path != final:
                     shutil.rmtree(path)
+        else:
+            for held in tensors.values():
+                gathered(held)
         _wait()
 
     def load(self, tensors: Mapping[str, Any]) -> dict[str, Any] | None:
         """Fill these tensors in place from the newest checkpoint; returns its facts, None if there is none.
 
         Raises:
-            RuntimeError: if it belongs to another architecture.
+            RuntimeError: if it belongs to another architecture, or is damaged.
         """
         path = self.newest
         if path is None:
             return None
-        try:
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", message="torch.distributed is disabled")
-                dcp.load(dict(tensors), checkpoint_id=path, no_dist=workers() == 1)
-        except (CheckpointException, RuntimeError, ValueError, KeyError) as error:
-            last = str(error).strip().splitlines()[-1]
-            raise RuntimeError(
-                f"{path} belongs to another architecture: {last}. Remove the folder or restore the config."
-            ) from error
+        for name, held in tensors.items():
+            try:
+                _read(path / f"{name}.safetensors", held)
+            except (OSError, SafetensorError, ValueError) as error:
+                raise RuntimeError(
+                    f"{path} belongs to another architecture: {name}: {error}."
+                    " Remove the folder or restore the config."
+                ) from error
         return self.facts()
 
     def clear(self) -> None:
@@ -114,6 +105,64 @@ def _wait() -> None:
         dist.barrier()
 
 
+def _flat(tensors: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Tensor]]:
+    """Tensors of nested dictionaries, with names joined by slashes."""
+    for name, value in tensors.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}/")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def gathered(tensors: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Whole copies in main memory, by flat names; every worker must ask, only the leading one keeps them."""
+    out = {}
+    for name, value in _flat(tensors):
+        full = whole(value.detach())
+        if leads():
+            out[name] = full.cpu().contiguous().clone()
+    return out
+
+
+def _write(path: Path, tensors: dict[str, Tensor]) -> None:
+    try:
+        save_file(tensors, path)
+    except SafetensorError as error:  # what it says of a full disk
+        raise OSError(None, str(error).splitlines()[0]) from error
+
+
+def _read(path: Path, tensors: Mapping[str, Any]) -> None:
+    """Fill tensors, whole or sharded, from a file that holds exactly these names and shapes."""
+    wanted = dict(_flat(tensors))
+    with safe_open(path, framework="pt") as file:
+        known = set(file.keys())
+        odd = sorted(known ^ wanted.keys())
+        if odd:
+            raise ValueError(f"{odd[0]} is in only one of checkpoint and model")
+        for name, value in wanted.items():
+            saved = file.get_tensor(name)
+            if saved.shape != value.shape or saved.dtype != value.dtype:
+                raise ValueError(
+                    f"{name} is {saved.dtype} {list(saved.shape)},"
+                    f" the model has {value.dtype} {list(value.shape)}"
+                )
+            _fill(value, saved)
+
+
+@torch.no_grad()
+def _fill(value: Tensor, saved: Tensor) -> None:
+    if isinstance(
+        value, DTensor
+    ):  # every worker read the file, so each takes its own shard without a message
+        local = value.to_local()
+        shards = distribute_tensor(
+            saved.to(local.device), value.device_mesh, value.placements, src_data_rank=None
+        )
+        local.copy_(shards.to_local())
+    else:
+        value.copy_(saved)
+
+
 def buffers_of(module: nn.Module) -> dict[str, Tensor]:
     """The buffers that belong to a module's state, by name."""
     parameters = {name for name, _ in module.named_parameters(remove_duplicate=False)}
@@ -125,31 +174,15 @@ def buffers_of(module: nn.Module) -> dict[str, Tensor]:
 def adam_moments(
     optimiser: torch.optim.Optimizer, parameters: Mapping[str, nn.Parameter]
 ) -> dict[str, dict[str, Tensor]]:
-    """The state of an Adam by the parameters' names, zero where it has not begun; what is filled in there is
-    what it goes on with.
-    """
-    out = {}
-    for name, parameter in parameters.items():
-        if parameter.requires_grad:
-            state = optimiser.state[parameter]
-            if not state:
-                fused = optimiser.defaults.get("fused")
-                state["step"] = torch.zeros(
-                    (), dtype=torch.float32, device=parameter.device if fused else "cpu"
-                )
-                state["exp_avg"], state["exp_avg_sq"] = (
-                    torch.zeros_like(parameter),
-                    torch.zeros_like(parameter),
-                )
-            out[name] = dict(state)
-    return out
+    """The state of one Adam by the parameters' names; see optimisers.optimiser_state."""
+    return optimiser_state([optimiser], parameters)
 
 
 def truncate_log(log: Path, step: int) -> None:
-    """Drop log rows of steps that will be run again, and the half-written one that a killed process leaves."""
+    """Drop log rows of steps that will run again, and the half-written one that a killed process leaves."""
     if log.exists():
         lines = log.read_text()
         rows = [
             line for line in lines[: lines.rfind("\n") + 1].splitlines() if json.loads(line)["step"] < step
         ]
-        log.write_text("".join(row + "\n" for row in rows))
+        write_text(log, "".join(row + "\n" for row in rows))

@@ -11,17 +11,20 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 from tqdm import tqdm
 
 from envs.precision import mixed_precision
-from learners.training.checkpoint import Checkpoints, adam_moments, buffers_of, truncate_log
+from envs.rng import step_generator
+from learners.training.checkpoint import Checkpoints, buffers_of, truncate_log
+from learners.training.optimisers import OPTIMISERS, optimiser_state
 from learners.training.parallel import Trainee, averaged, clip_gradients, leads, local, my_share, twin
 
 Batch = Callable[[int, torch.Generator], Any]
@@ -39,7 +42,7 @@ class FitConfig:
         steps: optimiser steps in all.
         batch: samples per step.
         lr: peak learning rate; warms up over `warmup` steps and falls by a cosine to a twentieth.
-        weight_decay: of AdamW, on matrices only.
+        weight_decay: decoupled, of matrices and convolutions only.
         ema: decay of the weights' moving average, 0 for none; the average is what a stage hands on.
         clip: largest gradient norm.
         bf16: run forward passes in bfloat16 where the device computes in it.
@@ -47,6 +50,10 @@ class FitConfig:
         seed: of batches and noise.
         microbatches: parts a batch is cut into, each with a backward pass of its own, to save memory or to be
             shared out to workers.
+        optimiser: a name in optimisers.OPTIMISERS: "adamw" or "muon".
+
+    Raises:
+        ValueError: if batch is no multiple of microbatches, or the optimiser is unknown.
     """
 
     steps: int
@@ -60,22 +67,18 @@ class FitConfig:
     checkpoint_every: int = 200
     seed: int = 0
     microbatches: int = 1
+    optimiser: str = "adamw"
 
     def __post_init__(self) -> None:
         if self.microbatches < 1 or self.batch % self.microbatches:
             raise ValueError(f"batch={self.batch} must be a multiple of microbatches={self.microbatches}")
+        if self.optimiser not in OPTIMISERS:
+            raise ValueError(f"optimiser={self.optimiser} must be one of {sorted(OPTIMISERS)}")
 
     @property
     def part(self) -> int:
         """Samples of a microbatch."""
         return self.batch // self.microbatches
-
-
-def step_generator(seed: int, step: int, part: int = 0) -> torch.Generator:
-    """The generator of one microbatch; equal seeds, steps and parts give equal numbers wherever and whenever."""
-    return torch.Generator().manual_seed(
-        (seed * 1_000_003 + step + part * 7_368_787_000_003) & 0x7FFF_FFFF_FFFF
-    )
 
 
 def _rate(config: FitConfig, step: int) -> float:
@@ -115,11 +118,7 @@ def fit(
     device = next(module.parameters()).device
     trainee, mine = Trainee(module), my_share(config.microbatches)
     trained = trainee.trained
-    groups = [
-        {"params": [p for p in trained.values() if p.ndim >= 2], "weight_decay": config.weight_decay},
-        {"params": [p for p in trained.values() if p.ndim < 2], "weight_decay": 0.0},
-    ]
-    optimiser = torch.optim.AdamW(groups, lr=config.lr, betas=(0.9, 0.99), fused=True)
+    optimisers = OPTIMISERS[config.optimiser](trained, config.lr, config.weight_decay)
     average = twin(trained)
     first, spent = 0, {"data": 0.0, "compute": 0.0}
 
@@ -128,7 +127,7 @@ def fit(
             "module": trainee.parameters,
             "buffers": buffers_of(module),
             "average": average,
-            "optimiser": adam_moments(optimiser, trained),
+            "optimiser": optimiser_state(optimisers, trained),
         }
 
     if checkpoints.newest is not None:
@@ -151,9 +150,10 @@ def fit(
     with (log if leads() else Path(os.devnull)).open("a") as stream:
         for step in range(first, config.steps):
             began, waited = time.perf_counter(), 0.0
-            for group in optimiser.param_groups:
-                group["lr"] = _rate(config, step)
-            optimiser.zero_grad(set_to_none=True)
+            for optimiser in optimisers:
+                for group in optimiser.param_groups:
+                    group["lr"] = _rate(config, step)
+                optimiser.zero_grad(set_to_none=True)
             rows = []
             for part in mine:
                 generator, asked = step_generator(config.seed, step, part), time.perf_counter()
@@ -171,15 +171,12 @@ def fit(
             figure = figures.pop("loss")
             if not math.isfinite(norm) or not math.isfinite(figure):
                 raise TrainingDiverged(
-                    f"{name}: loss {figure:.4g}, gradient norm {norm:.4g} at step {step}; lower {name}.lr or switch {name}.bf16 off"
+                    f"{name}: loss {figure:.4g}, gradient norm {norm:.4g} at step {step}; lower {name}.lr or"
+                    f" switch {name}.bf16 off"
                 )
-            optimiser.step()
-            decay = min(config.ema, (1 + step) / (10 + step))
-            torch._foreach_lerp_(
-                [local(value) for value in average.values()],
-                [local(p.detach()) for p in trained.values()],
-                1.0 - decay,
-            )
+            for optimiser in optimisers:
+                optimiser.step()
+            follow(average, trained, min(config.ema, (1 + step) / (10 + step)))
             took = time.perf_counter() - began
             spent["data"] += waited
             spent["compute"] += took - waited
@@ -188,7 +185,7 @@ def fit(
                 "step": step,
                 f"{name}/loss": figure,
                 f"{name}/grad_norm": norm,
-                f"{name}/lr": optimiser.param_groups[0]["lr"],
+                f"{name}/lr": _rate(config, step),
             }
             stream.write(json.dumps(row | {f"{name}/{key}": item for key, item in figures.items()}) + "\n")
             bar.update()
@@ -211,6 +208,17 @@ def fit(
         **{f"{key}_seconds": value for key, value in spent.items()},
         "loss": smooth if smooth is not None else math.nan,
     }
+
+
+def follow(average: Mapping[str, Tensor], trained: Mapping[str, Tensor], decay: float) -> None:
+    """Move an exponential moving average of weights one step on, in place, by torch's own rule.
+
+    swa_utils.AveragedModel copies the whole module for this; of a module in shards, or of one most of whose
+    weights are frozen, only the shards of those that learn are to be held twice, so its rule is used without
+    it.
+    """
+    update = get_ema_multi_avg_fn(decay)
+    update([local(value) for value in average.values()], [local(p.detach()) for p in trained.values()], 0)
 
 
 def _announce(name: str, steps: int, seconds: float) -> None:

@@ -1,5 +1,5 @@
-"""Low-rank adaptation of a transformer (Hu et al. 2021) by peft: few weights learn, and are folded into the
-rest at the end.
+"""Low-rank adaptation of transformers (Hu et al. 2021) by peft: few weights learn, and are folded in at the
+end.
 """
 
 from __future__ import annotations
@@ -14,21 +14,33 @@ TARGETS = ("to_q", "to_k", "to_v", "to_out.0", "ff.net.0.proj", "ff.net.2")
 
 
 @contextmanager
-def low_rank(net: nn.Module, rank: int) -> Iterator[None]:
-    """Within it only adapters of `net` learn; after it they are part of its weights, under their old names.
-    Rank 0 does nothing.
+def low_rank(module: nn.Module, rank: int) -> Iterator[None]:
+    """Within it only adapters of a module's projections learn; after it they are part of its weights.
 
-    An exception leaves the adapters where they are: what follows is a new process that resumes from a
-    checkpoint.
+    Names of parameters are the old ones again afterwards. Rank 0 leaves all weights to learn. An exception
+    leaves
+    the adapters where they are: what follows is a new process that resumes from a checkpoint.
+
+    Args:
+        module: with projections that are named as in TARGETS.
+        rank: of the adapters.
+
+    Raises:
+        ValueError: if the module has no such projections.
     """
     if not rank:
         yield
         return
+    if not any(name.endswith(TARGETS) for name, _ in module.named_modules()):
+        raise ValueError(
+            f"lora={rank} adapts the projections of transformers, and {type(module).__name__} has none;"
+            " set lora=0 to train all weights"
+        )
     from peft import LoraConfig, LoraModel  # transformers come with it, which take seconds to import
 
-    wanted = {name: parameter.requires_grad for name, parameter in net.named_parameters()}
-    adapted = LoraModel(net, LoraConfig(r=rank, lora_alpha=rank, target_modules=list(TARGETS)), "default")
+    wanted = {name: parameter.requires_grad for name, parameter in module.named_parameters()}
+    adapted = LoraModel(module, LoraConfig(r=rank, lora_alpha=rank, target_modules=list(TARGETS)), "default")
     yield
     adapted.merge_and_unload()
-    for name, parameter in net.named_parameters():
+    for name, parameter in module.named_parameters():
         parameter.requires_grad_(wanted[name])

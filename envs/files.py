@@ -1,0 +1,69 @@
+"""Files that are either whole or not there: written beside their place and renamed into it.
+
+A process killed at any moment, or a full disk, leaves the previous file as it was.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[Path]:
+    """A neighbour of `path` to write a file or a folder to; it takes the path's place when the block ends.
+
+    Folders above are made. A folder that stands at `path` is removed first.
+
+    Raises:
+        OSError: if it cannot be written, naming the path and the fix; what stood there is kept.
+    """
+    path = Path(path)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        remove(part)
+        yield part
+        if part.is_dir() and path.is_dir():
+            shutil.rmtree(path)
+        os.replace(part, path)
+    except OSError as error:
+        with suppress(OSError):
+            remove(part)
+        reason = error.strerror or str(error)
+        raise OSError(
+            error.errno,
+            f"cannot write {path}: {reason}; free disk space or make the folder writable, and start again:"
+            " finished work is kept",
+        ) from error
+    except BaseException:
+        remove(part)
+        raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all; see `atomic`."""
+    with atomic(path) as part:
+        part.write_text(text)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write what JSON can hold, whole or not at all; see `atomic`.
+
+    Raises:
+        ValueError: for NaN and infinite numbers, which JSON does not know.
+    """
+    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a folder, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

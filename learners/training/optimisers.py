@@ -1,0 +1,83 @@
+"""Which optimiser moves which parameters, and its state as named tensors for checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim import AdamW, Muon, Optimizer
+
+Parameters = Mapping[str, nn.Parameter]
+
+
+def adamw(trained: Parameters, lr: float, weight_decay: float) -> list[Optimizer]:
+    """AdamW (Loshchilov & Hutter 2019) on all; norms, biases and other vectors do not decay."""
+    groups = [
+        {"params": [p for p in trained.values() if p.ndim >= 2], "weight_decay": weight_decay},
+        {"params": [p for p in trained.values() if p.ndim < 2], "weight_decay": 0.0},
+    ]
+    return [AdamW([group for group in groups if group["params"]], lr=lr, betas=(0.9, 0.99), fused=True)]
+
+
+def muon(trained: Parameters, lr: float, weight_decay: float) -> list[Optimizer]:
+    """Muon (Jordan et al. 2024) on matrices, AdamW on everything else, at one learning rate.
+
+    Muon's steps are scaled to the size that AdamW's have (Liu et al. 2025), so a rate that suits one suits
+    both.
+    """
+    matrices = orthogonalised(trained)
+    rest = {name: p for name, p in trained.items() if name not in matrices}
+    out: list[Optimizer] = []
+    if matrices:
+        out.append(
+            Muon(list(matrices.values()), lr=lr, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
+        )
+    return out + (adamw(rest, lr, weight_decay) if rest else [])
+
+
+def orthogonalised(trained: Parameters) -> dict[str, nn.Parameter]:
+    """The parameters whose steps Muon makes orthogonal: those that are matrices."""
+    return {name: p for name, p in trained.items() if p.ndim == 2}
+
+
+OPTIMISERS: dict[str, Callable[[Parameters, float, float], list[Optimizer]]] = {"adamw": adamw, "muon": muon}
+
+
+def optimiser_state(optimisers: Sequence[Optimizer], trained: Parameters) -> dict[str, dict[str, Tensor]]:
+    """The state of optimisers by the parameters' names, made zero where it has not begun.
+
+    The tensors are the optimisers' own: whatever is filled in there is what they go on with.
+    """
+    names = {id(parameter): name for name, parameter in trained.items()}
+    out: dict[str, dict[str, Tensor]] = {}
+    for optimiser in optimisers:
+        begin = _BEGIN[type(optimiser)]
+        for group in optimiser.param_groups:
+            for parameter in group["params"]:
+                state = optimiser.state[parameter]
+                if not state:
+                    state.update(begin(parameter, optimiser.defaults))
+                out[names[id(parameter)]] = dict(state)
+    return out
+
+
+def _adam(parameter: nn.Parameter, defaults: Mapping[str, Any]) -> dict[str, Tensor]:
+    device = parameter.device if defaults.get("fused") else torch.device("cpu")
+    return {
+        "step": torch.zeros((), dtype=torch.float32, device=device),
+        "exp_avg": torch.zeros_like(parameter),
+        "exp_avg_sq": torch.zeros_like(parameter),
+    }
+
+
+def _muon(parameter: nn.Parameter, defaults: Mapping[str, Any]) -> dict[str, Tensor]:
+    return {"momentum_buffer": torch.zeros_like(parameter)}
+
+
+_BEGIN: dict[type[Optimizer], Callable[[nn.Parameter, Mapping[str, Any]], dict[str, Tensor]]] = {
+    torch.optim.Adam: _adam,
+    AdamW: _adam,
+    Muon: _muon,
+}

@@ -1,0 +1,38 @@
+"""Atomic writes: whole or not at all, with an error that names the file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from envs.files import atomic, write_json, write_text
+
+
+def test_what_stood_there_stays_until_the_new_file_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "a.txt"
+    write_text(path, "old")
+    with pytest.raises(KeyboardInterrupt), atomic(path) as part:
+        part.write_text("half")
+        raise KeyboardInterrupt
+    assert path.read_text() == "old" and list(path.parent.iterdir()) == [path]
+    write_text(path, "new")
+    assert path.read_text() == "new"
+
+
+def test_a_folder_replaces_a_folder(tmp_path: Path) -> None:
+    path = tmp_path / "artefact"
+    for name in ("one", "two"):
+        with atomic(path) as part:
+            part.mkdir()
+            (part / name).touch()
+    assert [child.name for child in path.iterdir()] == ["two"]
+
+
+def test_errors_name_the_file_and_the_fix(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match=r"cannot write .*file/below.*free disk space"):
+        write_text(tmp_path / "file" / "below", "")
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "a.json", {"loss": float("nan")})
+    assert not (tmp_path / "a.json").exists()
