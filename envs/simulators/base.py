@@ -9,14 +9,27 @@ index).
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from envs.rng import noise_generator
 from envs.simulators import memory
 from envs.specs import WorldSpec
+
+__all__ = ["WORLD_OPTIONS", "Simulator", "noise_generator", "to_bytes"]
+
+# Keys of a simulator's config section that belong to the world around an engine, not to the engine.
+WORLD_OPTIONS = (
+    "pose_map",
+    "ray_map",
+    "pose_map_style",
+    "kinematics",
+    "shared_noise",
+    "bf16",
+    "state_expert",
+    "tokenizer",
+)
 
 
 class Simulator(nn.Module):
@@ -35,6 +48,12 @@ class Simulator(nn.Module):
     def __init__(self, spec: WorldSpec, memory_frames: int):
         super().__init__()
         self.spec, self.memory_frames = spec, memory_frames
+
+    @property
+    def device(self) -> torch.device:
+        """Where its tensors are; the CPU, if it has none."""
+        tensor = next((value for value in (*self.parameters(), *self.buffers())), None)
+        return torch.device("cpu") if tensor is None else tensor.device
 
     # -- what an engine gives
     # ----------------------------------------------------------------------------------------
@@ -118,11 +137,6 @@ class Simulator(nn.Module):
     def __repr__(self) -> str:
         """Class and size; the modules in it would fill a screen."""
         return f"{type(self).__name__}({sum(p.numel() for p in self.parameters()):,} parameters)"
-
-
-def noise_generator(seed: int, chunk_index: int) -> torch.Generator:
-    """The generator of all randomness of one chunk of one session, whatever batch it is in."""
-    return torch.Generator().manual_seed((int(seed) * 1_000_003 + int(chunk_index)) & 0x7FFF_FFFF_FFFF)
 
 
 def to_bytes(frames: Tensor) -> Tensor:

@@ -22,8 +22,8 @@ _MEMORY = ("frames", "commands", "pose_map", "c2w")
 
 
 def memory_indices(length: Tensor, count: int) -> Tensor:
-    """Frames to remember out of the first `length` [...]: `count`, evenly spread, first and last included
-    [..., count].
+    """Which `count` of the first `length` [...] frames to remember, [..., count]: evenly spread, both ends
+    included.
     """
     share = torch.linspace(0, 1, count, dtype=torch.float64, device=length.device)
     return ((length.unsqueeze(-1) - 1) * share).round().long()
@@ -48,7 +48,7 @@ def new_sessions(first: TensorDict, seed: Tensor, capacity: int = 1) -> TensorDi
 
 
 def recall(state: TensorDict, count: int) -> TensorDict:
-    """`count` remembered frames with all that belongs to them, [B, M, ...], evenly spread and with the first."""
+    """`count` remembered frames and what belongs to them, [B, M, ...], evenly spread, the first included."""
     history = state["history"]
     known = history.select(*(name for name in _MEMORY if name in history.keys()))
     return known[_rows(state), memory_indices(state["length"], count)]

@@ -1,33 +1,39 @@
-"""What turns a bare WorldEnv into an environment for policies: conditioning, proprioception, reward."""
+"""What turns a bare WorldEnv into an environment for policies: action decoding, the robot's state, reward."""
 
 from torchrl.envs import Compose
 
 from envs.conditioning import PoseMapStyle
 from envs.geometry.kinematics import Kinematics
-from envs.judges import Judge
+from envs.judges.base import Judge
 from envs.simulators.state_experts.base import StateDecoder
-from envs.specs import Rewards
+from envs.specs import Rewards, WorldSpec
+from envs.transforms.action_decoding import ActionDecoding
 from envs.transforms.judge_reward import JudgeReward
-from envs.transforms.pose_map import PoseMapTransform
 from envs.transforms.state_expert import StateExpertTransform
 
-__all__ = ["JudgeReward", "PoseMapTransform", "StateExpertTransform", "world_transforms"]
+__all__ = ["ActionDecoding", "JudgeReward", "StateExpertTransform", "world_transforms"]
 
 
 def world_transforms(
+    spec: WorldSpec,
     decoder: StateDecoder,
     judge: Judge,
     rewards: Rewards,
-    views: tuple[str, ...],
+    *,
     later: bool = False,
     style: PoseMapStyle | None = None,
     kinematics: Kinematics | None = None,
 ) -> Compose:
-    """The three transforms in their order: commands to pose maps going in, joint states and rewards coming
-    out, the latter at once or `later`.
+    """The three transforms in their order: chunks to conditioned commands going in, states and rewards coming
+    out.
+
+    Args:
+        later: rewards arrive after the episode, see JudgeReward.
+        style: how pose maps are drawn; must be that of training.
+        kinematics: of the robot, for pose maps of joint commands.
     """
     return Compose(
-        PoseMapTransform(views, style, kinematics),
+        ActionDecoding(spec, style, kinematics),
         StateExpertTransform(decoder),
         JudgeReward(judge, rewards, later),
     )

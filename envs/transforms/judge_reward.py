@@ -11,8 +11,8 @@ from tensordict import TensorDictBase
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from envs.judges import Judge, Verdict
-from envs.specs import FEATURES, FRAMES, IMAGE, JUDGE_STATUS, PROGRESS, SUCCESS, TOKENS, Rewards, Status
+from envs.judges.base import Judge, Verdict
+from envs.specs import FEATURES, FRAMES, IMAGE, JUDGE_STATUS, PROGRESS, SUCCESS, Rewards, Status
 
 
 class JudgeReward(Transform):
@@ -39,11 +39,11 @@ class JudgeReward(Transform):
         self._first = torch.zeros(0, dtype=torch.uint8)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        clips = (next_tensordict[FRAMES], self._first, tensordict[TOKENS])
+        clips = (next_tensordict[FRAMES], self._first, self.parent.base_env.instructions)
         if self.later:
             if not self._tickets:
                 self._opening = self._progress
-            self._tickets.append(self.judge.begin(*clips))
+            self._tickets.append(self.judge.submit(*clips))
             nothing = torch.zeros_like(self._progress)
             next_tensordict["reward"], next_tensordict[SUCCESS], next_tensordict[PROGRESS] = (
                 nothing,
@@ -64,13 +64,14 @@ class JudgeReward(Transform):
         tickets, self._tickets = self._tickets, []
         if len(tickets) != batch.shape[1]:
             raise RuntimeError(
-                f"{len(tickets)} chunks were handed to the judge, the rollout holds {batch.shape[1]}; settle each rollout before the next begins"
+                f"{len(tickets)} chunks were handed to the judge, the rollout holds {batch.shape[1]};"
+                " settle each rollout before the next begins"
             )
         # By now the collector has begun the next episodes; these begin where theirs did.
         self._run, self._progress = torch.zeros_like(self._run), self._opening
         for number, ticket in enumerate(tickets):
             after = batch["next"][:, number]
-            self._decide(self.judge.end(ticket), after)
+            self._decide(self.judge.fetch(ticket), after)
             batch["next"][:, number] = after
 
     def _decide(self, verdict: Verdict, next_tensordict: TensorDictBase) -> None:
@@ -92,7 +93,7 @@ class JudgeReward(Transform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         mask = tensordict.get("_reset", None)
         image = tensordict_reset[IMAGE]
-        progress = self.judge.score(image.unsqueeze(1), image, tensordict_reset[TOKENS]).progress
+        progress = self.judge.score(image.unsqueeze(1), image, self.parent.base_env.instructions).progress
         if mask is None or self._run.shape[0] != progress.shape[0]:
             self._run = torch.zeros(progress.shape[0], dtype=torch.int64, device=progress.device)
             self._progress, self._first = progress, image.clone()

@@ -1,4 +1,6 @@
-"""The forward path's first half: joint states decoded from the simulator's features, for the policy to see."""
+"""The forward path's first half: the robot's state decoded from the simulator's features, for the policy to
+see.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ from envs.specs import FEATURES, STATE
 
 
 class StateExpertTransform(Transform):
-    """Writes the decoded joint state of the last frame, and remembers all of the chunk's in the session.
+    """Writes the decoded state of the last frame, and keeps all of the chunk's in the session.
 
     Args:
         decoder: trained on the simulator whose features it reads.
@@ -24,7 +26,7 @@ class StateExpertTransform(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         world = self.parent.base_env
         with torch.no_grad():
-            states = self.decoder.follow(world.simulator, world.session, next_tensordict[FEATURES])
+            states = self.decoder.follow(world.session, world.chunk, next_tensordict[FEATURES])
         next_tensordict[STATE] = states[:, -1]
         return next_tensordict
 

@@ -1,0 +1,1 @@
+"""State experts: the robot's state, read off a simulator's features."""

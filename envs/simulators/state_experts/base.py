@@ -1,4 +1,4 @@
-"""The contract of what decodes joint states from a simulator's features."""
+"""The contract of what decodes the robot's states from a simulator's features."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from envs.simulators import memory
 from envs.simulators.base import Simulator
 
 
 class StateDecoder(nn.Module):
-    """Turns features and commands into joint states.
+    """Turns features and commands into robot states.
 
     Args:
-        memory: frames of command and state history it reads.
+        memory_frames: frames of command and state history it reads, M.
 
     Attributes:
         normalised: whether its units came with its weights, so that data need not set them.
@@ -21,18 +22,18 @@ class StateDecoder(nn.Module):
 
     normalised = False
 
-    def __init__(self, memory: int):
+    def __init__(self, memory_frames: int):
         super().__init__()
-        self.memory = memory
+        self.memory_frames = memory_frames
 
-    def normalise(self, states: Tensor) -> None:
-        """Set units from joint states [N, 16]."""
+    def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
+        """Take units from data; arguments as of Simulator.normalise."""
         raise NotImplementedError
 
     @torch.no_grad()
     def look(self, simulator: Simulator, inputs: TensorDict) -> Tensor:
-        """What the frozen simulator makes of training inputs (Simulator.asked), [B, ...]: the same whatever
-        the decoder has learned.
+        """What the frozen simulator makes of training inputs, [B, ...]: the same whatever the decoder has
+        learned.
         """
         return simulator.features(inputs).float()
 
@@ -44,59 +45,47 @@ class StateDecoder(nn.Module):
         """Tell the simulator what its features should be, if that is the decoder's to say."""
 
     def decode(
-        self,
-        features: Tensor,
-        commands: Tensor,
-        past_commands: Tensor,
-        past_states: Tensor,
-        seed: Tensor,
-        chunk_index: Tensor,
+        self, features: Tensor, commands: Tensor, history: TensorDict, seed: Tensor, chunk_index: Tensor
     ) -> Tensor:
-        """Joint states of one chunk.
+        """Robot states of one chunk.
 
         Args:
             features: [B, *feature_shape] of the simulator.
-            commands: [B, K, A] absolute; past_commands: [B, M, A] and past_states: [B, M, 16] up to the
-                chunk's start.
+            commands: [B, K, A].
+            history: TensorDict [B] with commands [M, A] and states [M, S] up to the chunk's start.
             seed, chunk_index: int64 [B], all the randomness there is.
 
         Returns:
-            float32 [B, K, 16].
+            float32 [B, K, S].
         """
         raise NotImplementedError
 
-    def follow(self, simulator: Simulator, state: TensorDict, features: Tensor) -> Tensor:
+    def follow(self, state: TensorDict, chunk: int, features: Tensor) -> Tensor:
         """Decode the chunk that a session has just made, and write it into its memory.
 
         Args:
-            state: of the simulator after the step, changed in place.
+            state: of the sessions after the step, changed in place.
+            chunk: frames of that step, K.
             features: of that step.
 
         Returns:
-            float32 [B, K, 16].
+            float32 [B, K, S].
         """
-        chunk = simulator.shape.chunk
-        recent = simulator.recent(state, self.memory + chunk)
-        decoded = self.decode(
-            features,
-            recent["commands"][:, -chunk:],
-            recent["commands"][:, : self.memory],
-            recent["states"][:, : self.memory],
-            state["seed"],
-            state["chunk_index"],
-        )
-        simulator.remember_states(state, decoded)
+        recent = memory.recent(state, self.memory_frames + chunk)
+        history = recent[:, : self.memory_frames]
+        history.batch_size = state.shape
+        commands = recent["commands"][:, -chunk:]
+        decoded = self.decode(features, commands, history, state["seed"], state["chunk_index"])
+        memory.write_states(state, decoded)
         return decoded
 
     def loss(
-        self,
-        features: Tensor,
-        commands: Tensor,
-        past_commands: Tensor,
-        past_states: Tensor,
-        truth: Tensor,
-        valid: Tensor,
-        generator: torch.Generator,
+        self, features: Tensor, history: TensorDict, future: TensorDict, generator: torch.Generator
     ) -> Tensor:
-        """Training loss against true states [B, K, 16], where valid [B, K]."""
+        """Training loss against true states.
+
+        Args:
+            history: as of `decode`.
+            future: TensorDict [B] with commands [K, A], states [K, S] and valid bool [K].
+        """
         raise NotImplementedError

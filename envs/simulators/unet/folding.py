@@ -50,15 +50,3 @@ class _Unfold(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         """Squares of gradients as channels."""
         return fold(gradient, ctx.edge), None
-
-
-def at_detail(pictures: Tensor, shrink: int) -> Tensor:
-    """Bytes [B, 3, H, W] as float in 0..1, with shrink = 2 the mean of each four pixels; four sums are faster
-    than torch's pooling.
-    """
-    x = pictures.float().div_(255)
-    return (
-        x
-        if shrink == 1
-        else (x[..., ::2, ::2] + x[..., 1::2, ::2] + x[..., ::2, 1::2] + x[..., 1::2, 1::2]) / 4
-    )
