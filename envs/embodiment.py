@@ -1,10 +1,9 @@
 """What a robot is, as data: the names and kinds of its action and state, its cameras, its rate.
 
 Every shape, head, encoder, transform, server and test is built from an `Embodiment`. It is written to and
-read from
-the `info.json` of a LeRobot v3.0 data set: feature names and shapes are most of it, the rest stands under the
-key
-"worldloop", which may be missing. Nothing here imports torch, so physics workers start fast.
+read from the `info.json` of a LeRobot v3.0 data set: feature names and shapes are most of it, the rest stands
+in features.action.info.worldloop, which LeRobot's tools carry along, and may be missing. Nothing here imports
+torch, so physics workers start fast.
 """
 
 from __future__ import annotations
@@ -12,9 +11,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
+from math import prod
 from typing import Any
 
-INFO_KEY = "worldloop"  # of info.json, for what LeRobot has no place for
+INFO_KEY = "worldloop"  # of a feature's info in info.json, for what LeRobot has no place for
 IMAGE_PREFIX = "observation.images."
 
 
@@ -195,7 +195,7 @@ class Embodiment:
     # -- LeRobot's info.json
     # -----------------------------------------------------------------------------------------
     def to_info(self) -> dict[str, Any]:
-        """What stands under INFO_KEY of info.json: all that feature names and shapes do not say."""
+        """What stands in features.action.info.worldloop: all that feature names and shapes do not say."""
         plain = asdict(self)
         for known in ("robot", "action_names", "state_names", "fps"):
             plain.pop(known)
@@ -217,24 +217,24 @@ class Embodiment:
         """
         features = info["features"]
         missing = [name for name in ("action", "observation.state") if name not in features]
-        cameras = [name for name in features if name.startswith(IMAGE_PREFIX)]
+        cameras = camera_features(features)
         if not cameras:
             missing.append(f"{IMAGE_PREFIX}*")
         if missing:
             raise EmbodimentError(
-                f"features {missing} are missing from info.json; Worldloop needs images, action and state"
+                f"features {missing} are missing from info.json, which has {sorted(features)}; Worldloop needs"
+                " images, action and observation.state"
             )
-        own = dict(info.get(INFO_KEY, {}).get("embodiment", {}))
+        own = (features["action"].get("info") or {}).get(INFO_KEY, {})
         action, state = (feature_names(features[name]) for name in ("action", "observation.state"))
         about = own.get("cameras", {})
         arms = tuple(
             Arm(a["name"], tuple(a["numbers"]), a["gripper"], tuple(a["gripper_range"]))
             for a in own.get("arms", ())
         )
-        views = []
-        for key in cameras:
-            name, shape = key[len(IMAGE_PREFIX) :], _image_size(features[key])
-            views.append(Camera(name, shape, **about.get(name, {})))
+        views = [
+            Camera(name, _image_size(features[key]), **about.get(name, {})) for name, key in cameras.items()
+        ]
         kind, delta = guess_action(action)
         robot = own.get("kinematics")
         return cls(
@@ -269,14 +269,36 @@ class Embodiment:
         return ""
 
 
-def feature_names(feature: Mapping[str, Any]) -> tuple[str, ...]:
-    """A name for every number of a feature of info.json: LeRobot has lists, nested lists, and dictionaries of
-    lists.
+def camera_features(features: Mapping[str, Any]) -> dict[str, str]:
+    """The feature of each camera by the camera's name, in order: every feature of images or video but depth.
+
+    LeRobot's observation.images.top is the camera "top"; pusht's observation.image is the camera "image".
     """
-    (size,) = feature["shape"]
+    cameras: dict[str, str] = {}
+    for key, feature in features.items():
+        about = {**(feature.get("video_info") or {}), **(feature.get("info") or {})}
+        if feature.get("dtype") not in ("image", "video"):
+            continue
+        if about.get("is_depth_map") or about.get("video.is_depth_map"):
+            continue
+        name = key.removeprefix(IMAGE_PREFIX).removeprefix("observation.")
+        cameras[key if name in cameras else name] = key
+    return cameras
+
+
+def feature_names(feature: Mapping[str, Any]) -> tuple[str, ...]:
+    """A name for every number of a feature of info.json.
+
+    LeRobot has lists, nested lists, dictionaries of lists ({"motors": [...]}, {"axes": [...]}) and
+    dictionaries of positions ({"delta_x": 0, ...}); numbers without fitting names are called by position.
+    """
+    size = prod(feature["shape"])
     names = feature.get("names")
-    if isinstance(names, Mapping):  # {"motors": [...]} or {"axes": [...]}
-        names = [name for part in names.values() for name in part]
+    if isinstance(names, Mapping):
+        if all(isinstance(part, int) for part in names.values()):
+            names = sorted(names, key=names.__getitem__)
+        else:
+            names = [name for part in names.values() for name in part]
     if names and isinstance(names[0], (list, tuple)):
         names = [name for part in names for name in part]
     if not names or len(names) != size:
@@ -300,6 +322,7 @@ def guess_action(names: tuple[str, ...]) -> tuple[ActionKind, bool]:
 def _image_size(feature: Mapping[str, Any]) -> tuple[int, int]:
     """(height, width) of an image feature, whose shape may be [H, W, C] or [C, H, W]; `names` says which."""
     shape, names = list(feature["shape"]), feature.get("names")
-    if names and names[0] in ("channel", "channels", "c"):
+    named = bool(names) and str(names[0]) in ("channel", "channels", "c")
+    if named or (not names and shape[0] in (1, 3) and shape[-1] not in (1, 3)):
         return shape[1], shape[2]
     return shape[0], shape[1]

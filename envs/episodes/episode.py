@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.pool import Track
-from envs.specs import ACTION_DIM, STATE_DIM
+from envs.embodiment import Embodiment
+from envs.episodes.pictures import resize_frames, resize_intrinsics
+
+Floats = NDArray[np.float32]
+Bools = NDArray[np.bool_]
 
 
 class EpisodeError(ValueError):
@@ -22,110 +25,167 @@ class EpisodeError(ValueError):
 class Episode:
     """T video frames with everything known at each of them; frame 0 is the start.
 
+    What a source does not know is None. Only the camera poses of an uncalibrated camera among calibrated ones
+    are NaN.
+
     Args:
         frames: uint8 [T, V, 3, H, W] RGB.
-        commands: float32 [T, 14], the absolute command in force when the frame was taken; row t + 1 is the
-            action taken at t.
-        achieved: float32 [T, 14], flange poses the arms really had.
-        states: float32 [T, 16], see schema.STATE_DIM.
-        intrinsic: float32 [V, 3, 3] pixels.
-        c2w: float32 [T, V, 4, 4] camera to world, OpenCV convention.
-        success: bool [T], true from the frame on at which the task's condition has held long enough.
-        progress: float32 [T] in 0..1.
-        objects: float32 [T, N, 4] true places (schema.OBJECT_DIM), NaN where nobody knows them, or a thing
-            has no heading; simulators learn contact from them, judges and policies where to look; none is
-            told them while it acts.
-        instruction, seed, behaviour: words, the episode's seed, who acted ("expert", "noisy", "random",
-            "policy-<n>", or a foreign source).
-        views: names of the V cameras.
-        fps: frames per second.
-        seen: bool [T], frames of which there is a picture; others are black. All by default.
-        recorded: float32 [T, A], actions as the source has them, if it has others than end-effector poses.
-        recorded_layout: what those are: "joints" for [L7, Lg, R7, Rg] (layouts.CommandLayout), else the
-            source's own name.
-
-    What a source does not know is NaN throughout: states, commands, or the pose of a camera.
+        commands: float32 [T, A], row t the action that led to frame t; row 0 is the command in force at the
+            start, zeros for actions that are changes.
+        states: float32 [T, S], LeRobot's observation.state.
+        instruction: the task in words; "" if nobody said it.
+        embodiment: the robot and its cameras.
+        source: who acted ("expert", "noisy", "random", "policy-<n>") or where the episode comes from.
+        seed: the episode's seed or number.
+        success: bool [T], True from the frame on at which the task is done; None if nobody labelled it.
+        intrinsic: float32 [V, 3, 3] in pixels; NaN for an uncalibrated camera.
+        c2w: float32 [T, V, 4, 4] camera to world, OpenCV convention; NaN for an uncalibrated camera.
+        poses: float32 [T, arms, 7] commanded flange poses [x, y, z, roll, pitch, yaw, gripper 0 open .. 1
+            closed], where the source knows them and the command does not say them.
+        reward: float32 [T], of the action that led to each frame.
+        privileged: float32 [T, ...] by name, what only physics knows; only evaluation reads it.
+        present: bool [T], frames of which there is a picture; others are black. All by default.
 
     Raises:
         EpisodeError: if lengths disagree, or numbers are missing here and there.
     """
 
     frames: NDArray[np.uint8]
-    commands: NDArray[np.float32]
-    achieved: NDArray[np.float32]
-    states: NDArray[np.float32]
-    intrinsic: NDArray[np.float32]
-    c2w: NDArray[np.float32]
-    success: NDArray[np.bool_]
-    progress: NDArray[np.float32]
-    objects: NDArray[np.float32]
+    commands: Floats
+    states: Floats
     instruction: str
-    seed: int
-    behaviour: str
-    views: tuple[str, ...]
-    fps: float
-    seen: NDArray[np.bool_] = None  # type: ignore[assignment]
-    recorded: NDArray[np.float32] | None = None
-    recorded_layout: str = ""
+    embodiment: Embodiment
+    source: str = ""
+    seed: int = 0
+    success: Bools | None = None
+    intrinsic: Floats | None = None
+    c2w: Floats | None = None
+    poses: Floats | None = None
+    reward: Floats | None = None
+    privileged: dict[str, Floats] = field(default_factory=dict)
+    present: Bools = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
+        robot = self.embodiment
         length, views = self.frames.shape[:2]
-        if views != len(self.views):
-            raise EpisodeError(
-                f"episode {self.seed}: frames hold {views} views, but {list(self.views)} are named"
-            )
+        if views != len(robot.cameras):
+            raise self._error(f"frames hold {views} views, but {robot.robot} has cameras {list(robot.views)}")
+        if self.present is None:
+            self.present = np.ones(length, bool)
         shapes = {
-            "commands": (length, ACTION_DIM),
-            "achieved": (length, ACTION_DIM),
-            "states": (length, STATE_DIM),
+            "commands": (length, robot.action_dim),
+            "states": (length, robot.state_dim),
+            "success": (length,),
+            "intrinsic": (views, 3, 3),
             "c2w": (length, views, 4, 4),
+            "poses": (length, len(robot.arms), 7),
+            "reward": (length,),
+            "present": (length,),
         }
         for name, shape in shapes.items():
             value = getattr(self, name)
+            if value is None:
+                continue
             if value.shape != shape:
-                raise EpisodeError(f"episode {self.seed}: {name} has shape {value.shape}, expected {shape}")
-            known = np.isfinite(value)
-            # A camera's 16 numbers are known together; of other fields all are, or none.
-            whole = (
-                known.all(axis=(0, 2, 3)) | np.isnan(value).all(axis=(0, 2, 3))
-                if name == "c2w"
-                else known.all() | np.isnan(value).all()
-            )
-            if not whole.all():
-                raise EpisodeError(
-                    f"episode {self.seed}: {name} holds NaN or infinite values in some places; what is unknown must be NaN throughout"
+                raise self._error(
+                    f"{name} has shape {value.shape}, but {robot.robot} makes it {shape}; correct the"
+                    " embodiment or the data"
                 )
-        if self.seen is None:
-            self.seen = np.ones(length, bool)
-        if self.seen.shape != (length,) or (self.recorded is not None and len(self.recorded) != length):
-            raise EpisodeError(f"episode {self.seed}: seen and recorded must have {length} rows")
-        if self.recorded is not None and not np.isfinite(self.recorded).all():
-            raise EpisodeError(f"episode {self.seed}: recorded actions hold NaN or infinite values")
+            kind = np.dtype(bool) if name in ("success", "present") else np.dtype(np.float32)
+            if value.dtype != kind:
+                setattr(self, name, value.astype(kind))
+            if name not in ("c2w", "intrinsic") and not np.isfinite(value).all():
+                raise self._error(f"{name} holds NaN or infinite values; what is unknown is left out")
+        if (self.c2w is None) != (self.intrinsic is None):
+            raise self._error("c2w and intrinsic are known together or not at all")
+        if self.c2w is not None and self.intrinsic is not None:
+            self._check_cameras(self.c2w, self.intrinsic)
+        for name, value in self.privileged.items():
+            if len(value) != length or not np.isfinite(value).all():
+                raise self._error(
+                    f"privileged {name} must hold {length} rows without NaN; leave out what does not exist"
+                )
+
+    def _check_cameras(self, c2w: Floats, intrinsic: Floats) -> None:
+        for view, camera in enumerate(self.embodiment.cameras):
+            known = np.isfinite(c2w[:, view]), np.isfinite(intrinsic[view])
+            if camera.calibrated and not all(part.all() for part in known):
+                raise self._error(f"camera {camera.name} is calibrated, but c2w or intrinsic holds NaN")
+            if not camera.calibrated and any(part.any() for part in known):
+                raise self._error(
+                    f"camera {camera.name} has poses in c2w or intrinsic; say calibrated=True in the"
+                    " embodiment, or NaN throughout"
+                )
+
+    def _error(self, text: str) -> EpisodeError:
+        return EpisodeError(f"episode {self.seed} of {self.source or 'unknown source'}: {text}")
 
     def __len__(self) -> int:
         return len(self.frames)
 
     @property
-    def succeeded(self) -> bool:
-        """True if the episode ended in success."""
-        return bool(self.success[-1])
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the pictures."""
+        return self.frames.shape[-2], self.frames.shape[-1]
+
+    @property
+    def succeeded(self) -> bool | None:
+        """Whether the episode ended in success; None if nobody labelled it."""
+        return None if self.success is None else bool(self.success[-1])
+
+    def take(self, rows: slice | NDArray[np.int64]) -> Episode:
+        """The episode of some of its frames only."""
+        part: dict[str, Any] = {}
+        for name in ("frames", "commands", "states", "present", "success", "c2w", "poses", "reward"):
+            value = getattr(self, name)
+            part[name] = None if value is None else value[rows]
+        known = {name: value[rows] for name, value in self.privileged.items()}
+        return replace(self, **part, privileged=known)
+
+    def resized(self, size: tuple[int, int]) -> Episode:
+        """The episode with pictures of another (height, width); intrinsics are scaled alike."""
+        if size == self.size:
+            return self
+        intrinsic = self.intrinsic
+        return replace(
+            self,
+            frames=resize_frames(self.frames, size, self.present),
+            intrinsic=None if intrinsic is None else resize_intrinsics(intrinsic, self.size, size),
+            embodiment=self.embodiment.at(size),
+        )
 
     @classmethod
-    def from_track(cls, track: Track, behaviour: str, views: tuple[str, ...], fps: float) -> Episode:
-        """The episode a bench recorded."""
-        rows: dict[str, Any] = {name: np.stack(values) for name, values in track.rows.items()}
-        floats = {
-            name: rows[name].astype(np.float32)
-            for name in ("commands", "achieved", "states", "c2w", "progress", "objects")
-        }
+    def from_track(cls, track: Any, source: str, embodiment: Embodiment) -> Episode:
+        """The episode that a bench recorded.
+
+        Args:
+            track: with `rows` (lists by name: frames, commands, states, success, and where the bench knows
+                them c2w, poses, reward and `privileged`, a dictionary of lists), seed, instruction, intrinsic.
+            source: who acted.
+            embodiment: the bench's robot.
+        """
+        rows = dict(track.rows)
+        privileged = rows.pop("privileged", None) or getattr(track, "privileged", None) or {}
+
+        def stacked(name: str, kind: Any) -> Any:
+            values = rows.get(name)
+            known = values is not None and len(values) > 0 and values[0] is not None
+            return np.stack(values).astype(kind) if known else None
+
+        intrinsic = getattr(track, "intrinsic", None)
+        frames = np.stack(rows["frames"])
         return cls(
-            frames=rows["frames"],
-            success=rows["success"].astype(bool),
-            intrinsic=track.intrinsic.astype(np.float32),
+            frames=frames,
+            commands=stacked("commands", np.float32),
+            states=stacked("states", np.float32),
             instruction=track.instruction,
-            seed=track.seed,
-            behaviour=behaviour,
-            views=views,
-            fps=fps,
-            **floats,
+            embodiment=embodiment.at((frames.shape[-2], frames.shape[-1])),
+            source=source,
+            seed=int(track.seed),
+            success=stacked("success", bool),
+            intrinsic=None if intrinsic is None else np.asarray(intrinsic, np.float32),
+            c2w=stacked("c2w", np.float32),
+            poses=stacked("poses", np.float32),
+            reward=stacked("reward", np.float32),
+            privileged={name: np.stack(part).astype(np.float32) for name, part in privileged.items()},
         )

@@ -1,0 +1,302 @@
+"""Writes LeRobot v3.0 data sets shard by shard, so that nothing finished is lost.
+
+A shard is one data file, one video per camera and one episodes file, all with a file index that nothing in the
+data set has yet. A journal names the files of the shard that is being written; the episodes file comes last and
+by rename, so a shard without it does not exist, and its files, which are ours, are removed when writing goes
+on. No other file is touched but info.json, stats.json and tasks.parquet, which describe the whole.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from envs.embodiment import IMAGE_PREFIX, Embodiment
+from envs.episodes.episode import Episode, EpisodeError
+from envs.episodes.files import write_atomically
+from envs.episodes.formats import lerobot_columns as names
+from envs.episodes.formats.lerobot import open_parquet, read_episode_rows, read_info, read_tasks
+from envs.episodes.formats.lerobot_columns import (
+    CHUNK_FILES,
+    DATA_PATH,
+    EPISODES_PATH,
+    VERSION,
+    VIDEO_PATH,
+    columns_of,
+    features_of,
+    plain_rate,
+)
+from envs.episodes.formats.lerobot_stats import column_stats, merge_stats, picture_stats
+from envs.episodes.video import write_video
+
+_JOURNAL = "meta/worldloop.writing.json"
+_FILE = re.compile(r"chunk-(\d+)/file-(\d+)\.")
+
+
+class LeRobotWriter:
+    """Appends shards of episodes to a LeRobot v3.0 data set.
+
+    All episodes of a data set have the same features: those of its first one, or of the existing data set.
+
+    Args:
+        root: folder of the data set; an existing one is continued, whoever began it.
+        embodiment: the robot; its name becomes LeRobot's robot_type. Pictures have the size that the first
+            episode's have.
+
+    Raises:
+        EpisodeError: if `root` holds a data set of another robot.
+    """
+
+    def __init__(self, root: Path, embodiment: Embodiment):
+        self.root, self.embodiment = Path(root), embodiment
+        if not (self.root / "meta/info.json").exists():
+            return
+        info = read_info(self.root)
+        other = Embodiment.from_info(info).differs(embodiment)
+        if other:
+            raise EpisodeError(f"{root} holds episodes of another robot: {other}. Choose another folder.")
+        for key, kind in (("data_path", DATA_PATH), ("video_path", VIDEO_PATH)):
+            if info.get(key) != kind:
+                raise EpisodeError(
+                    f"{root}: info.json says {key}={info.get(key)!r}; Worldloop writes {kind!r} and appends to"
+                    " nothing else. Choose another folder."
+                )
+        self._finish_journal()
+        rows = read_episode_rows(self.root)
+        if len(rows) != info.get("total_episodes"):  # interrupted before the description was rewritten
+            self._describe(info["features"])
+
+    @property
+    def shards(self) -> int:
+        """Number of finished episodes files."""
+        return len(list((self.root / "meta/episodes").glob("chunk-*/file-*.parquet")))
+
+    @property
+    def episodes(self) -> int:
+        """Number of finished episodes."""
+        return len(read_episode_rows(self.root))
+
+    def write(self, episodes: Sequence[Episode]) -> None:
+        """Add one shard; afterwards the data set on disk is complete and consistent.
+
+        Raises:
+            EpisodeError: if an episode has other features than the data set.
+        """
+        if not episodes:
+            return
+        features = self._check(episodes)
+        self._finish_journal()
+        rows = read_episode_rows(self.root)
+        shard = self._fresh_shard()
+        place = {"chunk_index": shard // CHUNK_FILES, "file_index": shard % CHUNK_FILES}
+        videos = {view: IMAGE_PREFIX + view for view in self.embodiment.views}
+        paths = {view: VIDEO_PATH.format(video_key=key, **place) for view, key in videos.items()}
+        data, listing = DATA_PATH.format(**place), EPISODES_PATH.format(**place)
+        journal = {"listing": listing, "files": [data, *paths.values()]}
+        self._write_json(_JOURNAL, journal)
+        tasks = self._write_tasks(episodes)
+        for k, view in enumerate(self.embodiment.views):
+            stream = (frame.transpose(1, 2, 0) for episode in episodes for frame in episode.frames[:, k])
+            write_atomically(
+                self.root / paths[view],
+                lambda path, stream=stream: write_video(path, stream, self.embodiment.fps),  # type: ignore[misc]
+            )
+        first_row = int(rows[-1]["dataset_to_index"]) if rows else 0
+        tables, records, clock, row = [], [], 0, first_row
+        for number, episode in enumerate(episodes, len(rows)):
+            columns = _with_indices(episode, number, row, tasks[episode.instruction], features)
+            tables.append(pa.table({name: _column(value) for name, value in columns.items()}))
+            record: dict[str, Any] = {
+                "episode_index": number,
+                "tasks": [episode.instruction],
+                "length": len(episode),
+                **{f"data/{name}": value for name, value in place.items()},
+                "dataset_from_index": row,
+                "dataset_to_index": row + len(episode),
+                **{f"meta/episodes/{name}": value for name, value in place.items()},
+            }
+            for key in videos.values():
+                record |= {f"videos/{key}/{name}": value for name, value in place.items()}
+                record[f"videos/{key}/from_timestamp"] = clock / self.embodiment.fps
+                record[f"videos/{key}/to_timestamp"] = (clock + len(episode)) / self.embodiment.fps
+            records.append(record | _stats(episode, columns))
+            row, clock = row + len(episode), clock + len(episode)
+        write_atomically(self.root / data, lambda path: _write_groups(path, tables))
+        if not rows:
+            self._write_json("meta/info.json", self._info(features, [], {}))
+        table = self._like_existing(pa.Table.from_pylist(records))
+        write_atomically(self.root / listing, lambda path: pq.write_table(table, path))
+        self._describe(features)
+        (self.root / _JOURNAL).unlink()
+
+    # -- what is there already
+    def _check(self, episodes: Sequence[Episode]) -> dict[str, Any]:
+        """The features of the data set, which all episodes must have."""
+        existing = (self.root / "meta/info.json").exists()
+        own = features_of(episodes[0])
+        if any(not episode.present.all() for episode in episodes):
+            own[names.PRESENT] = {"dtype": "bool", "shape": [1], "names": None}
+        features = read_info(self.root)["features"] if existing else own
+        wanted = {name: _signature(feature) for name, feature in features.items()}
+        for episode in episodes:
+            other = episode.embodiment.differs(self.embodiment)
+            if other:
+                raise EpisodeError(f"episode {episode.seed} is of another robot: {other}")
+            found = {name: _signature(feature) for name, feature in features_of(episode).items()}
+            if names.PRESENT in wanted:
+                found[names.PRESENT] = wanted[names.PRESENT]
+            differing = sorted(
+                name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name)
+            )
+            if differing:
+                name = differing[0]
+                raise EpisodeError(
+                    f"{self.root}: feature {name} is {wanted.get(name, 'absent')} in the data set, but"
+                    f" {found.get(name, 'absent')} in episode {episode.seed} of {episode.source}; write it to"
+                    " another data set"
+                )
+        return dict(features)
+
+    def _fresh_shard(self) -> int:
+        """A file index that no file of the data set has."""
+        used = [-1]
+        for kind in ("data", "videos", "meta/episodes"):
+            for path in (self.root / kind).rglob("file-*.*"):
+                found = _FILE.search(path.as_posix())
+                if found:
+                    used.append(int(found[1]) * CHUNK_FILES + int(found[2]))
+        return max(used) + 1
+
+    def _finish_journal(self) -> None:
+        """Remove what an interrupted shard left: files that the journal names, if their episodes file is missing."""
+        path = self.root / _JOURNAL
+        if not path.exists():
+            return
+        journal = json.loads(path.read_text())
+        if not (self.root / journal["listing"]).exists():
+            for name in journal["files"]:
+                (self.root / name).unlink(missing_ok=True)
+        path.unlink()
+
+    def _like_existing(self, table: pa.Table) -> pa.Table:
+        """The table with the columns, order and types of existing episodes files, which LeRobot reads as one."""
+        paths = sorted((self.root / "meta/episodes").glob("chunk-*/file-*.parquet"))
+        if not paths:
+            return table
+        schema = open_parquet(paths[0]).schema_arrow.remove_metadata()
+        missing = [name for name in schema.names if name not in table.column_names]
+        if missing:
+            raise EpisodeError(
+                f"{paths[0]}: has columns {missing} that Worldloop cannot fill; write to another data set"
+            )
+        return table.select(schema.names).cast(schema)
+
+    # -- what describes the whole
+    def _write_json(self, name: str, value: Any) -> None:
+        text = json.dumps(value, indent=4, allow_nan=False)
+        write_atomically(self.root / name, lambda path: path.write_text(text))
+
+    def _write_tasks(self, episodes: Sequence[Episode]) -> dict[str, int]:
+        tasks = read_tasks(self.root)
+        known = len(tasks)
+        for episode in episodes:
+            tasks.setdefault(episode.instruction, len(tasks))
+        if len(tasks) > known:
+            table = _tasks_table(tasks)
+            write_atomically(self.root / "meta/tasks.parquet", lambda path: pq.write_table(table, path))
+        return tasks
+
+    def _describe(self, features: dict[str, Any]) -> None:
+        """Rewrite stats.json and info.json from the finished shards."""
+        rows = read_episode_rows(self.root, stats=True)
+        if rows:
+            self._write_json("meta/stats.json", merge_stats(rows))
+        self._write_json("meta/info.json", self._info(features, rows, read_tasks(self.root)))
+
+    def _info(
+        self, features: dict[str, Any], rows: list[dict[str, Any]], tasks: dict[str, int]
+    ) -> dict[str, Any]:
+        path = self.root / "meta/info.json"
+        info = read_info(self.root) if path.exists() else {}
+        new = {
+            "codebase_version": VERSION,
+            "robot_type": self.embodiment.robot,
+            "fps": plain_rate(self.embodiment.fps),
+            "chunks_size": CHUNK_FILES,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
+            "data_path": DATA_PATH,
+            "video_path": VIDEO_PATH,
+        }
+        counts = {
+            "total_episodes": len(rows),
+            "total_frames": sum(int(row["length"]) for row in rows),
+            "total_tasks": len(tasks),
+            "splits": {"train": f"0:{len(rows)}"},
+        }
+        return {**new, **info, **counts, "features": features}
+
+
+def _signature(feature: dict[str, Any]) -> tuple[Any, ...]:
+    return feature["dtype"], tuple(feature["shape"]), tuple(feature.get("names") or ())
+
+
+def _with_indices(
+    episode: Episode, number: int, row: int, task: int, features: dict[str, Any]
+) -> dict[str, NDArray[Any]]:
+    columns, length = columns_of(episode), len(episode)
+    if names.PRESENT in features:
+        columns[names.PRESENT] = episode.present
+    columns["episode_index"] = np.full(length, number)
+    columns["index"] = np.arange(row, row + length)
+    columns["task_index"] = np.full(length, task)
+    return {name: columns[name] for name in features if name in columns}
+
+
+def _column(values: NDArray[Any]) -> pa.Array:
+    if values.dtype == object:
+        return pa.array(values.tolist(), pa.string())
+    if values.ndim == 1:
+        return pa.array(values)
+    flat = pa.array(np.ascontiguousarray(values, np.float32).reshape(-1))
+    return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+
+
+def _write_groups(path: Path, tables: list[pa.Table]) -> None:
+    """Each episode as a row group of its own, so that one can be read without the others."""
+    with pq.ParquetWriter(path, tables[0].schema) as writer:
+        for table in tables:
+            writer.write_table(table)
+
+
+def _stats(episode: Episode, columns: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    shown = episode.frames[episode.present] if episode.present.any() else episode.frames
+    parts = {
+        IMAGE_PREFIX + view: picture_stats(shown[:, k]) for k, view in enumerate(episode.embodiment.views)
+    }
+    parts |= {name: column_stats(value) for name, value in columns.items() if value.dtype != object}
+    return {f"stats/{name}/{stat}": value for name, part in parts.items() for stat, value in part.items()}
+
+
+def _tasks_table(tasks: dict[str, int]) -> pa.Table:
+    """Tasks as LeRobot reads them: by pandas, with the instruction as index."""
+    table = pa.table({"task_index": pa.array(list(tasks.values()), pa.int64()), "task": list(tasks)})
+    kinds = [("task_index", "int64", "int64"), ("task", "unicode", "object")]
+    about = {
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": [
+            {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
+            for name, kind, numpy in kinds
+        ],
+        "pandas_version": "2.0.0",
+    }
+    return table.replace_schema_metadata({"pandas": json.dumps(about)})
