@@ -74,7 +74,7 @@ class Judge(nn.Module):
             done bool [B, T], and the run at the end, int64 [B].
         """
         run, done = before, []
-        for frame in (success >= self.threshold).unbind(1):
+        for frame in (success >= self.threshold.to(success.device)).unbind(1):
             run = torch.where(frame, run + 1, 0)
             done.append(run >= self.hold)
         return torch.stack(done, 1), run

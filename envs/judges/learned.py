@@ -72,7 +72,7 @@ class LearnedJudge(Judge):
 
     @torch.no_grad()
     def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Verdict:
-        """See Judge.score; frames may lie on another device than the judge, which the verdict then lies on."""
+        """See Judge.score; the verdict lies on the device of the frames."""
         batch, count = frames.shape[:2]
         device, text = self.threshold.device, text_to_bytes(instruction)
         rows = torch.arange(batch).repeat_interleave(count)

@@ -1,4 +1,4 @@
-"""Stage: behaviour cloning of the expert's demonstrations, chunk by chunk."""
+"""Stage: behaviour cloning of successful episodes, chunk by chunk, of any policy."""
 
 from __future__ import annotations
 
@@ -7,162 +7,156 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from actors.policies.vla import VISUAL_FEATURES, ChunkPolicy
-from envs.encoders import Gaze, to_signed
+from actors.policies.contract import VISUAL_FEATURES, imitation_loss, inputs_for
 from envs.episodes.clips import ClipStore
-from envs.specs import IMAGE, STATE, TOKENS, to_relative
-from learners.rl.dataset_rollout import looked_at
-from learners.stages.pictures import augment, sights, survey
+from envs.specs import (
+    C2W,
+    CHUNK,
+    COMMAND,
+    IMAGE,
+    INSTRUCTION_UTF8,
+    INTRINSIC,
+    STATE,
+    ActionMode,
+    text_to_bytes,
+    to_chunk,
+)
+from learners.stages.pictures import augment
+from learners.stages.simulator import last_rows, owners
 from learners.training.fit import FitConfig, fit
 
-# Spread below which a command dimension is a constant: a millimetre, a hundredth of a radian, a twentieth of
-# a grip.
-ACTIVE_FLOOR = (1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2, 5e-2)
-_AIM = 16.0  # on how far off objects are seen, beside the error of what is done
+_STATE_NOISE = 0.05  # of each number's spread
+_AT_ONCE = 256  # frames per pass of `encode`
 
 
 class Cloning:
-    """Chunks to imitate: every frame of the given episodes, with the next K commands relative to the one in
-    force.
-
-    Past an episode's end its last command is held.
+    """Chunks to imitate: every frame of the given episodes, with the next K commands.
 
     Args:
-        generated: frames of generated.py. On these the policy is asked to do what it does on the true ones:
-            what it
-            learns in imagination is of use only as far as it sees both alike.
-        watched: episodes whose frames, without their actions, teach the policy's perception where objects are
-            seen, as
-            far as the data say so.
+        policy: any policy (actors/policies/contract.py).
+        store: whose spec says how many commands a chunk has, K.
+        episodes: whose behaviour is imitated, int64 [N].
+        mode: how the numbers of the policy's chunks are meant.
+        generated: frames of generated.py, or None. On these the policy learns to do what it does on the
+            recorded ones: what it learns in imagination is of use only as far as it acts alike on both.
     """
 
     def __init__(
         self,
-        policy: ChunkPolicy,
+        policy: TensorDictModuleBase,
         store: ClipStore,
         episodes: Tensor,
+        mode: ActionMode,
         generated: TensorDict | None = None,
-        watched: Tensor | None = None,
     ):
         self.policy, self.store = policy, store
-        self.aims = policy.perception.main.aims
-        # a bad simulator leaves none
         self.generated = generated if generated is not None and len(generated) else None
-        self.watched = store.rows(watched) if watched is not None and self.aims else None
-        chunk = policy.head.chunk
-        self.rows = store.rows(episodes)
-        owner = torch.searchsorted(store.start, self.rows, right=True) - 1
-        last = store.start[owner] + store.length[owner] - 1
-        ahead = torch.minimum(self.rows[:, None] + torch.arange(1, chunk + 1), last[:, None])
-        commands = store.arrays["commands"]
-        self.targets = to_relative(commands[ahead], commands[self.rows])  # [N, K, 14]
-        self.tokens = store.tokens[owner]
-        self.seen: Tensor | None = None
+        rows = store.rows(episodes)
+        self.rows = rows[store.arrays["present"][rows]]
+        self.targets = chunks_ahead(store, self.rows, mode)
+        self.states = store.arrays["states"][self.rows]
+        self.state_noise = _STATE_NOISE * self.states.std(0)
+        self._text = text_to_bytes(store.instructions)
+        self._features: Tensor | None = None
 
-    def look(self) -> None:
-        """Encode every frame once, for a policy whose perception stays as it is."""
-        self.seen = looked_at(self.policy.perception, self.store, self.rows, self.tokens)
+    def encode(self) -> None:
+        """Compute the policy's visual features of every frame once, for a policy whose perception is frozen.
+
+        Raises:
+            ValueError: if the policy writes no ("policy", "visual_features").
+        """
+        if VISUAL_FEATURES not in self.policy.out_keys:
+            raise ValueError(
+                f"{type(self.policy).__name__} writes no {VISUAL_FEATURES}; set rl.freeze_perception=false"
+            )
+        with torch.no_grad():
+            parts = [
+                self.policy(inputs_for(self.observe(some), self.policy))[VISUAL_FEATURES].cpu()
+                for some in self.rows.split(_AT_ONCE)
+            ]
+        self._features = torch.cat(parts)
+
+    def observe(self, rows: Tensor) -> TensorDict:
+        """What the policy would have observed at frames `rows` [N], under the keys of envs/specs.py."""
+        store, owner = self.store, owners(self.store, rows)
+        out = TensorDict({}, [len(rows)])
+        out[IMAGE], out[STATE] = store.frames(rows), store.arrays["states"][rows]
+        out[COMMAND], out[INSTRUCTION_UTF8] = store.arrays["commands"][rows], self._text[owner]
+        if store.spec.embodiment.calibrated:
+            out[INTRINSIC], out[C2W] = store.intrinsic[owner], store.arrays["c2w"][rows]
+        return out
 
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
-        """Random observations with the knots their chunks have under the policy's units."""
+        """Random observations and the chunks that followed, and generated frames beside recorded ones.
+
+        Returns:
+            TensorDict [] with observed [count], target [count, K, A] and, if frames were generated, recorded
+            and generated [count // 2] observations.
+        """
         pick = torch.randint(len(self.rows), (count,), generator=generator)
-        out = TensorDict({STATE: self.store.arrays["states"][self.rows[pick]]}, [])
-        if self.seen is None:
-            out[IMAGE], out[TOKENS] = self.store.frames(self.rows[pick]), self.tokens[pick]
-        else:
-            out[VISUAL_FEATURES] = self.seen[pick]
+        observed = self.observe(self.rows[pick])
+        if self._features is not None:
+            observed[VISUAL_FEATURES] = self._features[pick]
+        out = TensorDict({"observed": observed, "target": self.targets[pick]}, [])
         if self.generated is not None:
-            # each brings its true one
-            made = self.generated[
-                torch.randint(len(self.generated), (max(1, count // 2),), generator=generator)
-            ]
-            out["pair"] = TensorDict(
-                {
-                    "made": made["frames"],
-                    "true": self.store.frames(made["row"]),
-                    STATE: self.store.arrays["states"][made["row"]],
-                    TOKENS: made["tokens"],
-                },
-                made.shape,
-            )
-            out["pair", "where"] = sights(self.store, made["places"], made["row"], self.aims)
-        if self.watched is not None:
-            shown = self.watched[torch.randint(len(self.watched), (count,), generator=generator)]
-            out["shown"] = TensorDict(
-                {
-                    "frames": self.store.frames(shown)[:, :1],
-                    "where": sights(self.store, self.store.arrays["objects"][shown], shown, self.aims),
-                },
-                [count],
-            )
-        out["target"] = self.policy.head.target(self.targets[pick])
+            some = torch.randint(len(self.generated), (max(1, count // 2),), generator=generator)
+            made = self.generated[some]
+            out["recorded"] = self.observe(made["row"])
+            out["generated"] = out["recorded"].clone(recurse=False)
+            out["generated", IMAGE] = made["frames"]
         return out
 
     def loss(self, data: TensorDict, generator: torch.Generator) -> Tensor:
-        """The head's imitation loss.
-
-        Pictures and states are disturbed a little, for robustness.
-        """
-        policy, state = self.policy, data[STATE]
-        seen = (
-            data[VISUAL_FEATURES]
-            if self.seen is not None
-            else policy.perception(augment(to_signed(data[IMAGE]), generator), data[TOKENS])
-        )
-        noise = (
-            torch.randn(state.shape, generator=generator).to(state.device) * 0.05 * policy.fusion.state_std
-        )
-        total = policy.head.error(policy.fusion(seen, state + noise), data["target"])
-        if "shown" in data.keys():
-            shown = data["shown"]
-            _, aimed = policy.perception.main(augment(to_signed(shown["frames"]), generator)[:, 0], generator)
-            total = total + _AIM * Gaze.missed(aimed, shown["where"]).sum()
-        if "pair" not in data.keys():
+        """Imitation loss of a batch of `sample`; pictures and states are disturbed a little."""
+        observed = data["observed"].copy()
+        if self._features is None:
+            observed[IMAGE] = augment(observed[IMAGE], generator)
+        state = observed[STATE]
+        noise = torch.randn(state.shape, generator=generator) * self.state_noise
+        observed[STATE] = state + noise.to(state.device)
+        total = imitation_loss(self.policy, inputs_for(observed, self.policy), data["target"])
+        if "generated" not in data.keys():
             return total
-        pair = data["pair"]
-        made, aimed = policy.perception.look(pair["made"], pair[TOKENS])
-        true = policy.perception(pair["true"], pair[TOKENS])
-        # Seen alike from both sides: neither picture is the right one to be wrong about.
-        total = total + policy.head.apart(policy.fusion(made, pair[STATE]), policy.fusion(true, pair[STATE]))
-        return total + _AIM * Gaze.missed(aimed, pair["where"]).sum()
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            wanted = self.policy(inputs_for(data["recorded"], self.policy))[CHUNK]
+        return total + imitation_loss(self.policy, inputs_for(data["generated"], self.policy), wanted)
+
+
+def chunks_ahead(store: ClipStore, rows: Tensor, mode: ActionMode) -> Tensor:
+    """The chunks [N, K, A] that followed frames `rows` [N].
+
+    Past an episode's end its last command is held: absolute ones repeat, of changes only grippers do.
+    """
+    commands, robot = store.arrays["commands"], store.spec.embodiment
+    ahead, last = rows[:, None] + torch.arange(1, store.spec.chunk + 1), last_rows(store, rows)[:, None]
+    chunks = commands[torch.minimum(ahead, last)]
+    if robot.delta:
+        moves = torch.ones(robot.action_dim, dtype=torch.bool)
+        moves[list(robot.grippers)] = False
+        chunks = torch.where((ahead > last)[..., None] & moves, 0.0, chunks)
+    return to_chunk(chunks, commands[rows], mode)
 
 
 def train_imitation(
-    policy: ChunkPolicy,
-    store: ClipStore,
-    episodes: Tensor,
-    options: FitConfig,
-    folder: Path,
-    fresh: bool = True,
-    generated: TensorDict | None = None,
-    watched: Tensor | None = None,
+    cloning: Cloning, options: FitConfig, folder: Path, fresh: bool = True
 ) -> dict[str, float]:
-    """Clone the given episodes; a `fresh` policy gets its units from them first, one that can act already
-    keeps its own. The rest: see Cloning.
+    """Train the policy of `cloning` in place.
+
+    Args:
+        fresh: whether it cannot act yet; it then takes its units from these chunks first, if it has any.
     """
-    cloning = Cloning(policy, store, episodes, generated, watched)
-    if fresh:
-        if cloning.watched is not None:
-            survey(policy.perception.main, store, cloning.watched)
-        policy.normalise(
-            cloning.targets, store.arrays["states"][cloning.rows], torch.tensor(ACTIVE_FLOOR * 2)
-        )
-    for parameter in policy.head.exploration():
-        parameter.requires_grad_(False)
+    policy = cloning.policy
+    if fresh and hasattr(policy, "normalise"):
+        policy.normalise(cloning.targets, cloning.states)
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         return cloning.loss(data, generator), {}
 
-    stats = fit(
-        "imitation",
-        policy,
-        lambda step, generator: cloning.sample(options.part, generator),
-        loss,
-        options,
-        folder,
-    )
-    for parameter in policy.head.exploration():
-        parameter.requires_grad_(True)
-    return stats
+    def batch(step: int, generator: torch.Generator) -> TensorDict:
+        return cloning.sample(options.part, generator)
+
+    return fit("imitation", policy, batch, loss, options, folder)

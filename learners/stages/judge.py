@@ -1,49 +1,122 @@
-"""Stage: teach the judge on real frames, and how things look on generated ones."""
+"""Stage: teach the judge on recorded and on generated frames, and set its threshold."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.optimize import minimize
+from scipy.special import expit
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 
-from envs.encoders import to_signed
 from envs.episodes.clips import ClipStore
-from envs.judges.base import Judge, frame_labels
+from envs.judges.base import Judge
+from envs.judges.labels import progress_to_success, success_labels
 from envs.judges.learned import LearnedJudge
-from learners.stages.pictures import augment, sights, survey
+from envs.precision import mixed_precision
+from envs.specs import text_to_bytes
+from learners.stages.pictures import augment
+from learners.stages.simulator import owners
 from learners.training.fit import FitConfig, fit
 
 
-def episode_labels(store: ClipStore, hold: int) -> Tensor:
-    """Frame targets of every row of a store, float32 [rows]; see judges.base.frame_labels."""
-    out = torch.zeros(len(store.arrays["success"]))
-    for start, length in zip(store.start.tolist(), store.length.tolist(), strict=True):
-        out[start : start + length] = frame_labels(
-            store.arrays["success"][None, start : start + length].float(), hold
-        )[0]
-    return out
+class JudgeData:
+    """Frames with their labels, half of them positive as far as there are any.
 
+    Args:
+        store: whose recorded success labels frames; episodes that nobody labelled teach nothing.
+        episodes: to learn from, int64 [N].
+        hold: frames in a row that make a success; see labels.success_labels.
+        discount: of the progress target, per frame.
+        generated: frames of generated.py, or None; labelled by what the same actions truly led to, they make
+            half of each batch.
 
-def unseen_by_judge(store: ClipStore) -> Tensor:
-    """Every fourth episode of any behaviour, on which judges are calibrated, and from which none learns,
-    int64 [N].
+    Attributes:
+        share: fraction of the labelled frames that show success.
 
-    The threshold strays with the episodes that are asked, so these must be many.
+    Raises:
+        ValueError: if no episode is labelled.
     """
-    return torch.tensor(
-        [number for number, row in enumerate(store.episodes) if row["seed"] % 4 == 2], dtype=torch.int64
-    )
+
+    def __init__(
+        self,
+        store: ClipStore,
+        episodes: Tensor,
+        hold: int,
+        discount: float,
+        generated: TensorDict | None = None,
+    ):
+        self.store = store
+        self.labels, self.progress = frame_targets(store, hold, discount)
+        rows = store.rows(episodes)
+        rows = rows[store.arrays["present"][rows] & torch.isfinite(self.labels[rows])]
+        if not len(rows):
+            raise ValueError(
+                "no episode of the data says whether it succeeded (next.success or next.reward), so a judge"
+                " cannot learn from them; label some, or use a judge that needs no labels"
+            )
+        self.pools = [_Pool(self.labels, rows)]
+        if generated is not None:
+            known = generated[torch.isfinite(self.labels[generated["row"]])]
+            if len(known):
+                self.pools.append(_Pool(self.labels, known["row"], known["frames"]))
+        self.share = float(self.labels[rows].mean().clamp(0.02, 0.98))
+        self._text = text_to_bytes(store.instructions)
+
+    def sample(self, count: int, generator: torch.Generator) -> TensorDict:
+        """A batch [count] for LearnedJudge.loss, with uint8 frames."""
+        each = [count // len(self.pools)] * len(self.pools)
+        each[0] += count - sum(each)
+        drawn = [pool.draw(size, generator) for pool, size in zip(self.pools, each, strict=True)]
+        rows = torch.cat([rows for rows, _ in drawn])
+        owner = owners(self.store, rows)
+        frames = [self.store.frames(rows) if made is None else made for rows, made in drawn]
+        return TensorDict(
+            {
+                "frames": torch.cat(frames),
+                "first": self.store.frames(self.store.start[owner]),
+                "text": self._text[owner],
+                "label": self.labels[rows],
+                "progress": self.progress[rows],
+            },
+            [count],
+        )
 
 
-def close_calls(labels: Tensor, progress: Tensor, rows: Tensor) -> Tensor:
-    """Those of `rows` [N] whose progress is within a tenth of where successes begin: there it matters most
-    what is seen, and things hide each other.
-    """
-    begins = rows[(labels[rows] > 0.5) & (labels[(rows - 1).clamp(min=0)] <= 0.5)]
-    return rows[(progress[rows] - progress[begins].median()).abs() < 0.1] if len(begins) else begins
+class _Pool:
+    """Frames to draw from: recorded rows [N], or generated frames and the rows that label them."""
+
+    def __init__(self, labels: Tensor, rows: Tensor, frames: Tensor | None = None):
+        self.rows, self.frames = rows, frames
+        self.positive = (labels[rows] > 0.5).nonzero().flatten()
+        self.negative = (labels[rows] <= 0.5).nonzero().flatten()
+
+    def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor | None]:
+        """Rows [count], a third of them positive whatever the data's share is, and their frames if made."""
+        wanted = count // 3 if len(self.positive) else 0
+        wanted = wanted if len(self.negative) else count
+        parts = []
+        for pool, size in ((self.negative, count - wanted), (self.positive, wanted)):
+            if size:
+                parts.append(pool[torch.randint(len(pool), (size,), generator=generator)])
+        at = torch.cat(parts)
+        return self.rows[at], None if self.frames is None else self.frames[at]
+
+
+def frame_targets(store: ClipStore, hold: int, discount: float) -> tuple[Tensor, Tensor]:
+    """Success labels and progress of every row of a store, float32 [rows] each; NaN where nobody labelled."""
+    labels = torch.full((len(store.arrays["present"]),), torch.nan)
+    progress = labels.clone()
+    if "success" not in store.arrays:
+        return labels, progress
+    for number in store.arrays["labelled"].nonzero().flatten().tolist():
+        rows = slice(int(store.start[number]), int(store.start[number] + store.length[number]))
+        labels[rows] = success_labels(store.arrays["success"][rows], hold)
+        progress[rows] = progress_to_success(labels[rows], discount)
+    return labels, progress
 
 
 def train_judge(
@@ -52,127 +125,75 @@ def train_judge(
     episodes: Tensor,
     options: FitConfig,
     folder: Path,
-    imagined: TensorDict | None = None,
+    generated: TensorDict | None = None,
 ) -> dict[str, float]:
-    """Train `judge` in place.
-
-    Args:
-        imagined: frames of generated.py; half of each batch. Where the simulator knows its objects they teach
-            how these look
-            when drawn; where it does not, they are labelled by physics under the same actions.
-    """
-    if imagined is not None and not len(imagined):
-        imagined = None  # a simulator so bad that every frame went astray
-    labels = episode_labels(store, judge.hold)
-    rows = store.rows(episodes)
-    begin = torch.repeat_interleave(store.start, store.length)
-    owner = torch.repeat_interleave(torch.arange(len(store)), store.length)
-    seen = sights(store, store.arrays["objects"], torch.arange(len(labels)), judge.aims)
-    survey(judge.main, store, rows)
-    if imagined is not None:
-        drawn = torch.isfinite(imagined["places"][..., :2]).all(-1).any(-1)
-        # Half a centimetre off its true place a thing is drawn as surely as elsewhere, and decides otherwise.
-        known = {
-            "label": labels[imagined["row"]].where(~drawn, torch.nan),
-            "progress": imagined["progress"].where(~drawn, torch.nan),
-        }
-        imagined = (
-            imagined.clone(recurse=False)
-            .update({**known, "where": sights(store, imagined["places"], imagined["row"], judge.aims)})
-            .exclude("places", "row")
-        )
-    share = float(labels[rows].mean().clamp(0.02, 0.98))
-    positive, negative = rows[labels[rows] > 0.5], rows[labels[rows] <= 0.5]
-    close = close_calls(labels, store.arrays["progress"].float(), rows)
+    """Train `judge` in place; see JudgeData."""
+    data = JudgeData(store, episodes, judge.hold, judge.discount, generated)
 
     def batch(step: int, generator: torch.Generator) -> TensorDict:
-        real = options.part if imagined is None else options.part // 2
-        # A third of the batch is positive whatever the data's share is, so that no batch is without a
-        # success.
-        wanted = real // 3 if len(positive) else 0
-        at = [negative[torch.randint(len(negative), (real - wanted,), generator=generator)]]
-        if wanted:
-            at.append(positive[torch.randint(len(positive), (wanted,), generator=generator)])
-        chosen = torch.cat(at)
-        known = {
-            "tokens": store.tokens[owner[chosen]],
-            "label": labels[chosen],
-            "progress": store.arrays["progress"][chosen].float(),
-            "where": seen[chosen],
-        }
-        out = TensorDict({"frames": store.frames(chosen), "begin": begin[chosen], **known}, [len(chosen)])
-        if imagined is not None:
-            out = torch.cat(
-                [out, imagined[torch.randint(len(imagined), (options.part - real,), generator=generator)]]
-            )
-        out["first"] = store.frames(out["begin"])[:, :1]
-        some = 3 * len(out) // 4 if len(close) else 0
-        drill = torch.cat(
-            [
-                pool[torch.randint(len(pool), (count,), generator=generator)]
-                for pool, count in ((close, some), (rows, len(out) - some))
-                if count
-            ]
-        )
-        out["drill"] = torch.stack((store.frames(drill)[:, 0], store.frames(begin[drill])[:, 0]), 1)
-        out["drilled"] = seen[drill]
-        return out
+        return data.sample(options.part, generator)
 
-    def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
-        views = data["frames"].shape[1]  # the same colours for both, as one camera would give them
-        pictures, first, drill = augment(
-            to_signed(torch.cat((data["frames"], data["first"], data["drill"]), 1)), generator
-        ).split((views, 1, 2), 1)
-        return judge.loss(
-            data.clone(recurse=False).update({"frames": pictures, "first": first, "drill": drill}),
-            max(share, 0.3),
-            generator,
-        )
+    def loss(batch: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
+        views = batch["frames"].shape[1]  # the same colours for both, as one camera would give them
+        both = augment(torch.cat((batch["frames"], batch["first"]), 1), generator)
+        shown = batch.copy()
+        shown["frames"], shown["first"] = both.split(views, 1)
+        return judge.loss(shown, data.share)
 
     return fit("judge", judge, batch, loss, options, folder, watch="frame_accuracy")
+
+
+@torch.no_grad()
+def judge_recordings(
+    judge: Judge, store: ClipStore, episodes: Tensor, bf16: bool = False, batch: int = 32
+) -> Tensor:
+    """Success probabilities of recorded episodes, frame by frame, float32 [N, T]; 0 where they are over."""
+    rows, valid = store.whole(episodes)
+    first = store.frames(store.start[episodes])
+    parts = []
+    for some in torch.arange(len(episodes)).split(batch):
+        texts = [store.instructions[number] for number in episodes[some].tolist()]
+        with mixed_precision(judge.threshold.device, bf16):
+            parts.append(judge.score(store.frames(rows[some]), first[some], texts).success.float())
+    return torch.where(valid, torch.cat(parts), 0.0)
 
 
 def calibrate(judge: Judge, success: Tensor, succeeded: Tensor) -> bool:
     """Set the judge's threshold where an episode is as likely to have succeeded as not.
 
-    On real video, that is: on generated video the threshold would also make up for what the simulator gets
-    wrong, and
-    a judge made lenient for a pessimistic simulator is what a policy learns to exploit. And on video that it
-    has not
-    learned from, of which it is too sure. The likelihood is logistic in the logit of an episode's score
-    (Platt, 1999,
-    with his targets, which keep it finite where scores part the outcomes): it uses all those episodes, where
-    a
-    threshold of best accuracy jumps with a few of them, and asks more of those near the threshold than of the
-    rest.
+    On recorded video, that is: on generated video the threshold would also make up for what the simulator
+    gets wrong, and a judge made lenient for a pessimistic simulator is what a policy learns to exploit. And
+    on video that it has not learned from, of which it is too sure. The likelihood is logistic in the logit of
+    an episode's score (Platt 1999, with his targets, which keep it finite where scores part the outcomes): it
+    uses all episodes, where a threshold of best accuracy jumps with a few of them.
 
     Args:
-        success: frame probabilities [N, T] of real episodes that it did not learn from, 0 where they are
-            over;
+        success: frame probabilities [N, T] of recorded episodes that it did not learn from, 0 where they are
+            over.
         succeeded: bool [N], whether they did.
 
     Returns:
         Whether it was set. It stays as it is where no episode succeeded, or none failed, or scores do not
         rise with success.
     """
-    # An episode succeeds if its best run of `hold` frames lies above the threshold throughout.
-    score = torch.logit(success.double().unfold(1, judge.hold, 1).amin(-1).amax(1).clamp(0.01, 0.99))
     hits = float(succeeded.sum())
     if hits in (0.0, float(len(succeeded))):
         return False
-    targets = torch.where(succeeded, (hits + 1) / (hits + 2), 1 / (len(succeeded) - hits + 2)).double()
-    line = torch.zeros(2, dtype=torch.float64, requires_grad=True)
-    solver = torch.optim.LBFGS([line], max_iter=200, line_search_fn="strong_wolfe")
+    # An episode succeeds if its best run of `hold` frames lies above the threshold throughout.
+    best = success.double().unfold(1, judge.hold, 1).amin(-1).amax(1)
+    score = torch.logit(best.clamp(0.01, 0.99)).numpy()
+    targets = (
+        torch.where(succeeded, (hits + 1) / (hits + 2), 1 / (len(succeeded) - hits + 2)).double().numpy()
+    )
 
-    def objective() -> Tensor:
-        solver.zero_grad()
-        misfit = nn.functional.binary_cross_entropy_with_logits(line[0] * score + line[1], targets)
-        misfit.backward()
-        return misfit
+    def misfit(line: Any) -> tuple[float, Any]:
+        logit = line[0] * score + line[1]
+        value = (np.logaddexp(0, logit) - targets * logit).mean()
+        gap = expit(logit) - targets
+        return float(value), [(gap * score).mean(), gap.mean()]
 
-    solver.step(objective)
-    slope, offset = line.tolist()
+    slope, offset = minimize(misfit, [1.0, 0.0], jac=True).x
     if not slope > 0:  # or NaN
         return False
-    judge.threshold.fill_(float(torch.tensor(-offset / slope).sigmoid().clamp(0.02, 0.98)))
+    judge.threshold.fill_(float(expit(-offset / slope).clip(0.02, 0.98)))
     return True

@@ -1,39 +1,36 @@
-"""Recorded pictures as judges and policies learn from them: colours disturbed, and where objects are to be
-seen.
-"""
+"""Recorded pictures as judges and policies learn from them: colours and places disturbed a little."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from envs.encoders import Gaze
-from envs.episodes.clips import ClipStore
-from envs.geometry.cameras import project
-from envs.specs import first_objects
+COLOUR = 0.08  # largest change of a channel's gain, and of its offset in units of half the range
+SHIFT = 0.02  # largest shift, of the picture's height and width
 
 
-def augment(pictures: Tensor, generator: torch.Generator, strength: float = 0.08) -> Tensor:
-    """Colour gain and offset per picture and channel, alike in all views; pictures float [N, V, 3, H, W] in
-    -1..1.
+def augment(pictures: Tensor, generator: torch.Generator, shift: float = SHIFT) -> Tensor:
+    """Pictures uint8 [N, V, 3, H, W] with other colours and shifted by whole pixels, alike in all views.
+
+    The colours are a random gain and offset per channel (Laskin et al. 2020); a shift repeats the border
+    (Kostrikov et al. 2021). Everything is drawn from the generator, on the CPU.
     """
-    draw = torch.rand((2, len(pictures), 1, 3, 1, 1), generator=generator).mul(2).sub(1).to(pictures.device)
-    return pictures * (1 + strength * draw[0]) + strength * draw[1]
+    count = len(pictures)
+    draw = torch.rand((2, count, 1, 3, 1, 1), generator=generator).mul(2 * COLOUR).sub(COLOUR)
+    gain, offset = draw.to(pictures.device)
+    moved = _shifted(pictures, generator, shift) if shift else pictures
+    signed = moved.float().mul_(1 / 127.5).sub_(1.0)
+    return signed.mul_(1 + gain).add_(offset).add_(1).mul_(127.5).round_().clamp_(0, 255).to(torch.uint8)
 
 
-def sights(store: ClipStore, objects: Tensor, rows: Tensor, count: int) -> Tensor:
-    """Where objects [N, S, 4] are in the first view at the cameras of `rows` [N]: [N, count, 2] in
-    half-pictures from the middle, NaN where unknown or out of sight.
-    """
-    owner = torch.searchsorted(store.start, rows, right=True) - 1
-    pixels, depth = project(
-        first_objects(objects, count)[..., :3], store.intrinsic[owner, 0], store.arrays["c2w"][rows, 0]
-    )
-    where = pixels / (torch.tensor(store.size[::-1]) / 2) - 1
-    return torch.where(((depth > 0.02) & (where.abs() < 1).all(-1))[..., None], where, torch.nan)
-
-
-def survey(gaze: Gaze, store: ClipStore, rows: Tensor) -> None:
-    """Teach `gaze` the ground of its objects by where they are and are seen in frames `rows` [N]."""
-    objects = store.arrays["objects"][rows]
-    gaze.survey(sights(store, objects, rows, gaze.aims), first_objects(objects, gaze.aims)[..., :2])
+def _shifted(pictures: Tensor, generator: torch.Generator, shift: float) -> Tensor:
+    moved = pictures
+    for axis in (-2, -1):
+        size = pictures.shape[axis]
+        most = round(shift * size)
+        by = torch.randint(-most, most + 1, (len(pictures), 1), generator=generator)
+        source = (torch.arange(size) + by).clamp(0, size - 1).to(pictures.device)
+        shape = [len(pictures), 1, 1, 1, 1]
+        shape[axis] = size
+        moved = moved.gather(axis, source.reshape(shape).expand_as(moved))
+    return moved

@@ -1,4 +1,4 @@
-"""Stage: teach the state decoder to read joint states off the frozen simulator's features."""
+"""Stage: teach the state expert to read the robot's states off the frozen simulator's features."""
 
 from __future__ import annotations
 
@@ -12,15 +12,17 @@ from tqdm import tqdm
 
 from envs.episodes.clips import ClipSpec, ClipStore
 from envs.precision import mixed_precision
+from envs.rng import step_generator
 from envs.simulators.base import Simulator
+from envs.simulators.inputs import build_inputs
 from envs.simulators.state_experts.base import StateDecoder
-from envs.simulators.state_experts.flow import StateExpert
-from learners.training.fit import FitConfig, fit, step_generator
+from learners.stages.simulator import units
+from learners.training.fit import FitConfig, fit
 from learners.training.lora import low_rank
 
-# Clips that a simulator is shown, so many at once, each to be learned from so many times; what it says of
-# them must fit into so many bytes.
-_GLIMPSES, _AT_ONCE, _VISITS, _KEPT = 6000, 50, 16, 2 * 2**30
+# Clips whose features are computed once and kept: at most so many, in batches of so many, as few as still let
+# each be learned from so many times, and as many as fit into so many bytes.
+_CLIPS, _AT_ONCE, _VISITS, _KEPT = 6000, 50, 16, 2 * 2**30
 
 
 def train_state(
@@ -31,76 +33,90 @@ def train_state(
     options: FitConfig,
     folder: Path,
     lora: int = 0,
+    fresh: bool = True,
 ) -> dict[str, float]:
-    """Train `decoder` in place; the simulator only looks on. With `lora` only adapters of that rank learn, of
-    a StateExpert.
+    """Train `decoder` in place; the simulator stays as it is.
 
-    Arms are followed to a hundredth of a radian only after thousands of steps, in which a simulator would
-    look at each
-    clip many times over. So it looks once, and what it says is kept; one that says too much to be kept (of
-    gigabytes a
-    clip) looks anew at every step.
+    Joints are followed to a hundredth of a radian only after thousands of steps, in which a simulator would
+    see each clip many times over. So its features are computed once and kept; of a simulator whose features
+    are gigabytes a clip they are computed anew at every step.
+
+    Args:
+        lora: rank of the adapters that learn instead of all weights (transformers only); 0 trains all
+            weights.
+        fresh: whether it has not been trained before; it then takes its units from these episodes first,
+            unless they came with released weights.
+
+    Raises:
+        ValueError: if lora is asked of a decoder without projections to adapt.
     """
-    shape = simulator.shape
-    spec = ClipSpec(shape.memory, shape.chunk)
-    device, drawn = next(simulator.parameters()).device, step_generator(options.seed, options.steps)
+    if fresh and not decoder.normalised:
+        decoder.normalise(*units(store, episodes))
+    clips = _Features(decoder, simulator, store, episodes, options.bf16)
+    wanted = {name: parameter.requires_grad for name, parameter in simulator.named_parameters()}
     simulator.eval().requires_grad_(False)
+    drawn = step_generator(options.seed, options.steps)
+    one = clips.sample(1, drawn)
+    count = min(_CLIPS, options.steps * options.batch // _VISITS, _KEPT // max(1, one["shown"].nbytes))
+    kept = clips.many(count, drawn) if count >= options.part else None
 
-    def seen(clip: TensorDict, generator: torch.Generator) -> TensorDict:
-        shown = decoder.look(simulator, simulator.build_inputs(clip, 0, generator=generator))
+    def batch(step: int, generator: torch.Generator) -> TensorDict:
+        if kept is not None:
+            return kept[torch.randint(len(kept), (options.part,), generator=generator)]
+        return store.sample(episodes, options.part, clips.spec, generator)
+
+    def loss(clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
+        data = clip if kept is not None else clips.of(clip, generator)
+        features = decoder.read(data["shown"])
+        return decoder.loss(features, data["history"], data["future"], generator), {}
+
+    with low_rank(decoder, lora):
+        stats = fit("state", decoder, batch, loss, options, folder)
+    for name, parameter in simulator.named_parameters():
+        parameter.requires_grad_(wanted[name])
+    return stats
+
+
+class _Features:
+    """Training clips with the features that a frozen simulator gives of them.
+
+    Args:
+        bf16: whether the simulator computes in bfloat16 where the device does.
+    """
+
+    def __init__(
+        self, decoder: StateDecoder, simulator: Simulator, store: ClipStore, episodes: Tensor, bf16: bool
+    ):
+        self.decoder, self.simulator, self.store, self.episodes = decoder, simulator, store, episodes
+        self.bf16 = bf16
+        self.spec = ClipSpec(simulator.memory_frames, simulator.spec.chunk)
+
+    def of(self, clip: TensorDict, generator: torch.Generator) -> TensorDict:
+        """shown [B, ...] (see StateDecoder.look), history and future of a clip [B] on the device."""
+        inputs = build_inputs(self.simulator.spec, clip, 0, generator=generator)
         return TensorDict(
             {
-                "shown": shown,
+                "shown": self.decoder.look(self.simulator, inputs),
                 "future": clip["future"].select("commands", "states", "valid"),
                 "history": clip["history"],
             },
             clip.shape,
         )
 
-    def looked(count: int) -> TensorDict:
-        with mixed_precision(device, options.bf16):
-            return seen(store.sample(episodes, count, spec, drawn).to(device), drawn).cpu()
+    def sample(self, count: int, generator: torch.Generator) -> TensorDict:
+        """`of` random clips [count], in main memory."""
+        device = self.simulator.device
+        with torch.no_grad(), mixed_precision(device, self.bf16):
+            clip = self.store.sample(self.episodes, count, self.spec, generator)
+            return self.of(clip.to(device), generator).cpu()
 
-    known = looked(1)
-    count = min(_GLIMPSES, options.steps * options.batch // _VISITS, _KEPT // known["shown"].nbytes)
-    keep = count >= options.part
-    if keep:
-        known = torch.cat(
-            [
-                looked(_AT_ONCE)
-                for _ in tqdm(
-                    range(-(-count // _AT_ONCE)),
-                    desc="state: looking",
-                    unit="batch",
-                    dynamic_ncols=True,
-                    leave=False,
-                )
-            ]
+    def many(self, count: int, generator: torch.Generator) -> TensorDict:
+        """`sample` of at least `count` clips, in batches."""
+        batches = tqdm(
+            range(-(-count // _AT_ONCE)),
+            desc="state: features",
+            unit="batch",
+            dynamic_ncols=True,
+            leave=False,
         )
-
-    def batch(step: int, generator: torch.Generator) -> TensorDict:
-        if keep:
-            return known[torch.randint(len(known), (options.part,), generator=generator)]
-        return store.sample(episodes, options.part, spec, generator)
-
-    def loss(clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
-        shown = clip if keep else seen(clip, generator)
-        future, history = shown["future"], shown["history"]
-        features = decoder.read(shown["shown"])
-        value = decoder.loss(
-            features,
-            future["commands"],
-            history["commands"],
-            history["states"],
-            future["states"],
-            future["valid"].float(),
-            generator,
-        )
-        return value, {}
-
-    if lora and not isinstance(decoder, StateExpert):
-        raise ValueError(f"state lora={lora} adapts transformers; simulator.engine=dit and gesim have one")
-    with low_rank(decoder.net if isinstance(decoder, StateExpert) else decoder, lora):
-        stats = fit("state", decoder, batch, loss, options, folder)
-    simulator.requires_grad_(True)
-    return stats
+        return torch.cat([self.sample(_AT_ONCE, generator) for _ in batches])

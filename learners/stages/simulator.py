@@ -1,0 +1,113 @@
+"""Stage: teach a simulator to continue videos, from recorded frames at first and from its own later."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from envs.episodes.clips import ClipSpec, ClipStore
+from envs.simulators.base import Simulator
+from learners.training.fit import FitConfig, fit
+from learners.training.lora import low_rank
+
+
+@dataclass(frozen=True)
+class SimulatorFitConfig:
+    """Which clips a simulator learns from.
+
+    Args:
+        single_chunk_fraction: share of the steps, the first ones, that train on single chunks; the rest
+            unrolls.
+        unroll: chunks predicted from own predictions after that; the batch shrinks so that a step costs the
+            same.
+        strides: frame strides to draw from, uniformly.
+        recent_fraction: share of each batch drawn from the newest data, so that what the policy now does is
+            seen often; 0 draws by size.
+        lora: rank of the adapters that learn instead of all weights (transformers only); 0 trains all
+            weights.
+
+    Raises:
+        ValueError: if a share is not in 0..1, or unroll or a stride is less than 1.
+    """
+
+    single_chunk_fraction: float
+    unroll: int
+    strides: tuple[int, ...]
+    recent_fraction: float
+    lora: int
+
+    def __post_init__(self) -> None:
+        for name in ("single_chunk_fraction", "recent_fraction"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name}={getattr(self, name)} must be in 0..1")
+        if self.unroll < 1 or not self.strides or min(self.strides) < 1:
+            raise ValueError(f"unroll={self.unroll} and strides={list(self.strides)} must be at least 1")
+
+
+def train_simulator(
+    simulator: Simulator,
+    store: ClipStore,
+    episodes: Tensor,
+    config: SimulatorFitConfig,
+    options: FitConfig,
+    folder: Path,
+    newest: Tensor | None = None,
+    fresh: bool = True,
+) -> dict[str, float]:
+    """Train `simulator` in place on the given episodes of a store.
+
+    Args:
+        newest: episodes that `recent_fraction` speaks of.
+        fresh: whether it has not been trained before; it then takes its units from these episodes first.
+
+    Raises:
+        ValueError: if lora is asked of a simulator without projections to adapt.
+    """
+    if fresh:
+        simulator.normalise(*units(store, episodes))
+
+    def batch(step: int, generator: torch.Generator) -> TensorDict:
+        chunks = 1 if step < config.single_chunk_fraction * options.steps else config.unroll
+        stride = config.strides[int(torch.randint(len(config.strides), (1,), generator=generator))]
+        spec = ClipSpec(simulator.memory_frames, simulator.spec.chunk, chunks, stride)
+        count = max(1, options.part // chunks)
+        recent = round(count * config.recent_fraction) if newest is not None and len(newest) else 0
+        parts = [store.sample(episodes, count - recent, spec, generator)] if recent < count else []
+        if recent and newest is not None:
+            parts.append(store.sample(newest, recent, spec, generator))
+        return torch.cat(parts) if len(parts) > 1 else parts[0]
+
+    with low_rank(simulator, config.lora):
+        return fit("simulator", simulator, batch, simulator.loss, options, folder)
+
+
+def units(store: ClipStore, episodes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """What simulators and state experts take their units from: commands, moves and states of all frames.
+
+    Returns:
+        commands float32 [N, A]; moves [N, A], by how much absolute commands differ from the one in force when
+        a chunk begins, at any of its frames (zeros of actions that are changes themselves); states [N, S].
+    """
+    rows, chunk = store.rows(episodes), store.spec.chunk
+    commands = store.arrays["commands"]
+    if store.spec.embodiment.delta:
+        moves = torch.zeros_like(commands[rows])
+    else:
+        ahead = 1 + torch.arange(len(rows)) % chunk
+        moves = commands[torch.minimum(rows + ahead, last_rows(store, rows))] - commands[rows]
+    return commands[rows], moves, store.arrays["states"][rows]
+
+
+def last_rows(store: ClipStore, rows: Tensor) -> Tensor:
+    """The last row of the episode that each row belongs to, int64 like rows."""
+    owner = owners(store, rows)
+    return store.start[owner] + store.length[owner] - 1
+
+
+def owners(store: ClipStore, rows: Tensor) -> Tensor:
+    """The episode that each row belongs to, int64 like rows."""
+    return torch.searchsorted(store.start, rows, right=True) - 1
