@@ -1,65 +1,76 @@
-"""Builds worlds and policies from the config, in any process: no code travels, only numbers and this module's
-name.
+"""Builds worlds and policies from the config, in any process: no code travels, only numbers and names.
+
+Every choice is a class that its config section names (`_target_`, see envs/targets.py); what is known of the
+world that it shall work in is handed to it as a WorldSpec.
 """
 
 from __future__ import annotations
 
 import ctypes
+import json
 import os
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields
-from functools import partial
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 from safetensors.torch import load_file
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import TransformedEnv
 
-from actors.policies.chunk_gaussian import ChunkGaussianHead
-from actors.policies.chunk_tokens import ChunkTokenHead
-from actors.policies.heads import Head
-from actors.policies.openpi import OpenPIPolicy
-from actors.policies.vla import ChunkPolicy
 from envs.conditioning import PoseMapStyle
+from envs.embodiment import Embodiment, EmbodimentError, Robot
 from envs.episodes.clips import ClipStore
-from envs.geometry.kinematics import Kinematics, KinematicsError, Robot
-from envs.judges import Judge, LearnedJudge
-from envs.layouts import CommandLayout
+from envs.geometry.kinematics import Kinematics, KinematicsError
+from envs.judges.base import Judge
 from envs.physics.env import PhysicsEnv
-from envs.physics.pool import available_cores
-from envs.physics.tabletop.bench import BenchConfig, frames_held
-from envs.simulators.base import Simulator, WorldShape
+from envs.physics.pool import TaskPool, available_cores
+from envs.physics.suite import SuiteError, build_suite
+from envs.simulators.base import Simulator
 from envs.simulators.state_experts.base import StateDecoder
-from envs.simulators.state_experts.head import StateHead
-from envs.simulators.unet.engine import UNetConfig, UNetSimulator
-from envs.specs import ActionMode, Rewards
+from envs.specs import ActionMode, Rewards, WorldSpec
+from envs.targets import ConfigError, build, options, to_plain
 from envs.transforms import world_transforms
 from envs.world import InitialStates, WorldEnv
 
+__all__ = [
+    "ConfigError",
+    "build",
+    "build_algorithm",
+    "build_judge",
+    "build_kinematics",
+    "build_physics",
+    "build_policy",
+    "build_pool",
+    "build_simulator",
+    "build_state_decoder",
+    "build_world",
+    "device_of",
+    "embodiment_of",
+    "load",
+    "open_clips",
+    "options",
+    "pose_style",
+    "prepare_process",
+    "rewards_of",
+    "world_spec",
+]
+
 T = TypeVar("T")
 
-
-class ConfigError(ValueError):
-    """A value in the config cannot work; the message names the key and the fix."""
-
-
-def options(kind: type[T], section: Mapping[str, Any], key: str) -> T:
-    """A dataclass from a config section; lists become tuples, unknown and missing keys are named.
-
-    Raises:
-        ConfigError: naming the config key.
-    """
-    known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
-    unknown = sorted(set(section) - known)
-    if unknown:
-        raise ConfigError(f"{key}.{unknown[0]} is not an option; {key} takes {sorted(known)}")
-    values = {name: tuple(value) if isinstance(value, list) else value for name, value in section.items()}
-    try:
-        return kind(**values)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{key}: {error}") from error
+# Keys of the simulator's section that are not its class's own options.
+_AROUND_SIMULATOR = (
+    "pose_map",
+    "ray_map",
+    "pose_map_style",
+    "kinematics",
+    "shared_noise",
+    "bf16",
+    "state_expert",
+)
+_robots: dict[str, Embodiment] = {}
 
 
 def prepare_process(seed: int, threads: int = 0) -> None:
@@ -90,7 +101,7 @@ def prepare_process(seed: int, threads: int = 0) -> None:
 
 
 def device_of(cfg: Mapping[str, Any]) -> torch.device:
-    """The device of simulators and learners.
+    """The device of policies, simulators, judges and learners.
 
     Raises:
         ConfigError: if launch.device asks for a GPU that is not there.
@@ -103,194 +114,166 @@ def device_of(cfg: Mapping[str, Any]) -> torch.device:
     return torch.device(name)
 
 
-def bench_config(cfg: Mapping[str, Any]) -> BenchConfig:
-    """Options of the true world."""
+def embodiment_of(cfg: Mapping[str, Any]) -> Embodiment:
+    """The robot: that of the task suite (task.suite), or of the data where there is no physics (task.data).
+
+    Raises:
+        ConfigError: if neither is given, or does not describe a robot.
+    """
     task = cfg["task"]
-    return options(
-        BenchConfig,
-        {
-            "task": task["name"],
-            "control_hz": task["control_hz"],
-            "hold": task["hold"],
-            "size": task["size"],
-            "views": task["views"],
-        },
-        "task",
-    )
+    if task.get("suite") is not None:
+        section = task["suite"]
+        known = json.dumps(to_plain(section), sort_keys=True)
+        if known not in _robots:  # building a suite compiles its models
+            try:
+                _robots[known] = build_suite(section).embodiment
+            except (SuiteError, EmbodimentError) as error:
+                raise ConfigError(str(error)) from error
+        return _robots[known]
+    if not task.get("data"):
+        raise ConfigError(
+            "task.suite and task.data are both empty, so no robot is known; choose task=push or another"
+            " suite, or name LeRobot data sets by task.data=[folder]"
+        )
+    robots = [(str(folder), _recorded_robot(Path(folder))) for folder in task["data"]]
+    first, robot = robots[0]
+    for folder, other in robots[1:]:
+        if difference := robot.differs(other):
+            raise ConfigError(f"task.data: {first} and {folder} are of different robots: {difference}")
+    return robot
 
 
-def world_shape(cfg: Mapping[str, Any]) -> WorldShape:
-    """What every simulator of this config shows."""
-    task = cfg["task"]
-    return WorldShape(
-        len(task["views"]),
-        tuple(task["size"]),
-        task["chunk"],
-        cfg["simulator"]["memory"],
-        task["control_hz"],
-        tuple(cfg["simulator"]["sides"]),
-        CommandLayout(cfg["simulator"]["layout"]),
-    )
+def _recorded_robot(folder: Path) -> Embodiment:
+    path = folder / "meta" / "info.json"
+    if not path.is_file():
+        raise ConfigError(f"task.data: {path} does not exist; name folders of LeRobot v3.0 data sets")
+    try:
+        return Embodiment.from_info(json.loads(path.read_text()))
+    except (EmbodimentError, KeyError, ValueError) as error:
+        raise ConfigError(f"task.data: {path}: {error}") from error
+
+
+def world_spec(cfg: Mapping[str, Any]) -> WorldSpec:
+    """What the worlds of this config show, and how their simulators are conditioned.
+
+    Raises:
+        ConfigError: if the robot is unknown, or does not allow the conditioning that is asked for.
+    """
+    task, section = cfg["task"], cfg["simulator"]
+    robot = embodiment_of(cfg)
+    if section["kinematics"]:
+        robot = replace(robot, kinematics=options(Robot, section["kinematics"], "simulator.kinematics"))
+    drawn = _resolve(section["pose_map"], robot.calibrated and robot.commands_poses, "simulator.pose_map")
+    rays = _resolve(section["ray_map"], robot.calibrated, "simulator.ray_map")
+    try:
+        return WorldSpec(robot, tuple(task["size"]), task["chunk"], drawn, rays)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _resolve(value: Any, auto: bool, key: str) -> bool:
+    """`auto` is whatever the robot allows."""
+    if value not in ("auto", True, False):
+        raise ConfigError(f"{key}={value!r} must be auto, true or false")
+    return auto if value == "auto" else bool(value)
 
 
 def pose_style(cfg: Mapping[str, Any]) -> PoseMapStyle:
     """How this config's pose maps are drawn."""
-    return options(PoseMapStyle, cfg["simulator"]["pose_map"], "simulator.pose_map")
+    return options(PoseMapStyle, cfg["simulator"]["pose_map_style"], "simulator.pose_map_style")
 
 
 def build_kinematics(cfg: Mapping[str, Any]) -> Kinematics | None:
-    """Forward kinematics of the robot, if simulator.kinematics says which."""
-    robot = cfg["simulator"]["kinematics"]
+    """Forward kinematics of the robot, if its description or simulator.kinematics names a model."""
+    robot = world_spec(cfg).embodiment.kinematics
     if robot is None:
         return None
-    nested = {
-        name: tuple(tuple(arm) for arm in value) if name == "joints" else value
-        for name, value in robot.items()
-    }
     try:
-        return Kinematics(options(Robot, nested, "simulator.kinematics"))
+        return Kinematics(robot)
     except KinematicsError as error:
         raise ConfigError(str(error)) from error
 
 
-def joints_to_hands(cfg: Mapping[str, Any]) -> Kinematics | None:
-    """Kinematics for those who say joints to a world of end-effector commands; where none are named, the
-    bench's, whose worlds those are.
-    """
-    return build_kinematics(cfg) or (
-        Kinematics() if CommandLayout(cfg["simulator"]["layout"]) is CommandLayout.EEF else None
-    )
-
-
-def open_clips(cfg: Mapping[str, Any], folders: Iterable[Path]) -> ClipStore:
-    """Data sets as one store, with the commands and pose maps that the simulator takes."""
-    return ClipStore(list(folders), CommandLayout(cfg["simulator"]["layout"]), pose_style(cfg))
+def open_clips(cfg: Mapping[str, Any], folders: Iterable[Path | str]) -> ClipStore:
+    """Data sets as one store that shows what this config's worlds show."""
+    return ClipStore([Path(folder) for folder in folders], world_spec(cfg), style=pose_style(cfg))
 
 
 def build_simulator(cfg: Mapping[str, Any], weights: Path | None = None) -> Simulator:
-    """The learned world of simulator.engine, with weights if given."""
-    engine, shape = cfg["simulator"]["engine"], world_shape(cfg)
-    section = cfg["simulator"]["model"]
-    if engine == "unet":
-        model: Simulator = UNetSimulator(shape, options(UNetConfig, section, "simulator.model"))
-        model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    elif engine == "dit":
-        from envs.simulators.dit.engine import DiTConfig, DiTSimulator
-
-        model = DiTSimulator(shape, options(DiTConfig, section, "simulator.model"))
-    elif engine == "gesim":
-        from envs.simulators.gesim.engine import GESimConfig, GESimulator
-
-        try:
-            model = GESimulator.build(
-                shape, options(GESimConfig, section, "simulator.model"), cfg["simulator"]["checkpoint"]
-            )
-        except ValueError as error:
-            raise ConfigError(f"simulator.model: {error}") from error
-    elif engine == "remote":
-        from envs.simulators.remote.engine import RemoteConfig, RemoteSimulator
-
-        return RemoteSimulator(shape, options(RemoteConfig, section, "simulator.model"))
-    else:
-        raise ConfigError(f"simulator.engine={engine!r} is unknown; choose unet, dit, gesim or remote")
+    """The learned world of the simulator section, with weights if given."""
+    section = {name: value for name, value in cfg["simulator"].items() if name not in _AROUND_SIMULATOR}
+    model: Simulator = build(section, "simulator", spec=world_spec(cfg))
     return load(model, weights).to(device_of(cfg))
 
 
 def build_state_decoder(
     cfg: Mapping[str, Any], simulator: Simulator, weights: Path | None = None
 ) -> StateDecoder:
-    """What decodes joint states from that simulator's features."""
-    shape, engine = simulator.shape, cfg["simulator"]["engine"]
-    if engine == "unet":
-        decoder: StateDecoder = StateHead(simulator.feature_shape[0], shape.chunk, shape.memory)
-    elif engine == "remote":
-        from envs.simulators.remote.engine import GivenStates
-
-        return GivenStates(shape.chunk)
-    elif engine == "gesim":
-        from envs.simulators.gesim.engine import GESimulator
-
-        assert isinstance(simulator, GESimulator)
-        decoder = simulator.state_expert()
-    else:
-        from envs.simulators.dit.engine import DiTSimulator
-        from envs.simulators.state_experts.flow import StateExpertConfig, untrained_expert
-
-        assert isinstance(simulator, DiTSimulator)
-        decoder = untrained_expert(
-            simulator, options(StateExpertConfig, cfg["simulator"]["state"], "simulator.state")
-        )
+    """What decodes the robot's states from that simulator's features."""
+    decoder: StateDecoder = build(
+        cfg["simulator"]["state_expert"], "simulator.state_expert", simulator=simulator
+    )
     decoder = load(decoder, weights).to(device_of(cfg))
     decoder.attach(simulator)
     return decoder
 
 
-def build_judge(cfg: Mapping[str, Any], weights: Path | None = None) -> LearnedJudge:
-    """The learned judge."""
-    section = cfg["judge"]
-    judge = LearnedJudge(
-        len(cfg["task"]["views"]),
-        frames_held(cfg["task"]["hold"], cfg["task"]["control_hz"]),
-        section["margin"],
-        section["width"],
-        section["points"],
-        section["aims"],
-    )
+def build_judge(cfg: Mapping[str, Any], weights: Path | None = None) -> Judge:
+    """The judge of the judge section."""
+    section = {name: value for name, value in cfg["judge"].items() if name != "rewards"}
+    judge: Judge = build(section, "judge", spec=world_spec(cfg))
     return load(judge, weights).to(device_of(cfg))
 
 
-def build_policy(cfg: Mapping[str, Any], weights: Path | None = None) -> ChunkPolicy:
-    """The policy; it acts and learns on the CPU, for it is small."""
-    section = cfg["policy"]
-    chunk = cfg["task"]["chunk"]
-    if section["head"] == "gaussian":
-        head: Callable[[int], Head] = partial(
-            ChunkGaussianHead, chunk=chunk, knots=section["knots"], std=section["std"]
-        )
-    elif section["head"] == "tokens":
-        head = partial(ChunkTokenHead, chunk=chunk, bins=section["bins"])
-    else:
-        raise ConfigError(f"policy.head={section['head']!r} is unknown; choose gaussian or tokens")
-    return load(
-        ChunkPolicy(
-            len(cfg["task"]["views"]),
-            head,
-            section["width"],
-            section["points"],
-            channels=section["channels"],
-            aims=section["aims"],
-        ),
-        weights,
-    )
+def build_policy(cfg: Mapping[str, Any], weights: Path | None = None) -> TensorDictModuleBase:
+    """The policy of the policy section; see actors/policies/contract.py."""
+    policy: TensorDictModuleBase = build(cfg["policy"], "policy", spec=world_spec(cfg))
+    return load(policy, weights).to(device_of(cfg))
 
 
-def build_openpi(cfg: Mapping[str, Any], url: str) -> OpenPIPolicy:
-    """An openpi server as a policy for the worlds of this config."""
-    layout = CommandLayout(cfg["simulator"]["layout"])
-    return OpenPIPolicy(
-        url,
-        tuple(cfg["task"]["views"]),
-        cfg["task"]["chunk"],
-        layout,
-        ActionMode(cfg["task"]["mode"]),
-        joints_to_hands(cfg),
-    )
+def rewards_of(cfg: Mapping[str, Any]) -> Rewards:
+    """What progress and success are worth in both worlds."""
+    return options(Rewards, cfg["judge"]["rewards"], "judge.rewards")
 
 
 def build_physics(cfg: Mapping[str, Any], batch: int, record: bool = False, seed: int = 0) -> PhysicsEnv:
-    """The true world."""
+    """The true world.
+
+    Raises:
+        ConfigError: if the task has no suite, or no task of that name.
+    """
     task = cfg["task"]
-    return PhysicsEnv(
-        bench_config(cfg),
-        batch,
-        task["chunk"],
-        task["horizon"],
-        ActionMode(task["mode"]),
-        options(Rewards, cfg["judge"]["rewards"], "judge.rewards"),
-        cfg["launch"]["workers"],
-        record,
-        seed,
-    )
+    if task.get("suite") is None:
+        raise ConfigError("task.suite is empty: this task is known from data alone and has no physics")
+    try:
+        return PhysicsEnv(
+            task["suite"],
+            task["name"],
+            world_spec(cfg),
+            batch,
+            task["horizon"],
+            ActionMode(task["mode"]),
+            rewards_of(cfg),
+            cfg["launch"]["workers"],
+            record,
+            seed,
+        )
+    except (SuiteError, EmbodimentError) as error:
+        raise ConfigError(str(error)) from error
+
+
+def build_pool(cfg: Mapping[str, Any]) -> TaskPool:
+    """Worker processes that run scripted episodes of the task, one slot each."""
+    task, workers = cfg["task"], cfg["launch"]["workers"] or available_cores()
+    try:
+        return TaskPool(task["suite"], task["name"], workers, task["horizon"], workers)
+    except (SuiteError, EmbodimentError) as error:
+        raise ConfigError(str(error)) from error
+
+
+def build_algorithm(cfg: Mapping[str, Any], policy: TensorDictModuleBase) -> Any:
+    """The algorithm of the algorithm section (learners.rl.algorithm.Algorithm) around a policy."""
+    return build(cfg["algorithm"], "algorithm", policy=policy, spec=world_spec(cfg))
 
 
 def build_world(
@@ -304,7 +287,7 @@ def build_world(
     seed: int = 0,
 ) -> TransformedEnv:
     """The imagined world with its three transforms; `later` is JudgeReward's."""
-    task = cfg["task"]
+    task, section = cfg["task"], cfg["simulator"]
     simulator.eval(), decoder.eval(), judge.eval()
     base = WorldEnv(
         simulator,
@@ -312,17 +295,20 @@ def build_world(
         batch,
         task["horizon"],
         ActionMode(task["mode"]),
-        cfg["simulator"]["shared_noise"],
-        cfg["simulator"]["bf16"],
+        section["shared_noise"],
+        section["bf16"],
         seed,
     )
-    rewards = options(Rewards, cfg["judge"]["rewards"], "judge.rewards")
-    return TransformedEnv(
-        base,
-        world_transforms(
-            decoder, judge, rewards, tuple(task["views"]), later, pose_style(cfg), build_kinematics(cfg)
-        ),
+    transforms = world_transforms(
+        world_spec(cfg),
+        decoder,
+        judge,
+        rewards_of(cfg),
+        later=later,
+        style=pose_style(cfg),
+        kinematics=build_kinematics(cfg),
     )
+    return TransformedEnv(base, transforms)
 
 
 def load(module: T, weights: Path | None) -> T:
@@ -345,7 +331,8 @@ def load(module: T, weights: Path | None) -> T:
     missing, extra = sorted(wanted.keys() - found.keys()), sorted(found.keys() - wanted.keys())
     if wrong or missing or extra:
         raise ConfigError(
-            f"{weights} is of another architecture: missing {missing[:4]}, unexpected {extra[:4]}, differing {wrong[:4]}. Use the config it was trained with (config.yaml beside it)."
+            f"{weights} is of another architecture or robot: missing {missing[:4]}, unexpected {extra[:4]},"
+            f" differing {wrong[:4]}. Use the config it was trained with (config.yaml beside it)."
         )
     module.load_state_dict({name: value.to(wanted[name].dtype) for name, value in found.items()})
     return module  # type: ignore[return-value]

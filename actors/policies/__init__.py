@@ -1,1 +1,1 @@
-"""Policies: what turns views, state and words into chunks of actions."""
+"""Policies: from views, state and instruction to chunks of actions; contract.py says what they are."""

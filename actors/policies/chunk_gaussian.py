@@ -11,19 +11,22 @@ from torch import Tensor, nn
 from torch.distributions import Distribution, constraints, register_kl
 
 from actors.policies.heads import Head
-from envs.specs import ACTION_DIM
+from envs.specs import ActionMode
 
 
-def knot_basis(chunk: int, knots: int) -> Tensor:
-    """Linear interpolation [chunk, knots] from rest at time 0 through knots spread evenly up to the chunk's
-    end.
+def knot_basis(chunk: int, knots: int, from_rest: bool) -> Tensor:
+    """Linear interpolation [chunk, knots] through knots spread evenly over a chunk, the last at its end.
+
+    Args:
+        from_rest: interpolation begins at 0 just before the first action, as offsets from the command in
+            force do; otherwise the first knot is the first action.
     """
     times = torch.arange(1, chunk + 1, dtype=torch.float32)
-    at = torch.linspace(0, chunk, knots + 1)
-    hats = torch.stack(
-        [(1 - (times - at[k]).abs() * knots / chunk).clamp(min=0) for k in range(1, knots + 1)], 1
-    )
-    return hats
+    if not from_rest and knots == 1:
+        return torch.ones(chunk, 1)
+    places = torch.linspace(0, chunk, knots + 1)[1:] if from_rest else torch.linspace(1, chunk, knots)
+    between = chunk / knots if from_rest else (chunk - 1) / (knots - 1)
+    return (1 - (times[:, None] - places).abs() / between).clamp(min=0)
 
 
 class ChunkGaussian(Distribution):
@@ -112,11 +115,12 @@ class ChunkGaussianHead(Head):
     """Mean and spread of the knots of a chunk; spreads are learned and do not depend on the observation.
 
     Args:
-        width: of the trunk's output.
+        width: of the hidden vector.
         chunk: actions per chunk, K.
+        actions: numbers of an action, A.
         knots: free points per dimension and chunk.
         std: initial spread, in units of the demonstrations' own spread.
-        actions: numbers of an action, A.
+        mode: how the chunk's numbers are meant; relative ones begin where the robot is.
     """
 
     names = ("loc", "scale", "basis", "gain", "offset")
@@ -125,14 +129,17 @@ class ChunkGaussianHead(Head):
     gain: Tensor
     offset: Tensor
 
-    def __init__(self, width: int, chunk: int, knots: int = 2, std: float = 0.3, actions: int = ACTION_DIM):
+    def __init__(self, width: int, chunk: int, actions: int, knots: int, std: float, mode: str):
         super().__init__()
+        if not 1 <= knots <= chunk:
+            raise ValueError(f"knots={knots} must be between 1 and task.chunk={chunk}")
         self.chunk, self.knots, self.actions = chunk, knots, actions
         self.mean = nn.Linear(width, knots * actions)
         nn.init.normal_(self.mean.weight, std=1e-2)
         nn.init.zeros_(self.mean.bias)
         self.log_std = nn.Parameter(torch.full((knots, actions), float(torch.tensor(std).log())))
-        self.register_buffer("basis", knot_basis(chunk, knots))
+        self.from_rest = ActionMode(mode) is ActionMode.RELATIVE
+        self.register_buffer("basis", knot_basis(chunk, knots, self.from_rest))
         self.register_buffer("gain", torch.ones(actions))
         self.register_buffer("offset", torch.zeros(actions))
 
@@ -148,14 +155,14 @@ class ChunkGaussianHead(Head):
             self.offset.expand(*lead, -1),
         )
 
-    def normalise(self, chunks: Tensor, floor: Tensor) -> None:
-        """See Head.normalise; the knots of dimensions that vary get unit spread."""
-        knots = torch.linalg.pinv(self.basis) @ chunks
-        spread = knots.flatten(0, 1).std(0)
+    def normalise(self, chunks: Tensor, varies: Tensor) -> None:
+        """See Head.normalise; the knots of numbers that vary get unit spread."""
         centre = chunks.flatten(0, 1).mean(0)
-        active = spread > floor
+        middle = torch.zeros_like(centre) if self.from_rest else centre
+        spread = (torch.linalg.pinv(self.basis) @ (chunks - middle)).flatten(0, 1).std(0)
+        active = varies & (spread > 0)
         self.gain.copy_(torch.where(active, spread, 0.0))
-        self.offset.copy_(torch.where(active, 0.0, centre))
+        self.offset.copy_(torch.where(active, middle, centre))
 
     def target(self, chunks: Tensor) -> Tensor:
         """Knots [N, knots, A] in normalised units."""
@@ -177,4 +184,4 @@ class ChunkGaussianHead(Head):
     def _gap(self, one: Tensor, other: Tensor) -> Tensor:
         active = (self.gain > 0).float()
         error = (one - other).abs() * active
-        return error.sum() / (active.sum() * error.shape[0] * error.shape[1])
+        return error.sum() / (active.sum().clamp(min=1) * error.shape[0] * error.shape[1])

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from torch.distributions import Distribution, constraints, register_kl
 
 from actors.policies.heads import Head
-from envs.specs import ACTION_DIM
 
 
 class ChunkTokens(Distribution):
@@ -90,11 +89,10 @@ class ChunkTokenHead(Head):
     """Logits of the bins of every number of a chunk.
 
     Args:
-        width: of the trunk's output.
+        width: of the hidden vector.
         chunk: actions per chunk, K.
-        bins: per number.
-        low, high: range of every number until `normalise` finds a narrower one.
         actions: numbers of an action, A.
+        bins: per number; they span -1..1 until `normalise` finds another range.
     """
 
     names = ("logits", "low", "high")
@@ -102,33 +100,25 @@ class ChunkTokenHead(Head):
     low: Tensor
     high: Tensor
 
-    def __init__(
-        self,
-        width: int,
-        chunk: int,
-        bins: int = 64,
-        low: float = -1.0,
-        high: float = 1.0,
-        actions: int = ACTION_DIM,
-    ):
+    def __init__(self, width: int, chunk: int, actions: int, bins: int):
         super().__init__()
         self.chunk, self.bins, self.actions = chunk, bins, actions
         self.logits = nn.Linear(width, chunk * actions * bins)
         nn.init.normal_(self.logits.weight, std=1e-2)
         nn.init.zeros_(self.logits.bias)
-        self.register_buffer("low", torch.full((actions,), low))
-        self.register_buffer("high", torch.full((actions,), high))
+        self.register_buffer("low", torch.full((actions,), -1.0))
+        self.register_buffer("high", torch.full((actions,), 1.0))
 
     def forward(self, hidden: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         logits = self.logits(hidden.float()).unflatten(-1, (self.chunk, self.actions, self.bins))
         lead = hidden.shape[:-1]
         return logits, self.low.expand(*lead, -1), self.high.expand(*lead, -1)
 
-    def normalise(self, chunks: Tensor, floor: Tensor) -> None:
+    def normalise(self, chunks: Tensor, varies: Tensor) -> None:
         """See Head.normalise; the bins span the demonstrations and a tenth more on either side."""
         rows = chunks.flatten(0, 1)
         low, high, centre = rows.amin(0), rows.amax(0), rows.mean(0)
-        active, margin = rows.std(0) > floor, 0.1 * (high - low)
+        active, margin = varies & (high > low), 0.1 * (high - low)
         self.low.copy_(torch.where(active, low - margin, centre))
         self.high.copy_(torch.where(active, high + margin, centre))
 
@@ -142,7 +132,7 @@ class ChunkTokenHead(Head):
             target.shape
         )
         active = (self.high > self.low).float()
-        return (wrong * active).sum() / (active.sum() * target.shape[0] * target.shape[1])
+        return (wrong * active).sum() / (active.sum().clamp(min=1) * target.shape[0] * target.shape[1])
 
     def apart(self, one: Tensor, other: Tensor) -> Tensor:
         """Symmetric KL divergence per number that varies, in nats."""

@@ -5,26 +5,36 @@ from __future__ import annotations
 import abc
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor, nn
+
+from envs.embodiment import ActionKind, Embodiment
+
+RESOLUTION = 1e-4  # of any unit in use (metres, radians, degrees, shares); no motor moves by less
+MARGIN = 0.01  # share of the greatest spread among numbers of one unit, below which a number is constant
 
 
 class Head(nn.Module, abc.ABC):
     """From a policy's hidden vector [..., width] to the parameters of a distribution over chunks [K, A].
+
+    Built as head(width=, chunk=, actions=, **options of its config section).
 
     Attributes:
         names: of those parameters, in the order in which forward returns them; the distribution takes them by
             name.
         distribution: its class, with log_prob, entropy, mode, a registered KL divergence, and `held`.
         chunk: actions per chunk, K.
+        actions: numbers of an action, A.
     """
 
     names: ClassVar[tuple[str, ...]]
     distribution: ClassVar[type[Any]]
     chunk: int
+    actions: int
 
     @abc.abstractmethod
-    def normalise(self, chunks: Tensor, floor: Tensor) -> None:
-        """Set units from demonstrated chunks [N, K, A]; dimensions whose spread is below `floor` [A] become
+    def normalise(self, chunks: Tensor, varies: Tensor) -> None:
+        """Set units from demonstrated chunks [N, K, A]; numbers that do not vary (bool [A]) become
         constants.
         """
 
@@ -43,3 +53,32 @@ class Head(nn.Module, abc.ABC):
     @abc.abstractmethod
     def exploration(self) -> list[nn.Parameter]:
         """Parameters that say how much to explore, which demonstrations do not tell."""
+
+
+def varying(chunks: Tensor, robot: Embodiment) -> Tensor:
+    """Which numbers of an action vary in demonstrated chunks [N, K, A]: bool [A].
+
+    A number is constant if its standard deviation is below RESOLUTION, or below MARGIN times the greatest one
+    among the numbers of its unit: positions, angles and joints each have one, grippers that of their range,
+    and numbers of unknown meaning are each alone.
+    """
+    spread = chunks.flatten(0, 1).double().std(0, unbiased=False)
+    least = torch.full_like(spread, RESOLUTION)
+    for group in _units(robot):
+        least[group] = torch.maximum(least[group], MARGIN * spread[group].max())
+    for arm in robot.arms:
+        if arm.gripper is not None:
+            opened, closed = arm.gripper_range
+            least[arm.gripper] = max(RESOLUTION, MARGIN * abs(closed - opened))
+    return spread > least
+
+
+def _units(robot: Embodiment) -> list[list[int]]:
+    """Positions in the action of numbers that have the same unit."""
+    if robot.action_kind is ActionKind.OTHER:
+        return []
+    numbers = [list(arm.numbers) for arm in robot.arms]
+    if robot.action_kind is ActionKind.JOINTS:
+        return [[n for arm in numbers for n in arm]] if numbers else []
+    groups = ([n for arm in numbers for n in arm[:3]], [n for arm in numbers for n in arm[3:]])
+    return [group for group in groups if group]

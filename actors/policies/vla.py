@@ -1,4 +1,5 @@
-"""The small vision-language-action policy: all views, state and words in, a distribution over chunks out.
+"""The small vision-language-action policy: all views, the robot's state and the instruction in, a
+distribution over chunks out.
 
 Perception, fusion and head are modules of their own: heads (heads.py) are a choice, and RL may leave
 perception as it is.
@@ -6,141 +7,132 @@ perception as it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
+from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
 
-from actors.policies.heads import Head
-from envs.encoders import Gaze, PatchEncoder, WordEncoder, to_signed
-from envs.specs import CHUNK, IMAGE, LOG_PROB, STATE, STATE_DIM, TOKENS
+from actors.policies.contract import POLICY_FEATURES, VISUAL_FEATURES
+from actors.policies.heads import RESOLUTION, Head, varying
+from envs.encoders import MultiViewEncoder
+from envs.language import TextEncoder
+from envs.specs import CHUNK, IMAGE, INSTRUCTION_UTF8, LOG_PROB, STATE, WorldSpec
+from envs.targets import build
 
-# float32 [B, S]: what perception makes of pictures and words, for heads and critics
-VISUAL_FEATURES = ("policy", "visual_features")
-POLICY_FEATURES = ("policy", "policy_features")  # float32 [B, width]: that joined with the state
+_TEXT_FEATURES = 32
+_STATE_FEATURES = 64
 
 
 class Perception(nn.Module):
-    """Encodes pictures and words: the first view by key-points, the others in passing, words by a table.
+    """Encodes pictures and the instruction.
 
     Args:
-        views: number of cameras.
-        points: soft key-points of the first view.
-        channels: of its features.
-        aims: key-points that are taught to lie on the objects of the data, in their order.
+        spec: what the world shows.
+        points, width: of MultiViewEncoder.
     """
 
-    def __init__(self, views: int = 3, points: int = 32, channels: int = 32, aims: int = 0):
+    def __init__(self, spec: WorldSpec, points: int, width: int):
         super().__init__()
-        self.main = Gaze(points, channels, aims)
-        self.sides = nn.ModuleList(PatchEncoder(32) for _ in range(views - 1))
-        self.words = WordEncoder(16)
-        self.out_features = self.main.out_features + 32 * (views - 1) + 16
+        self.views = MultiViewEncoder(spec, points, width)
+        self.text = TextEncoder(_TEXT_FEATURES)
+        self.out_features = self.views.out_features + _TEXT_FEATURES
 
-    def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
-        """uint8 or float (-1..1) [B, V, 3, H, W], int64 [B, WORDS] -> float32 [B, out_features]; leading
-        dimensions may be more.
+    def forward(self, image: Tensor, text: Tensor) -> Tensor:
+        """uint8, or float in -1..1, [..., V, 3, H, W] and bytes uint8 [..., TEXT_BYTES] -> float32 [...,
+        out_features].
         """
         lead = image.shape[:-4]
-        seen, _ = self.look(image.reshape(-1, *image.shape[-4:]), tokens.reshape(-1, tokens.shape[-1]))
-        return seen.reshape(*lead, -1)
-
-    def look(self, image: Tensor, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """The same of one leading dimension, and where objects are seen in the first view, [B, 2, aims, 2];
-        see Gaze.
-        """
-        pictures = to_signed(image)
-        first, aimed = self.main(pictures[:, 0])
-        return torch.cat(
-            [first, *(side(pictures[:, k + 1]) for k, side in enumerate(self.sides)), self.words(tokens)], -1
-        ), aimed
+        seen = self.views(image.reshape(-1, *image.shape[-4:]))
+        said = self.text(text.reshape(-1, text.shape[-1]))
+        return torch.cat((seen, said), -1).reshape(*lead, -1)
 
 
 class Fusion(nn.Module):
-    """Joins what is seen with the joint state.
+    """Joins visual features with the robot's state.
 
     Args:
-        seen: features of perception.
+        visual: number of visual features.
+        states: numbers of the robot's state, S.
         width: size of the output.
-        states: numbers of the joint state.
     """
 
     state_mean: Tensor
     state_std: Tensor
 
-    def __init__(self, seen: int, width: int = 256, states: int = STATE_DIM):
+    def __init__(self, visual: int, states: int, width: int):
         super().__init__()
         self.register_buffer("state_mean", torch.zeros(states))
         self.register_buffer("state_std", torch.ones(states))
-        self.state = nn.Sequential(nn.Linear(states, 64), nn.SiLU(), nn.Linear(64, 64))
-        self.mix = nn.Sequential(nn.Linear(seen + 64, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())
+        self.state = nn.Sequential(
+            nn.Linear(states, _STATE_FEATURES), nn.SiLU(), nn.Linear(_STATE_FEATURES, _STATE_FEATURES)
+        )
+        self.mix = nn.Sequential(
+            nn.Linear(visual + _STATE_FEATURES, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU()
+        )
 
-    def forward(self, seen: Tensor, state: Tensor) -> Tensor:
-        """float [..., S], float [..., states] -> float32 [..., width]."""
+    def forward(self, visual: Tensor, state: Tensor) -> Tensor:
+        """float [..., visual], float [..., S] -> float32 [..., width]."""
         proprio = ((state - self.state_mean) / self.state_std).clamp(-5, 5)
-        return self.mix(torch.cat((seen, self.state(proprio)), -1))
+        return self.mix(torch.cat((visual, self.state(proprio)), -1))
 
 
 class ChunkPolicy(ProbabilisticTensorDictSequential):
-    """Perception, fusion, head and its distribution as one TorchRL policy with get_dist and log_prob.
+    """Perception, fusion, head and its distribution as one policy with get_dist (see contract.py).
 
     Args:
-        views: number of cameras.
-        head: builds what says chunks, from the width of the hidden vector; see heads.py.
-        width: of that vector.
-        points: soft key-points of the first view.
-        states: numbers of the joint state.
-        channels: of the first view's features.
-        aims: see Perception.
+        spec: what the world shows of which robot.
+        head: config section of the action head (heads.py): `_target_` and its options.
+        width: of the hidden vector.
+        points, channels: key-points and width of the main view's encoder.
 
-    Reads image, state and instruction tokens; writes ("vla_action", "chunk") and its log-probability.
+    Reads image, state and the instruction's bytes; writes ("vla_action", "chunk") and its log-probability.
 
-    Examples:
-        >>> policy = ChunkPolicy(views=3, head=partial(ChunkGaussianHead, chunk=4))
-        >>> sorted(map(str, policy.out_keys))[-1]
-        "('vla_action', 'log_probs')"
+    Raises:
+        ConfigError: if the head cannot be built.
+        ValueError: if it says chunks of another size than the robot takes.
     """
 
-    def __init__(
-        self,
-        views: int,
-        head: Callable[[int], Head],
-        width: int = 256,
-        points: int = 32,
-        states: int = STATE_DIM,
-        channels: int = 32,
-        aims: int = 0,
-    ):
-        eyes = Perception(views, points, channels, aims)
-        perception = TensorDictModule(eyes, in_keys=[IMAGE, TOKENS], out_keys=[VISUAL_FEATURES])
+    def __init__(self, spec: WorldSpec, head: Mapping[str, Any], width: int, points: int, channels: int):
+        eyes = Perception(spec, points, channels)
+        perception = TensorDictModule(eyes, in_keys=[IMAGE, INSTRUCTION_UTF8], out_keys=[VISUAL_FEATURES])
         fusion = TensorDictModule(
-            Fusion(eyes.out_features, width, states),
+            Fusion(eyes.out_features, spec.state_dim, width),
             in_keys=[VISUAL_FEATURES, STATE],
             out_keys=[POLICY_FEATURES],
         )
-        speaker = head(width)
-        said = TensorDictModule(
-            speaker, in_keys=[POLICY_FEATURES], out_keys=[("policy", name) for name in speaker.names]
+        action_head: Head = build(head, "policy.head", width=width, chunk=spec.chunk, actions=spec.action_dim)
+        says = (action_head.chunk, action_head.actions)
+        if says != (spec.chunk, spec.action_dim):
+            raise ValueError(
+                f"policy.head says chunks of {says[0]} x {says[1]} numbers, but {spec.embodiment.robot} takes"
+                f" {spec.chunk} x {spec.action_dim}; a head must use the chunk and actions that it is given"
+            )
+        parameters = TensorDictModule(
+            action_head,
+            in_keys=[POLICY_FEATURES],
+            out_keys=[("policy", name) for name in action_head.names],
         )
         sampler = ProbabilisticTensorDictModule(
-            in_keys={name: ("policy", name) for name in speaker.names},
+            in_keys={name: ("policy", name) for name in action_head.names},
             out_keys=[CHUNK],
-            distribution_class=speaker.distribution,
+            distribution_class=action_head.distribution,
             return_log_prob=True,
             log_prob_key=LOG_PROB,
         )
-        super().__init__(perception, fusion, said, sampler)
-        self.frozen = False
+        super().__init__(perception, fusion, parameters, sampler)
+        self.spec, self.frozen = spec, False
 
     @property
     def perception(self) -> Perception:
-        """What encodes pictures and words."""
+        """What encodes pictures and instruction."""
         return self[0].module
 
     @property
     def fusion(self) -> Fusion:
-        """What joins them with the state."""
+        """What joins them with the robot's state."""
         return self[1].module
 
     @property
@@ -148,12 +140,10 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         """What says chunks."""
         return self[2].module
 
-    def freeze_perception(self) -> None:
-        """Leave perception as imitation made it: what was seen during a rollout then serves every update, and
-        no picture is encoded twice.
-        """
-        self.perception.requires_grad_(False)
-        self.frozen = True
+    @property
+    def visual_dim(self) -> int:
+        """Numbers of ("policy", "visual_features")."""
+        return self.perception.out_features
 
     @property
     def trained(self) -> ProbabilisticTensorDictSequential:
@@ -162,14 +152,27 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         """
         return ProbabilisticTensorDictSequential(self[1], self[2], self[3]) if self.frozen else self
 
-    def normalise(self, chunks: Tensor, states: Tensor, floor: Tensor) -> None:
-        """Set units from demonstrations: dimensions that hardly vary become constants.
+    def freeze_perception(self) -> None:
+        """Leave perception as imitation made it: what it made of a rollout then serves every update, and no
+        picture is encoded twice.
+        """
+        self.perception.requires_grad_(False)
+        self.frozen = True
+
+    @torch.no_grad()
+    def normalise(self, chunks: Tensor, states: Tensor) -> None:
+        """Take units from demonstrations; numbers that hardly vary become constants (heads.varying).
 
         Args:
-            chunks: [N, K, 14] actions as the policy will emit them; states: [N, 16].
-            floor: [14] spread below which a dimension is a constant.
+            chunks: [N, K, A] as the policy will emit them; states: [N, S].
         """
-        with torch.no_grad():
-            self.head.normalise(chunks, floor)
-            self.fusion.state_mean.copy_(states.mean(0))
-            self.fusion.state_std.copy_(states.std(0).clamp(min=0.05))
+        self.head.normalise(chunks, varying(chunks, self.spec.embodiment))
+        spread = states.std(0, unbiased=False)
+        self.fusion.state_mean.copy_(states.mean(0))
+        self.fusion.state_std.copy_(torch.where(spread > RESOLUTION, spread, 1.0))
+
+    def imitation_loss(self, observed: TensorDictBase, chunks: Tensor) -> Tensor:
+        """The head's loss of imitating chunks [B, K, A] from observations [B]."""
+        seen = self.perception(observed[IMAGE], observed[INSTRUCTION_UTF8])
+        hidden = self.fusion(seen, observed[STATE])
+        return self.head.error(hidden, self.head.target(chunks))

@@ -1,0 +1,95 @@
+"""What Worldloop asks of a policy, and how it treats any policy.
+
+A policy is a TensorDictModule that reads observations by the keys of envs/specs.py (`in_keys`) and writes
+("vla_action", "chunk") [B, K, A] with its log-probability [B]; `get_dist` gives the distribution that
+learners differentiate. A policy that also writes ("vla_action", "tokens") is scored on those, as TorchRL's are.
+
+Whatever else a policy has is used if it is there:
+
+- "language_instruction" among its in_keys: it is given the instruction as text;
+- ("policy", "visual_features") among its out_keys, and `visual_dim`: critics read them instead of pictures;
+- `trained`: the part that learners train and score, if that is not all of it;
+- `freeze_perception()`: for rl.freeze_perception;
+- `normalise(chunks [N, K, A], states [N, S])`: takes units from demonstrations;
+- `imitation_loss(observed, chunks [B, K, A])`: a better one than the negative log-likelihood.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import NestedKey, NonTensorStack, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.data.vla import ACTION_TOKENS_KEY
+
+from envs.specs import CHUNK, INSTRUCTION, INSTRUCTION_UTF8, bytes_to_text
+
+VISUAL_FEATURES = ("policy", "visual_features")  # float32 [B, visual_dim]: of pictures and instruction
+POLICY_FEATURES = ("policy", "policy_features")  # float32 [B, width]: those joined with the robot's state
+
+
+def trained_part(policy: TensorDictModuleBase) -> TensorDictModuleBase:
+    """What learners train and score: `policy.trained`, or all of it."""
+    return getattr(policy, "trained", policy)
+
+
+def action_key(policy: TensorDictModuleBase) -> NestedKey:
+    """The key of what the policy's distribution scores: action tokens if it writes any, else the chunk."""
+    return ACTION_TOKENS_KEY if ACTION_TOKENS_KEY in policy.out_keys else CHUNK
+
+
+def input_keys(policy: TensorDictModuleBase) -> list[NestedKey]:
+    """The keys of what a rollout must carry for a policy to be scored again; text travels as bytes."""
+    return [INSTRUCTION_UTF8 if key == INSTRUCTION else key for key in policy.in_keys]
+
+
+def writes_features(policy: TensorDictModuleBase) -> bool:
+    """Whether critics may read ("policy", "visual_features") of this policy."""
+    return VISUAL_FEATURES in policy.out_keys
+
+
+def with_text(observed: TensorDictBase, policy: TensorDictModuleBase) -> TensorDictBase:
+    """Observations [...] with the instruction as text, for policies that ask for it; the rest is shared.
+
+    The text is decoded from the bytes that rollouts carry.
+    """
+    if INSTRUCTION not in policy.in_keys:
+        return observed
+    out = observed.copy()
+    text = out[INSTRUCTION_UTF8]
+    stack = NonTensorStack(*bytes_to_text(text.reshape(-1, text.shape[-1])))
+    out[INSTRUCTION] = stack if out.ndim == 1 else stack.reshape(out.shape)
+    return out
+
+
+def device_of(module: nn.Module) -> torch.device:
+    """Where a module's numbers live; the CPU if it has none."""
+    return next((value.device for value in module.parameters()), torch.device("cpu"))
+
+
+def inputs_for(observed: TensorDictBase, policy: TensorDictModuleBase) -> TensorDictBase:
+    """The observations that a policy reads, on its device and with text if it asks for it."""
+    given = observed.select(*input_keys(policy), strict=False).to(device_of(policy))
+    return with_text(given, policy)
+
+
+def distribution(policy: TensorDictModuleBase, data: TensorDictBase) -> Any:
+    """The policy's distribution for observations [B], which are left as they are."""
+    return policy.get_dist(with_text(data, policy).copy())
+
+
+def imitation_loss(policy: TensorDictModuleBase, observed: TensorDictBase, chunks: Tensor) -> Tensor:
+    """Scalar loss of imitating chunks [B, K, A]: the policy's own, or their negative log-likelihood per
+    number.
+    """
+    own = getattr(policy, "imitation_loss", None)
+    if own is not None:
+        return own(with_text(observed, policy), chunks)  # type: ignore[no-any-return]
+    return -distribution(policy, observed).log_prob(chunks).mean() / chunks[0].numel()
+
+
+def with_fixed_spread(dist: Any) -> Any:
+    """A distribution whose spread does not learn, for those that tell mean and spread apart."""
+    return dist.held() if hasattr(dist, "held") else dist

@@ -1,0 +1,67 @@
+"""What stands between any policy and a world: text and devices on the way in, only sound numbers on the way
+out.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from actors.policies.contract import VISUAL_FEATURES, input_keys, inputs_for
+from envs.specs import CHUNK, COMMAND, INVALID_ACTION, LOG_PROB, ActionMode, WorldSpec
+
+
+class SafePolicyWrapper(TensorDictModuleBase):
+    """Any policy as worlds may use it.
+
+    Observations go to the policy's device and what it writes comes back to the world's; a policy that asks
+    for "language_instruction" is given text. Chunks that are NaN or infinite never reach a world: the robot
+    rests instead, and INVALID_ACTION says so.
+
+    Args:
+        policy: acts; see contract.py.
+        spec: what the world takes.
+        mode: how the numbers of a chunk are meant.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, spec: WorldSpec, mode: ActionMode):
+        super().__init__()
+        self.policy, self.spec, self.mode = policy, spec, mode
+        self.in_keys = list(dict.fromkeys([*input_keys(policy), COMMAND]))
+        self.out_keys = [*policy.out_keys, INVALID_ACTION]
+
+    def forward(self, observed: TensorDictBase) -> TensorDictBase:
+        """Writes what the policy writes, and INVALID_ACTION bool [B, 1].
+
+        Raises:
+            ValueError: if the policy's chunks are of another size than the world takes.
+        """
+        said = self.policy(inputs_for(observed, self.policy))
+        for key in self.policy.out_keys:
+            value = said.get(key, None)
+            if value is not None:
+                observed[key] = value.to(observed[COMMAND].device)
+        chunk = observed[CHUNK]
+        if tuple(chunk.shape[1:]) != (self.spec.chunk, self.spec.action_dim):
+            raise ValueError(
+                f"the policy says chunks {list(chunk.shape[1:])}, but {self.spec.embodiment.robot} takes"
+                f" [{self.spec.chunk}, {self.spec.action_dim}]; build it for this robot and task.chunk"
+            )
+        bad = ~chunk.isfinite().flatten(1).all(1)
+        if LOG_PROB in self.policy.out_keys:
+            bad |= ~observed[LOG_PROB].isfinite()
+        if bad.any():
+            observed[CHUNK] = torch.where(bad[:, None, None], self._rest(observed[COMMAND]), chunk)
+            for key in (LOG_PROB, VISUAL_FEATURES):
+                if key in self.policy.out_keys:
+                    value = observed[key]
+                    observed[key] = torch.where(bad.view(-1, *[1] * (value.ndim - 1)), 0.0, value)
+        observed[INVALID_ACTION] = bad.unsqueeze(-1)
+        return observed
+
+    def _rest(self, command: Tensor) -> Tensor:
+        """The chunk [B, K, A] by which a robot stays as it is: its command in force, or no change."""
+        holds = self.mode is ActionMode.ABSOLUTE and not self.spec.embodiment.delta
+        return (command if holds else torch.zeros_like(command)).unsqueeze(1).expand(-1, self.spec.chunk, -1)
