@@ -1,126 +1,205 @@
-"""The DiT engine: determinism per seed and chunk, and that it can learn."""
+"""The DiT engine for every robot: determinism in any batch slot, partial resets, learning, no unused weights."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import pytest
 import torch
 
-from envs.episodes.clips import ClipSpec, ClipStore
-from envs.simulators.base import WorldShape
-from envs.simulators.dit.engine import DiTConfig, DiTSimulator
-from envs.simulators.dit.network import Attention, DiTShape, MultiViewDiT
-from envs.simulators.replay import replay
-from envs.simulators.state_experts.flow import StateExpertConfig, untrained_expert
+from envs.simulators import memory
+from envs.simulators.dit.engine import DiTSimulator
+from envs.simulators.dit.layers import Attention
+from envs.simulators.dit.network import DiTShape, MultiViewDiT
+from envs.simulators.inputs import build_inputs
+from envs.simulators.state_experts.flow import StateExpert, StateTokens
+from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES, EMBODIMENTS, world_spec
+from tests.envs.clips_of import clip_of, first_of, future_of
 
-TINY = DiTConfig(layers=3, heads=2, head_dim=32, adaln_rank=8, codec_width=16, steps=2)
+NET = {"layers": 3, "heads": 2, "head_dim": 24, "adaln_rank": 8, "patch": 2, "stem": 8}
+DENOISING: dict[str, Any] = {
+    "prediction": "clean",
+    "steps": 2,
+    "shift": 2.0,
+    "foreground": 4.0,
+    "augment": 0.8,
+}
+
+
+def make(robot: str, **denoising: Any) -> DiTSimulator:
+    torch.manual_seed(0)
+    spec = world_spec(EMBODIMENTS[robot])
+    world = DiTSimulator(spec, 3, NET, {"channels": 8, "width": 16}, DENOISING | denoising)
+    with torch.no_grad():
+        world.net.proj_out.weight.mul_(20)  # output that is not trivial
+    return world.eval()
+
+
+def expert_of(world: DiTSimulator) -> StateExpert:
+    torch.manual_seed(1)
+    return StateExpert(world, layers=2, heads=2, head_dim=16, steps=2).eval()
 
 
 @pytest.fixture
 def dit() -> DiTSimulator:
-    torch.manual_seed(0)
-    return DiTSimulator(WorldShape(chunk=4), TINY).eval()
+    return make("two_arms_poses")
 
 
-def test_rollouts_depend_on_seed_and_not_on_batch(dit: DiTSimulator, store: ClipStore) -> None:
-    torch.manual_seed(1)
-    expert = untrained_expert(dit, StateExpertConfig(layers=2)).eval()
-    both = replay(dit, store, torch.tensor([1, 2]), expert, bf16=False)
-    alone = replay(dit, store, torch.tensor([2]), expert, bf16=False)
-    length = alone.frames.shape[1]
-    assert (both.frames[1, :length].int() - alone.frames[0].int()).abs().max() <= 1
-    assert torch.allclose(both.states[1, :length], alone.states[0], atol=1e-3)
-    assert not torch.equal(
-        dit._noise(torch.tensor([1]), torch.tensor([0]), torch.zeros(1, 3, 16, 4, 8, 8)),
-        dit._noise(torch.tensor([1]), torch.tensor([1]), torch.zeros(1, 3, 16, 4, 8, 8)),
-    )
+@pytest.mark.parametrize("robot", EMBODIMENTS)
+def test_rows_depend_on_seed_and_commands_and_on_no_other_row(robot: str) -> None:
+    world = make(robot)
+    expert, spec = expert_of(world), world.spec
+    first, seeds = first_of(spec, 3), torch.tensor([7, 8, 7])
+    first[2] = first[0]
+    together, alone = world.reset(first, seeds), world.reset(first[1:2], seeds[1:2])
+    for step in range(2):
+        future = future_of(spec, 3, step)
+        future[2] = future[0]
+        frames, features, together = world.step(together, future)
+        states = expert.follow(together, spec.chunk, features)
+        assert frames.shape == (3, spec.chunk, spec.views, 3, *spec.size) and frames.dtype == torch.uint8
+        assert states.shape == (3, spec.chunk, spec.state_dim) and torch.isfinite(states).all()
+        one, own, alone = world.step(alone, future[1:2])
+        assert torch.equal(frames[0], frames[2]) and not torch.equal(frames[0], frames[1])
+        assert (frames[1].int() - one[0].int()).abs().max() <= 1
+        assert torch.allclose(states[1], expert.follow(alone, spec.chunk, own)[0], atol=1e-3)
+    # Another command, other frames: the action vector tells, whether or not there is a pose map.
+    again = world.reset(first[:1], seeds[:1])
+    other = future_of(spec, 1)
+    frames = world.step(again.clone(), other)[0]
+    other["commands"] = other["commands"] + 1.0
+    assert not torch.equal(world.step(again, other)[0], frames)
 
 
-def test_loss_trains_trunk_and_unrolls(dit: DiTSimulator, store: ClipStore) -> None:
-    clip = store.clips(torch.tensor([1, 2]), torch.tensor([0, 3]), ClipSpec(4, 4, 2))
-    loss, _ = dit.loss(clip, torch.Generator().manual_seed(0))
+def test_a_partial_reset_is_a_masked_write(dit: DiTSimulator) -> None:
+    spec = dit.spec
+    state = dit.reset(first_of(spec, 2), torch.tensor([1, 2]))
+    _, _, state = dit.step(state, future_of(spec, 2))
+    fresh = first_of(spec, 1, seed=9)
+    state = memory.replace(state, torch.tensor([True, False]), dit.reset(fresh, torch.tensor([5])))
+    assert state["length"].tolist() == [1, 1 + spec.chunk] and state["chunk_index"].tolist() == [0, 1]
+    future = future_of(spec, 2, 3)
+    mixed = dit.step(state, future)[0]
+    again = dit.step(dit.reset(fresh, torch.tensor([5])), future[:1])[0]
+    assert (mixed[0].int() - again[0].int()).abs().max() <= 1
+
+
+@pytest.mark.parametrize("robot", EMBODIMENTS)
+def test_every_weight_learns_and_nothing_of_the_autoencoder(robot: str) -> None:
+    world = make(robot)
+    clip = clip_of(world.spec, 2, 3, chunks=2)
+    loss, _ = world.loss(clip, torch.Generator().manual_seed(1))
     loss.backward()
-    assert dit.net.patch_embed["proj"].weight.grad.abs().sum() > 0
-    assert all(p.grad is None for p in dit.codec.parameters())
+    assert [n for n, p in world.named_parameters() if p.requires_grad and p.grad is None] == []
+    dead = [n for n, p in world.named_parameters() if p.grad is not None and not p.grad.abs().sum() > 0]
+    assert dead == []
+    assert all(p.grad is None for p in world.codec.parameters())
+    expert = expert_of(world)
+    inputs = build_inputs(world.spec, clip, 0, generator=torch.Generator().manual_seed(0))
+    features = expert.read(expert.look(world, inputs))
+    future = clip["future"][:, : world.spec.chunk]
+    expert.loss(features, clip["history"], future, torch.Generator().manual_seed(0)).backward()
+    dead = [n for n, p in expert.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+    # of one key's bias the softmax over all keys takes no notice
+    assert all(name.endswith("to_k.bias") for name in dead), dead
+
+
+@pytest.mark.parametrize("prediction", ["velocity", "clean"])
+def test_loss_falls_and_frames_come_nearer(prediction: str) -> None:
+    world = make("one_arm_deltas", prediction=prediction, augment=0.0)
+    clip = clip_of(world.spec, 4, 3)
+    world.normalise(clip["future", "commands"].flatten(0, 1), torch.zeros(1, 4), clip["now", "state"])
+    optimiser = torch.optim.Adam([p for p in world.parameters() if p.requires_grad], 3e-3)
+    generator, losses = torch.Generator().manual_seed(0), []
+    for _ in range(60):
+        optimiser.zero_grad()
+        loss = world.loss(clip, generator)[0]
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    assert sum(losses[-10:]) < 0.6 * sum(losses[:10])
+
+
+def test_predictions_follow_the_flow_to_the_data(dit: DiTSimulator) -> None:
+    from envs.simulators.dit.prediction import PREDICTIONS
+
+    clean, noise, base = torch.randn(3, 2, 4)
+    z = 0.3 * clean + 0.7 * noise
+    for said, name in ((noise - clean, "velocity"), (clean - base, "clean")):
+        prediction = PREDICTIONS[name]
+        assert torch.allclose(prediction.velocity(said, z, 0.7, base), noise - clean, atol=1e-5)
+        assert prediction.error(said, clean, noise, base).abs().max() < 1e-5
+    with pytest.raises(ValueError, match=r"denoising\.prediction='x0'"):
+        make("one_arm_deltas", prediction="x0")
+    with pytest.raises(ValueError, match=r"task\.size"):
+        DiTSimulator(world_spec(ARM_DELTAS, (24, 32)), 3, NET, {"channels": 8, "width": 16}, DENOISING)
+
+
+def test_the_expert_learns_its_mix_and_the_simulator_takes_it_over(dit: DiTSimulator) -> None:
+    expert = expert_of(dit)
+    inputs = build_inputs(dit.spec, clip_of(dit.spec, 2, 3), 0, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        expert.net.video_buffer_weights.copy_(torch.tensor([0.5, 2.0, -1.0]))
+    expert.attach(dit)
+    mine = expert.read(expert.look(dit, inputs)).detach()
+    assert torch.allclose(dit.features(inputs)[:, :, expert.read_tokens].detach(), mine, atol=1e-5)
+    assert dit.features(inputs).shape[1:] == dit.feature_shape
+
+
+def test_state_tokens_mean_what_the_robot_says() -> None:
+    g = torch.Generator().manual_seed(0)
+    for robot, absolute in (
+        (BIMANUAL_JOINTS, True),
+        (ARM_JOINTS, True),
+        (BIMANUAL_POSES, False),
+        (ARM_DELTAS, False),
+    ):
+        tokens = StateTokens(robot)
+        commands, past = (torch.randn(1, n, robot.action_dim, generator=g) for n in (4, 2))
+        states = torch.randn(1, 2, robot.state_dim, generator=g)
+        clean, origin = tokens.clean(commands, past, states)
+        assert clean.shape == (1, 8, max(robot.action_dim, robot.state_dim))
+        assert (origin == 0).all() == absolute
+        moved, _ = tokens.clean(commands + 1, past + 1, states)
+        # only absolute joints and deltas are told as they are
+        unmoved = torch.allclose(moved, clean, atol=1e-5)
+        assert unmoved == (not absolute and not robot.delta)
 
 
 def test_cross_view_attention_in_every_third_block_only() -> None:
-    torch.manual_seed(0)
-    shape = DiTShape(
-        in_channels=4,
-        out_channels=4,
-        num_attention_heads=2,
-        attention_head_dim=24,
-        num_layers=3,
-        text_embed_dim=8,
-        adaln_lora_dim=8,
-    )
-    net = MultiViewDiT(shape).eval()
+    net = tiny_net()
     calls = []
     for block in net.transformer_blocks:
         block.register_forward_pre_hook(lambda module, args: calls.append(args[-1]))
-    net(torch.randn(3, 4, 2, 4, 4), torch.rand(3, 2), torch.zeros(1, 1, 8), 3, 10.0)
+    net(torch.randn(3, 4, 2, 4, 4), torch.rand(3, 2), torch.zeros(1, 1, 8), 10.0)
     assert calls == [3, 1, 1]
 
 
-def test_known_text_keys_change_nothing_and_follow_the_weights() -> None:
+def tiny_net() -> MultiViewDiT:
     torch.manual_seed(0)
-    net = MultiViewDiT(
-        DiTShape(
-            in_channels=4,
-            out_channels=4,
-            num_attention_heads=2,
-            attention_head_dim=24,
-            num_layers=3,
-            text_embed_dim=8,
-            adaln_lora_dim=8,
-        )
-    ).eval()
+    sizes = {"num_attention_heads": 2, "attention_head_dim": 24, "num_layers": 3, "adaln_lora_dim": 8}
+    return MultiViewDiT(DiTShape(in_channels=4, out_channels=4, text_embed_dim=8, **sizes)).eval()
+
+
+def test_known_text_keys_change_nothing_and_follow_the_weights() -> None:
+    net = tiny_net()
     for p in net.parameters():
         torch.nn.init.normal_(p, std=0.1)
     latents, times, text = torch.randn(6, 4, 2, 4, 4), torch.rand(6, 2), torch.randn(1, 5, 8)
-    anew = net(latents, times, text.repeat(6, 1, 1), 3, 10.0)[0].detach()
+    anew = net(latents, times, text.repeat(6, 1, 1), 10.0)[0].detach()
     with torch.no_grad():
-        kept = [net(latents, times, text, 3, 10.0)[0] for _ in range(2)]
+        kept = [net(latents, times, text, 10.0)[0] for _ in range(2)]
         assert torch.allclose(kept[0], anew, atol=1e-5) and torch.equal(*kept)
         net.transformer_blocks[0].attn2.to_v.weight.mul_(3.0)
-        assert not torch.allclose(net(latents, times, text, 3, 10.0)[0], kept[0], atol=1e-4)
+        assert not torch.allclose(net(latents, times, text, 10.0)[0], kept[0], atol=1e-4)
 
 
-def test_the_expert_learns_its_mix_and_the_simulator_takes_it_over(
-    dit: DiTSimulator, store: ClipStore
-) -> None:
-    torch.manual_seed(1)
-    expert = untrained_expert(dit, StateExpertConfig(layers=2))
-    clip = store.clips(torch.tensor([1, 2]), torch.tensor([0, 3]), ClipSpec(4, 4))
-    inputs = dit.build_inputs(clip, 0, generator=torch.Generator().manual_seed(0))
-    dit.requires_grad_(False)
-    features = expert.read(expert.look(dit, inputs))
-    history, future = clip["history"], clip["future"]
-    expert.loss(
-        features,
-        future["commands"],
-        history["commands"],
-        history["states"],
-        future["states"],
-        future["valid"].float(),
-        torch.Generator().manual_seed(0),
-    ).backward()
-    assert expert.net.video_buffer_weights.grad.abs().max() > 0
-    with torch.no_grad():
-        expert.net.video_buffer_weights.copy_(torch.tensor([0.5, 2.0, -1.0]))
-        expert.attach(dit)
-        assert torch.allclose(
-            dit.features(inputs)[:, :, expert.tokens], expert.read(expert.look(dit, inputs)), atol=1e-5
-        )
-
-
-def test_checkpointed_blocks_give_the_same_gradients(dit: DiTSimulator, store: ClipStore) -> None:
-    clip = store.clips(torch.tensor([1]), torch.tensor([0]), ClipSpec(4, 4))
+def test_checkpointed_blocks_give_the_same_gradients(dit: DiTSimulator) -> None:
     grads = []
     for checkpointing in (False, True):
         dit.net.checkpointing = checkpointing
         dit.zero_grad()
-        dit.loss(clip, torch.Generator().manual_seed(0))[0].backward()
+        dit.loss(clip_of(dit.spec, 1, 3), torch.Generator().manual_seed(0))[0].backward()
         grads.append(dit.net.transformer_blocks[1].attn1.to_q.weight.grad.clone())
     assert torch.allclose(*grads, atol=1e-7)
 

@@ -52,7 +52,7 @@ def test_a_urdf_without_its_meshes(tmp_path: Path) -> None:
     with pytest.raises(KinematicsError, match="no link or site 'hand'"):
         Kinematics(Robot(str(tmp_path / "two.urdf"), names, ("hand", "tool_r")))
     with pytest.raises(KinematicsError, match="does not exist"):
-        Kinematics(Robot(str(tmp_path / "none.urdf")))
+        Kinematics(Robot(str(tmp_path / "none.urdf"), names, ("tool_l", "tool_r")))
     (tmp_path / "bad.urdf").write_text("<robot")
     with pytest.raises(KinematicsError, match="cannot be read"):
-        Kinematics(Robot(str(tmp_path / "bad.urdf")))
+        Kinematics(Robot(str(tmp_path / "bad.urdf"), names, ("tool_l", "tool_r")))

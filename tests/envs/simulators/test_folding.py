@@ -6,8 +6,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from envs.simulators.unet.engine import _Embed
-from envs.simulators.unet.folding import at_detail, fold, unfold
+from envs.simulators.unet.blocks import Embed, at_detail
+from envs.simulators.unet.folding import fold, unfold
 
 
 @pytest.mark.parametrize(
@@ -31,13 +31,7 @@ def test_unfolding_passes_gradients_on() -> None:
 @pytest.mark.parametrize("shrink", [1, 2])
 def test_looking_at_bytes_is_a_convolution_of_pictures(shrink: int) -> None:
     torch.manual_seed(0)
-    embed = _Embed(6, 5, 8, shrink)
-    pictures, maps = (
-        torch.randint(0, 256, (2, 6, 16 * shrink, 24 * shrink), dtype=torch.uint8),
-        torch.rand(2, 5, 16, 24) * 2 - 1,
-    )
+    embed = Embed(6, 8, shrink)
+    pictures = torch.randint(0, 256, (2, 6, 16 * shrink, 24 * shrink), dtype=torch.uint8)
     small = at_detail(pictures, shrink) * 2 - 1
-    weight = torch.cat((embed.pictures, embed.maps.unflatten(1, (5, 4, 4))), 1)
-    assert torch.allclose(
-        embed(pictures, maps), F.conv2d(torch.cat((small, maps), 1), weight, embed.bias, stride=4), atol=1e-5
-    )
+    assert torch.allclose(embed(pictures), F.conv2d(small, embed.weight, embed.bias, stride=4), atol=1e-5)
