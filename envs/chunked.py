@@ -4,6 +4,8 @@ episodes.
 
 from __future__ import annotations
 
+import hashlib
+import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -13,91 +15,98 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from envs.language import VOCABULARY, WORDS, tokenize
-from envs.specs import ACTION_DIM, EPISODE, STATE_DIM, TOKENS, ActionMode
+from envs.specs import EPISODE, INSTRUCTION_UTF8, TEXT_BYTES, ActionMode, WorldSpec, text_to_bytes
 
 
 class ChunkedEnv(EnvBase):
     """Base of PhysicsEnv and WorldEnv: a batched environment with the same specs in truth and in imagination.
 
     Every episode has a seed. Seeds come from the queue filled by `schedule`, and when it is empty from a
-    stream
-    of their own; what happens in an episode depends on its seed and on the actions only.
+    stream of their own; what happens in an episode depends on its seed and on the actions only.
 
     Args:
+        spec: robot, size of the views, actions per step K.
         batch: episodes side by side, B.
-        chunk: actions per step, K.
-        horizon: control steps per episode, a multiple of `chunk`.
-        views: number of cameras, V.
-        size: (height, width) of every view.
+        horizon: actions per episode, a multiple of K.
         mode: meaning of the chunk's numbers.
         device: where observations live.
         seed: of the stream of episode seeds.
-        states, actions: numbers of a state and of an action; worlds of another robot say so.
+
+    Attributes:
+        instructions: texts of the B episodes, of which rollouts carry bytes (specs.INSTRUCTION_UTF8).
 
     Raises:
-        ValueError: if the horizon is not a multiple of the chunk.
+        ValueError: if the horizon is not a multiple of the chunk, or deltas are to be relative.
     """
 
     def __init__(
         self,
+        spec: WorldSpec,
         batch: int,
-        chunk: int,
         horizon: int,
-        views: int,
-        size: tuple[int, int],
         mode: ActionMode,
         device: torch.device | str = "cpu",
         seed: int = 0,
-        states: int = STATE_DIM,
-        actions: int = ACTION_DIM,
     ):
-        if horizon % chunk:
-            raise ValueError(f"task.horizon={horizon} must be a multiple of task.chunk={chunk}")
+        mode = ActionMode(mode)
+        if horizon % spec.chunk:
+            raise ValueError(f"task.horizon={horizon} must be a multiple of task.chunk={spec.chunk}")
+        if spec.embodiment.delta and mode is ActionMode.RELATIVE:
+            raise ValueError(
+                f"task.mode=relative needs absolute actions, and those of {spec.embodiment.robot} are deltas;"
+                " set task.mode=absolute"
+            )
         super().__init__(device=torch.device(device), batch_size=torch.Size([batch]))
-        self.chunk, self.horizon, self.mode = chunk, horizon, ActionMode(mode)
+        self.spec, self.horizon, self.mode = spec, horizon, mode
         self._stream = torch.Generator().manual_seed(seed)
         self._queue: deque[int] = deque()
         self._seeds = torch.zeros(batch, dtype=torch.int64)
         self._steps = torch.zeros(batch, dtype=torch.int64)
         self._over = torch.ones(batch, 1, dtype=torch.bool)
-        self._values: dict[int, dict[str, Any]] = {}
-        # Words stay outside the rollout, which carries their tokens: stacks of strings break TorchRL's
-        # stacking by device.
+        # Texts stay outside the rollout: stacks of strings break TorchRL's stacking by device.
         self.instructions: list[str] = [""] * batch
-        shape = (batch,)
-        height, width = size
-        self.observation_spec = Composite(
-            observation=Composite(
-                image=Bounded(0, 255, (*shape, views, 3, height, width), dtype=torch.uint8),
-                state=Unbounded((*shape, states)),
-                command=Unbounded((*shape, actions)),
-                tokens=Bounded(0, VOCABULARY - 1, (*shape, WORDS), dtype=torch.int64),
+        self._set_specs()
+
+    @property
+    def chunk(self) -> int:
+        """Actions per step, K."""
+        return self.spec.chunk
+
+    def _set_specs(self) -> None:
+        spec, shape = self.spec, tuple(self.batch_size)
+        views = spec.views
+        seen = {
+            "observation": Composite(
+                image=Bounded(0, 255, (*shape, views, 3, *spec.size), dtype=torch.uint8),
+                state=Unbounded((*shape, spec.state_dim)),
+                command=Unbounded((*shape, spec.action_dim)),
+                instruction_utf8=Bounded(0, 255, (*shape, TEXT_BYTES), dtype=torch.uint8),
                 shape=shape,
             ),
-            camera=Composite(
+            "success": Binary(1, (*shape, 1), dtype=torch.bool),
+            "progress": Bounded(0.0, 1.0, (*shape, 1)),
+            "episode_seed": Unbounded((*shape, 1), dtype=torch.int64),
+        }
+        if spec.embodiment.calibrated:
+            seen["camera"] = Composite(
                 intrinsic=Unbounded((*shape, views, 3, 3)),
                 c2w=Unbounded((*shape, views, 4, 4)),
                 shape=shape,
-            ),
-            success=Binary(1, (*shape, 1), dtype=torch.bool),
-            progress=Bounded(0.0, 1.0, (*shape, 1)),
-            episode_seed=Unbounded((*shape, 1), dtype=torch.int64),
-            shape=shape,
-            device=device,
-        )
+            )
+        self.observation_spec = Composite(seen, shape=shape, device=self.device)
         self._observation_keys = list(self.observation_spec.keys(True, True))
-        # A spec must be bounded to be sampled from; a metre or a radian per chunk is beyond what any arm
-        # does.
+        # A spec must be bounded to be sampled from: offsets of a metre or a radian and deltas of one are more
+        # than arms do at once, joints turn by half a circle.
+        absolute = self.mode is ActionMode.ABSOLUTE and not spec.embodiment.delta
+        bound = math.pi if absolute else 1.0
+        chunk = Bounded(-bound, bound, (*shape, spec.chunk, spec.action_dim))
         self.action_spec = Composite(
-            vla_action=Composite(chunk=Bounded(-1.0, 1.0, (*shape, chunk, actions)), shape=shape),
-            shape=shape,
-            device=device,
+            vla_action=Composite(chunk=chunk, shape=shape), shape=shape, device=self.device
         )
-        self.reward_spec = Unbounded((*shape, 1), device=device)
-        flag = Categorical(2, (*shape, 1), dtype=torch.bool, device=device)
+        self.reward_spec = Unbounded((*shape, 1), device=self.device)
+        flag = Categorical(2, (*shape, 1), dtype=torch.bool, device=self.device)
         self.done_spec = Composite(
-            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape, device=device
+            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape, device=self.device
         )
 
     def schedule(self, seeds: Iterable[int]) -> None:
@@ -107,7 +116,8 @@ class ChunkedEnv(EnvBase):
         """
         self._queue = deque(int(seed) for seed in seeds)
         if self._queue:
-            self._stream.manual_seed(hash(tuple(self._queue)) & 0x7FFF_FFFF)
+            digest = hashlib.sha256(repr(tuple(self._queue)).encode()).digest()
+            self._stream.manual_seed(int.from_bytes(digest[:6], "big"))
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
@@ -130,6 +140,11 @@ class ChunkedEnv(EnvBase):
     def _with_identity(self, out: TensorDict, instructions: Sequence[str]) -> TensorDict:
         # a rollout keeps it while resets go on
         out[EPISODE] = self._seeds.to(self.device, copy=True).unsqueeze(-1)
-        out[TOKENS] = torch.stack([tokenize(text) for text in instructions]).to(self.device)
-        self.instructions = list(instructions)
+        if list(instructions) != self.instructions or self._text is None:
+            self.instructions = list(instructions)
+            self._text = text_to_bytes(self.instructions).to(self.device)
+        out[INSTRUCTION_UTF8] = self._text.clone()
         return out
+
+    _text: torch.Tensor | None = None
+    _observation_keys: list[Any]

@@ -1,1 +1,1 @@
-"""The true world: a MuJoCo bench with two arms. Only env.py imports torch, so worker processes start fast."""
+"""True worlds: task suites behind one contract. Only env.py and toy_tracking.py import torch."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from envs.chunked import ChunkedEnv
-from envs.physics.pool import BenchPool, Track
-from envs.physics.tabletop.bench import BenchConfig
+from envs.physics.pool import TaskPool, Track
 from envs.specs import (
     C2W,
     CHUNK,
@@ -23,56 +23,61 @@ from envs.specs import (
     SUCCESS,
     ActionMode,
     Rewards,
+    WorldSpec,
     check_chunk,
-    to_absolute,
+    to_commands,
 )
 
 
 class PhysicsEnv(ChunkedEnv):
-    """A batch of MuJoCo benches; rewards and success come from the true positions.
+    """A batch of true episodes of one task; rewards and success come from the suite.
 
     Args:
-        config: the bench's options.
-        batch: episodes side by side.
-        chunk: actions per step, K.
-        horizon: control steps per episode, a multiple of `chunk`.
+        suite: config section of the task suite; its cameras must have the spec's size.
+        task: a name of the suite's tasks.
+        spec: robot, size of the views, actions per step K.
+        batch: episodes side by side, B.
+        horizon: actions per episode, a multiple of K.
         mode: meaning of the chunk's numbers.
-        rewards: weights of progress and success.
-        workers: processes; 0 means one per core.
+        rewards: weights of true progress and success.
+        workers: processes; 0 means one per core, 1 runs in this process.
         record: keep every frame of every episode, for `pop_tracks`.
         seed: of the stream of episode seeds.
 
     Examples:
-        >>> env = PhysicsEnv(BenchConfig(), batch=2, chunk=8, horizon=40)
-        >>> env.rollout(2)[("observation", "image")].shape
+        >>> env = PhysicsEnv(cfg.task.suite, "push", spec, batch=2, horizon=40, mode=ActionMode.RELATIVE,
+        ...     rewards=Rewards(progress=1.0, success=1.0))
+        >>> env.rollout(2)[IMAGE].shape  # [B, T, V, 3, H, W]
         torch.Size([2, 2, 3, 3, 64, 64])
     """
 
     def __init__(
         self,
-        config: BenchConfig,
+        suite: Mapping[str, Any],
+        task: str,
+        spec: WorldSpec,
         batch: int,
-        chunk: int,
         horizon: int,
-        mode: ActionMode = ActionMode.RELATIVE,
-        rewards: Rewards | None = None,
+        mode: ActionMode,
+        rewards: Rewards,
         workers: int = 0,
         record: bool = False,
         seed: int = 0,
     ):
-        super().__init__(batch, chunk, horizon, len(config.views), config.size, mode, seed=seed)
-        self.rewards = rewards or Rewards()
-        self.record = record
-        self.pool = BenchPool(config, batch, horizon, workers)
+        super().__init__(spec, batch, horizon, mode, seed=seed)
+        self.rewards, self.record = rewards, record
+        self.pool = TaskPool(suite, task, batch, horizon, workers)
         self.tracks: deque[Track] = deque()
+        self._rows: dict[int, dict[str, Any]] = {}
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         mask = self._reset_mask(tensordict)
-        slots = mask.nonzero().flatten().tolist()
         seeds = self._next_seeds(mask)
-        observed = self.pool.reset({slot: int(seeds[slot]) for slot in slots}, self.record)
-        self._take(observed)
+        slots = mask.nonzero().flatten().tolist()
+        self._take(self.pool.reset({slot: int(seeds[slot]) for slot in slots}, self.record))
+        self._check(self._rows[slots[0]])
         self._steps[mask] = 0
+        self._over[mask] = False
         self._last = self._observation()
         out = self._last.clone()
         for key in ("done", "terminated", "truncated"):
@@ -81,34 +86,44 @@ class PhysicsEnv(ChunkedEnv):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         chunk = tensordict[CHUNK]
-        check_chunk(chunk)
-        commands = to_absolute(chunk, self._last[COMMAND], self.mode).double().numpy()
-        before = self._last[PROGRESS].clone()
-        was_over = self._over.clone()
-        observed = self.pool.step({slot: commands[slot] for slot in range(self.batch_size[0])})
-        self._take(observed)
-        self._steps += self.chunk
-        self._last = out = self._observation()
+        check_chunk(chunk, self.spec.embodiment)
+        commands = to_commands(chunk.detach().cpu(), self._last[COMMAND], self.mode).double().numpy()
+        before, was_over = self._last[PROGRESS], self._over
+        self._take(self.pool.step(dict(enumerate(commands))))
+        self._steps += self.spec.chunk
+        self._last = self._observation()
+        out = self._last.clone()
         success = out[SUCCESS]
         out["reward"] = self.rewards(before, out[PROGRESS], success & ~was_over)
         out["terminated"] = success.clone()
         out["truncated"] = (self._steps >= self.horizon).unsqueeze(-1) & ~success
         out["done"] = out["terminated"] | out["truncated"]
         self._over = out["done"].clone()
-        self._last = out.select(*self._observation_keys)
-        return out.clone()
+        return out
+
+    def _check(self, row: Mapping[str, Any]) -> None:
+        spec = self.spec
+        due = {
+            "image": (spec.views, 3, *spec.size),
+            "state": (spec.state_dim,),
+            "command": (spec.action_dim,),
+        }
+        for name, shape in due.items():
+            if row[name].shape != shape:
+                raise ValueError(
+                    f"the task suite gives {name} {row[name].shape}, the world's spec says {shape}; build the"
+                    " spec from this suite's embodiment, with task.size equal to task.suite.size"
+                )
 
     def _take(self, observed: dict[int, dict[str, Any]]) -> None:
         for slot, values in observed.items():
             track = values.pop("track", None)
             if track is not None:
                 self.tracks.append(track)
-            self._values[slot] = values
-            if not values["over"]:
-                self._over[slot] = False
+            self._rows[slot] = values
 
     def _observation(self) -> TensorDict:
-        rows = [self._values[slot] for slot in range(self.batch_size[0])]
+        rows = [self._rows[slot] for slot in range(self.batch_size[0])]
 
         def stack(name: str) -> torch.Tensor:
             return torch.from_numpy(np.stack([row[name] for row in rows]))
@@ -117,8 +132,9 @@ class PhysicsEnv(ChunkedEnv):
         out[IMAGE] = stack("image")
         out[STATE] = stack("state").float()
         out[COMMAND] = stack("command").float()
-        out[INTRINSIC] = stack("intrinsic").float()
-        out[C2W] = stack("c2w").float()
+        if self.spec.embodiment.calibrated:
+            out[INTRINSIC] = stack("intrinsic").float()
+            out[C2W] = stack("c2w").float()
         out[SUCCESS] = stack("success").unsqueeze(-1)
         out[PROGRESS] = stack("progress").float().unsqueeze(-1)
         return self._with_identity(out, [row["instruction"] for row in rows])

@@ -1,23 +1,42 @@
-"""Worker processes that hold benches, so that a batch of true worlds uses every core.
+"""Worker processes that hold task suites, so that a batch of true worlds uses every core.
 
-Benches are dealt to workers by slot number, and what a bench does depends on its episode's seed alone: the
-number of workers changes the speed and nothing else.
+Episodes are dealt to workers by slot number, and what happens in one depends on its task, seed and actions
+alone: the number of workers changes the speed and nothing else. So a worker that dies
+can be replaced by another that runs its episodes again up to where they were, bit for bit.
 """
 
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
+import logging
 import os
-import traceback
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection, wait
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.tabletop.bench import Bench, BenchConfig
+from envs.physics.suite import plain_section
+from envs.physics.worker import Track, Worker, WorkerSpec
+
+log = logging.getLogger(__name__)
+RETRIES = 3  # replacements of one worker that may die in a row before the pool gives up
+
+__all__ = ["PoolError", "TaskPool", "Track", "available_cores"]
+
+
+class PoolError(RuntimeError):
+    """A physics worker failed; the message holds its own traceback."""
+
+
+class _Died(Exception):
+    """The process at the other end of a pipe is gone."""
 
 
 def available_cores() -> int:
@@ -26,209 +45,201 @@ def available_cores() -> int:
 
 
 @dataclass
-class Track:
-    """What one episode leaves behind, a row per video frame; row 0 is the start.
-
-    frames uint8 [T, V, 3, H, W], commands and achieved [T, 14], states [T, 16], c2w [T, V, 4, 4], success
-    [T],
-    progress [T], objects [T, 2, 4] = places of block and target (schema.OBJECT_DIM); a disc has no heading.
-    """
+class _Episode:
+    """What it takes to run an episode again: its seed and all chunks so far."""
 
     seed: int
-    instruction: str
-    intrinsic: NDArray[Any]
-    rows: dict[str, list[Any]] = field(default_factory=dict)
-
-    def add(self, bench: Bench) -> None:
-        """Append the bench as it stands now."""
-        _, c2w = bench.cameras()
-        row = {
-            "frames": bench.render(),
-            "commands": bench.command.copy(),
-            "achieved": bench.achieved(),
-            "states": bench.state(),
-            "c2w": c2w,
-            "success": bench.success,
-            "progress": bench.task.progress(bench.distance),
-            "objects": np.stack([bench.block, np.array([*bench.layout.target, 0.0, np.nan])]),
-        }
-        for name, value in row.items():
-            self.rows.setdefault(name, []).append(value)
+    record: bool
+    chunks: list[NDArray[Any]] = field(default_factory=list)
 
 
-@dataclass
-class Slot:
-    """One bench of a worker with the episode it is in."""
-
-    bench: Bench
-    steps: int = 0
-    over: bool = True
-    track: Track | None = None
-
-
-class Worker:
-    """The work of one process; also runs in the caller's process when the pool has one worker."""
-
-    def __init__(self, config: BenchConfig, slots: int, horizon: int):
-        self.config, self.horizon = config, horizon
-        self.slots = [Slot(Bench(config)) for _ in range(slots)]
-
-    def reset(self, seeds: dict[int, int], record: bool) -> dict[int, dict[str, Any]]:
-        """Start episodes {slot: seed}; returns an observation per slot."""
-        out = {}
-        for index, seed in seeds.items():
-            slot = self.slots[index]
-            slot.bench.reset(seed)
-            slot.steps, slot.over = 0, False
-            slot.track = (
-                Track(seed, slot.bench.layout.instruction, slot.bench.cameras()[0]) if record else None
-            )
-            if slot.track is not None:
-                slot.track.add(slot.bench)
-            out[index] = self._observe(slot)
-        return out
-
-    def step(self, chunks: dict[int, NDArray[Any]]) -> dict[int, dict[str, Any]]:
-        """Carry out chunks {slot: [K, 14] absolute}, each to its end, as imagined worlds do; an episode that
-        is over stands still.
-        """
-        out = {}
-        for index, chunk in chunks.items():
-            slot = self.slots[index]
-            for command in () if slot.over else chunk:
-                slot.bench.step(command)
-                slot.steps += 1
-                if slot.track is not None:
-                    slot.track.add(slot.bench)
-            slot.over = slot.bench.success or slot.steps >= self.horizon
-            out[index] = self._observe(slot)
-            if slot.over and slot.track is not None:
-                out[index]["track"], slot.track = slot.track, None
-        return out
-
-    def script(self, jobs: list[tuple[int, float]], chunk: int = 1) -> list[Track]:
-        """Whole episodes of scripted behaviours for (seed, noise_level) pairs; recorded to the horizon, or to
-        the end of the `chunk` steps in which they succeed.
-        """
-        from envs.physics.tabletop.experts import Behaviour
-
-        out = []
-        for seed, noise_level in jobs:
-            bench = self.slots[0].bench
-            bench.reset(seed)
-            behaviour = Behaviour(
-                bench.task,
-                bench.layout,
-                noise_level,
-                np.random.default_rng([seed, 1]),
-                1 / self.config.control_hz,
-            )
-            near = bench.layout.arm * 7
-            track = Track(seed, bench.layout.instruction, bench.cameras()[0])
-            track.add(bench)
-            for step in range(self.horizon):
-                if bench.success and step % chunk == 0:
-                    break
-                command = bench.command.copy()
-                command[near : near + 2] = behaviour.fingertip(bench.block[:2], command[near : near + 2])
-                bench.step(command)
-                track.add(bench)
-            out.append(track)
-        return out
-
-    def picture(self, seed: int, size: tuple[int, int], views: tuple[str, ...]) -> NDArray[np.uint8]:
-        """A picture with shadows of an episode's start, uint8 [V, 3, H, W]."""
-        self.slots[0].bench.reset(seed)
-        return self.slots[0].bench.render(views, size, shadows=True)
-
-    def _observe(self, slot: Slot) -> dict[str, Any]:
-        bench = slot.bench
-        intrinsic, c2w = bench.cameras()
-        return {
-            "image": bench.render() if slot.track is None else slot.track.rows["frames"][-1],
-            "state": bench.state(),
-            "command": bench.command.copy(),
-            "intrinsic": intrinsic,
-            "c2w": c2w,
-            "success": bench.success,
-            "progress": bench.task.progress(bench.distance),
-            "instruction": bench.layout.instruction,
-            "over": slot.over,
-        }
-
-
-def _serve(pipe: Connection, config: BenchConfig, slots: int, horizon: int) -> None:
-    try:
-        worker = Worker(config, slots, horizon)
-        pipe.send(("ok", None))
-    except Exception:
-        pipe.send(("error", traceback.format_exc()))
-        return
-    while True:
-        try:
-            message = pipe.recv()
-        except EOFError:
-            return
-        if message is None:
-            return
-        name, arguments = message
-        try:
-            pipe.send(("ok", getattr(worker, name)(*arguments)))
-        except Exception:
-            pipe.send(("error", traceback.format_exc()))
-
-
-class PoolError(RuntimeError):
-    """A physics worker failed; the message holds its own traceback."""
-
-
-class BenchPool:
-    """`slots` benches over `workers` processes.
+class _Remote:
+    """A worker process, and what it takes to replace it by another that stands where it stood.
 
     Args:
-        config: the bench's options.
-        slots: how many episodes run side by side.
-        horizon: control steps after which an episode is over.
-        workers: processes; 0 means one per core, 1 runs in this process.
+        index: of the worker, for messages.
+        spec: of suite and task.
+        slots: episodes side by side.
     """
 
-    def __init__(self, config: BenchConfig, slots: int, horizon: int, workers: int = 0):
+    def __init__(self, index: int, spec: WorkerSpec, slots: int):
+        self.index, self.spec, self.slots = index, spec, slots
+        self._episodes: dict[int, _Episode] = {}
+        self._request: tuple[str, tuple[Any, ...]] | None = None
+        self._start()
+
+    def send(self, name: str, *arguments: Any) -> None:
+        """Ask for a method of Worker; `answer` waits for what it gives."""
+        self._request = (name, arguments)
+        if not self._fresh:
+            self._write(self._request)
+
+    def answer(self) -> Any:
+        """What the last request gave; a worker that died is replaced and asked again.
+
+        Raises:
+            PoolError: if the method failed, or if replacements keep dying.
+        """
+        for _ in range(1 + RETRIES):
+            try:
+                if self._fresh:
+                    self._catch_up()
+                value = self._read()
+                self._remember()
+                return value
+            except _Died:
+                code = self.close(0.0)
+                log.warning("physics worker %d died (exit code %s); its episodes run again", self.index, code)
+                self._start()
+        raise PoolError(
+            f"physics worker {self.index} died {1 + RETRIES} times in a row (exit code {code});"
+            " out of memory or a broken GL driver"
+        )
+
+    def close(self, patience: float) -> int | None:
+        """End the process, by force after `patience` seconds; returns its exit code."""
+        self._write(None)
+        try:
+            self.process.wait(patience)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        self.pipe.close()
+        return self.process.returncode
+
+    def _start(self) -> None:
+        self.pipe, theirs = Pipe()
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "envs.physics.worker", str(theirs.fileno())],
+            pass_fds=[theirs.fileno()],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)},
+        )
+        theirs.close()
+        self._fresh = True
+        self._write((self.spec, self.slots))
+
+    def _catch_up(self) -> None:
+        """Wait for a new process, run its episodes up to where the last one stood, and repeat the request."""
+        self._read()
+        for slot, episode in self._episodes.items():
+            self._write(("reset", ({slot: episode.seed}, episode.record)))
+            self._read()
+            for chunk in episode.chunks:
+                self._write(("step", ({slot: chunk},)))
+                self._read()
+        self._fresh = False
+        self._write(self._request)
+
+    def _remember(self) -> None:
+        assert self._request is not None
+        name, arguments = self._request
+        if name == "reset":
+            seeds, record = arguments
+            self._episodes |= {slot: _Episode(seed, record) for slot, seed in seeds.items()}
+        elif name == "step":
+            for slot, chunk in arguments[0].items():
+                self._episodes[slot].chunks.append(chunk)
+
+    def _write(self, message: Any) -> None:
+        with contextlib.suppress(OSError):  # it died, which the next `_read` finds
+            self.pipe.send(message)
+
+    def _read(self) -> Any:
+        try:
+            status, value = self.pipe.recv()
+        except (EOFError, OSError) as error:
+            raise _Died from error
+        if status == "error":
+            raise PoolError(f"physics worker {self.index} failed:\n{value}")
+        return value
+
+
+class TaskPool:
+    """`slots` episodes of one task over worker processes.
+
+    Args:
+        suite: config section of the task suite.
+        task: a name of its tasks.
+        slots: how many episodes run side by side.
+        horizon: actions after which an episode is over.
+        workers: processes; 0 means one per core, 1 runs in this process.
+
+    Raises:
+        PoolError: if a worker does not start, with its traceback.
+        SuiteError: the same, if the worker is this process.
+    """
+
+    def __init__(self, suite: Mapping[str, Any], task: str, slots: int, horizon: int, workers: int):
+        spec = WorkerSpec(plain_section(suite), task, horizon)
         count = min(workers or available_cores(), slots)
         self.owner = [slot % count for slot in range(slots)]
         self.local = [slot // count for slot in range(slots)]
-        sizes = [self.owner.count(k) for k in range(count)]
-        self._inline: Worker | None = None
-        self._pipes: list[Connection] = []
-        self._processes: list[Any] = []
-        if count == 1:
-            self._inline = Worker(config, slots, horizon)
-            return
-        context = multiprocessing.get_context(
-            "forkserver"
-        )  # whose imports later pools share; a fork of this process would share its threads' locks
-        # torchrl for the script that started us, which workers import anew
-        context.set_forkserver_preload(["torchrl.envs", __name__])
-        for size in sizes:
-            ours, theirs = context.Pipe()
-            process = context.Process(target=_serve, args=(theirs, config, size, horizon), daemon=True)
-            process.start()
-            theirs.close()
-            self._pipes.append(ours)
-            self._processes.append(process)
-        for index in range(count):
-            self._receive(index)
+        self._inline = Worker(spec, slots) if count == 1 else None
+        self._remotes: list[_Remote] = []
+        if count > 1:
+            self._remotes = [_Remote(k, spec, self.owner.count(k)) for k in range(count)]
+            for remote in self._remotes:
+                remote.send("modules")
+            for remote in self._remotes:
+                remote.answer()
 
-    def _receive(self, index: int) -> Any:
-        try:
-            status, value = self._pipes[index].recv()
-        except (EOFError, ConnectionResetError) as error:
-            code = self._processes[index].exitcode
-            raise PoolError(
-                f"physics worker {index} died (exit code {code}); out of memory or a broken GL driver"
-            ) from error
-        if status == "error":
-            raise PoolError(f"physics worker {index} failed:\n{value}")
-        return value
+    def reset(self, seeds: dict[int, int], record: bool) -> dict[int, dict[str, Any]]:
+        """Start episodes {slot: seed} and return their first observations, as NumPy arrays by name."""
+        return self._scatter("reset", seeds, record)
+
+    def step(self, chunks: dict[int, NDArray[Any]]) -> dict[int, dict[str, Any]]:
+        """Carry out chunks {slot: [K, A]} of commands and return the observations after them; where a
+        recorded episode ends, its Track stands under "track".
+        """
+        return self._scatter("step", chunks)
+
+    def script(self, jobs: list[tuple[int, float]], chunk: int) -> list[Track]:
+        """Scripted episodes for (seed, noise_level) pairs, in the order of `jobs`; see Worker.script."""
+        if self._inline is not None:
+            return self._inline.script(jobs, chunk)
+        waiting = deque(enumerate(jobs))
+        busy: dict[Connection, tuple[_Remote, int]] = {}
+        tracks: dict[int, Track] = {}
+
+        def give(remote: _Remote) -> None:
+            if waiting:
+                number, job = waiting.popleft()
+                remote.send("script", [job], chunk)
+                busy[remote.pipe] = remote, number
+
+        for remote in self._remotes:
+            give(remote)
+        while busy:
+            for pipe in wait(list(busy)):
+                assert isinstance(pipe, Connection)
+                remote, number = busy.pop(pipe)
+                (tracks[number],) = remote.answer()
+                give(remote)
+        return [tracks[number] for number in range(len(jobs))]
+
+    def picture(self, seed: int, size: tuple[int, int]) -> NDArray[np.uint8]:
+        """Pictures for people of an episode's start, uint8 [V, 3, H, W]."""
+        return self._ask("picture", seed, size)
+
+    def modules(self) -> list[str]:
+        """Names of the modules that a worker has imported."""
+        return self._ask("modules")
+
+    def processes(self) -> list[int]:
+        """Ids of the worker processes; none if the work is done in this one."""
+        return [remote.process.pid for remote in self._remotes]
+
+    def close(self) -> None:
+        """End the workers."""
+        for remote in self._remotes:
+            remote.close(5.0)
+        self._remotes, self._inline = [], None
+
+    def _ask(self, name: str, *arguments: Any) -> Any:
+        if self._inline is not None:
+            return getattr(self._inline, name)(*arguments)
+        self._remotes[0].send(name, *arguments)
+        return self._remotes[0].answer()
 
     def _scatter(self, name: str, work: dict[int, Any], *extra: Any) -> dict[int, Any]:
         if self._inline is not None:
@@ -237,40 +248,10 @@ class BenchPool:
         for slot, item in work.items():
             shares.setdefault(self.owner[slot], {})[self.local[slot]] = item
         for index, share in shares.items():
-            self._pipes[index].send((name, (share, *extra)))
-        count = len(self._pipes)
+            self._remotes[index].send(name, share, *extra)
+        count = len(self._remotes)
         out = {}
         for index in shares:
-            for local, value in self._receive(index).items():
+            for local, value in self._remotes[index].answer().items():
                 out[local * count + index] = value
         return out
-
-    def reset(self, seeds: dict[int, int], record: bool = False) -> dict[int, dict[str, Any]]:
-        """Start episodes {slot: seed} and return their first observations."""
-        return self._scatter("reset", seeds, record)
-
-    def step(self, chunks: dict[int, NDArray[Any]]) -> dict[int, dict[str, Any]]:
-        """Carry out chunks {slot: [K, 14]} and return the observations after them."""
-        return self._scatter("step", chunks)
-
-    def script(self, jobs: list[tuple[int, float]], chunk: int = 1) -> list[Track]:
-        """Scripted episodes for (seed, noise_level) pairs, in the order of `jobs`; see Worker.script."""
-        if self._inline is not None:
-            return self._inline.script(jobs, chunk)
-        count = len(self._pipes)
-        for index, pipe in enumerate(self._pipes):
-            pipe.send(("script", (jobs[index::count], chunk)))
-        shares = [self._receive(index) for index in range(count)]
-        return [shares[k % count][k // count] for k in range(len(jobs))]
-
-    def close(self) -> None:
-        """End the workers."""
-        for pipe in self._pipes:
-            with contextlib.suppress(OSError):  # gone already, which is what we ask for
-                pipe.send(None)
-        for pipe, process in zip(self._pipes, self._processes, strict=True):
-            process.join(timeout=5)
-            if process.is_alive():
-                process.kill()
-            pipe.close()
-        self._pipes, self._processes, self._inline = [], [], None

@@ -43,7 +43,7 @@ class Offscreen:
                 "or set MUJOCO_GL=osmesa and install libosmesa6."
             ) from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        self._scene = mujoco.MjvScene(model, maxgeom=200)
+        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + model.nsite + 100)
         self._option = mujoco.MjvOption()
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
@@ -53,7 +53,7 @@ class Offscreen:
     def render(
         self, model: mujoco.MjModel, data: mujoco.MjData, views: tuple[str, ...], shadows: bool
     ) -> NDArray[np.uint8]:
-        """Pictures uint8 [V, 3, H, W] of the named cameras."""
+        """Pictures uint8 [V, 3, H, W] of the named cameras; `shadows` brings reflections too."""
         self._gl.make_current()
         height, width, _ = self._pixels.shape
         out = np.empty((len(views), 3, height, width), np.uint8)
@@ -62,19 +62,26 @@ class Offscreen:
             mujoco.mjv_updateScene(
                 model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
             )
-            # Shadows cost eight times everything else, and updating the scene switches them on again.
+            # Shadows cost eight times all else, and updating the scene switches both on again.
             self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+            self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = shadows
             mujoco.mjr_render(self._rect, self._scene, self._context)
             mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
             out[k] = self._pixels[::-1].transpose(2, 0, 1)
         return out
 
 
-_CONTEXTS: dict[tuple[int, int], Offscreen] = {}
+_CONTEXTS: dict[tuple[str, tuple[int, int]], Offscreen] = {}
 
 
-def offscreen_for(model: mujoco.MjModel, size: tuple[int, int]) -> Offscreen:
-    """The process's context for pictures of `size` = (height, width), made at first use."""
-    if size not in _CONTEXTS:
-        _CONTEXTS[size] = Offscreen(model, size)
-    return _CONTEXTS[size]
+def offscreen_for(assets: str, model: mujoco.MjModel, size: tuple[int, int]) -> Offscreen:
+    """The process's context, made at first use.
+
+    Args:
+        assets: a name that models with equal meshes, textures and geoms share.
+        model: one of them.
+        size: (height, width) of the pictures.
+    """
+    if (assets, size) not in _CONTEXTS:
+        _CONTEXTS[assets, size] = Offscreen(model, size)
+    return _CONTEXTS[assets, size]

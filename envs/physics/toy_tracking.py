@@ -1,4 +1,4 @@
-"""TorchRL's ToyVLAEnv in its tracking mode as one of our worlds: chunks, seeded episodes, groups from one
+"""TorchRL's ToyVLAEnv in its tracking mode as one of our worlds: chunks, seeded episodes, groups that share a
 start.
 
 It needs neither pictures nor physics to be learned, which makes it the place to compare learners; see
@@ -14,12 +14,28 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import ToyVLAEnv
 
 from envs.chunked import ChunkedEnv
-from envs.specs import C2W, CHUNK, COMMAND, IMAGE, INTRINSIC, PROGRESS, STATE, SUCCESS, ActionMode
+from envs.embodiment import ActionKind, Camera, Embodiment
+from envs.specs import CHUNK, COMMAND, IMAGE, PROGRESS, STATE, SUCCESS, ActionMode, WorldSpec
+
+
+def toy_embodiment(actions: int, size: int) -> Embodiment:
+    """A robot of `actions` nameless numbers whose one camera of `size` pixels a side shows noise."""
+    names = tuple(f"action_{k}" for k in range(actions))
+    return Embodiment(
+        robot="toy_tracking",
+        action_names=names,
+        action_kind=ActionKind.OTHER,
+        delta=False,
+        arms=(),
+        state_names=(*names, *(f"target_{k}" for k in range(actions))),
+        cameras=(Camera("noise", (size, size)),),
+        fps=10.0,
+    )
 
 
 class ToyTrackingEnv(ChunkedEnv):
-    """A batch of episodes, each with a hidden-in-plain-sight target that actions must stay near; reward 1 at
-    success, else 0.
+    """A batch of episodes with a target, part of the state, that actions must stay near; reward 1 at success,
+    else 0.
 
     Args:
         batch: episodes side by side.
@@ -47,17 +63,8 @@ class ToyTrackingEnv(ChunkedEnv):
         targets: int = 0,
         seed: int = 0,
     ):
-        super().__init__(
-            batch,
-            chunk,
-            chunk * decisions,
-            1,
-            (size, size),
-            ActionMode.ABSOLUTE,
-            seed=seed,
-            states=2 * actions,
-            actions=actions,
-        )
+        spec = WorldSpec(toy_embodiment(actions, size), (size, size), chunk)
+        super().__init__(spec, batch, chunk * decisions, ActionMode.ABSOLUTE, seed=seed)
         self.toy = ToyVLAEnv(
             actions,
             2 * actions,
@@ -100,12 +107,7 @@ class ToyTrackingEnv(ChunkedEnv):
         return out
 
     def _observed(self, image: torch.Tensor, won: torch.Tensor) -> TensorDict:
-        batch = self.batch_size[0]
         out = TensorDict({}, self.batch_size)
         out[IMAGE], out[STATE], out[SUCCESS], out[PROGRESS] = image, self._state.clone(), won, won.float()
         out[COMMAND] = self._state[:, : self.targets.shape[1]].clone()
-        out[INTRINSIC], out[C2W] = (
-            torch.eye(3).expand(batch, 1, 3, 3).clone(),
-            torch.eye(4).expand(batch, 1, 4, 4).clone(),
-        )
-        return self._with_identity(out, [self.toy.instruction] * batch)
+        return self._with_identity(out, [self.toy.instruction] * self.batch_size[0])

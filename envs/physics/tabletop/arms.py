@@ -1,76 +1,78 @@
-"""Inverse kinematics of both arms by damped least squares, with a null space that prefers one posture."""
+"""Kinematics of both arms: flange poses of joints, and joints of flange poses by damped least squares with a
+null space that prefers one posture.
+"""
 
 from __future__ import annotations
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from envs.physics.tabletop.scene import ARMS, HOME
+from envs.physics.tabletop.scene import ARMS, HOME, JOINTS
 
 Array = NDArray[np.float64]
 _DAMPING = 1e-4
 _STEP_LIMIT = 0.35  # rad per iteration and joint
+DOWN = np.array([np.pi, 0.0, 0.0])  # roll, pitch, yaw of a gripper that points at the table
 
 
 def rpy_to_matrix(rpy: Array) -> Array:
-    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) of angles [..., 3] in radians -> [..., 3, 3]."""
-    roll, pitch, yaw = np.moveaxis(np.asarray(rpy, dtype=np.float64), -1, 0)
-    cr, sr, cp, sp, cy, sy = (
-        np.cos(roll),
-        np.sin(roll),
-        np.cos(pitch),
-        np.sin(pitch),
-        np.cos(yaw),
-        np.sin(yaw),
-    )
-    rows = (
-        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-        (-sp, cp * sr, cp * cr),
-    )
-    return np.stack([np.stack(row, -1) for row in rows], -2)
+    """Rotation matrix [3, 3] = Rz(yaw) Ry(pitch) Rx(roll) of angles [3] in radians."""
+    return Rotation.from_euler("xyz", rpy).as_matrix()
 
 
 def matrix_to_rpy(matrix: Array, near: Array) -> Array:
-    """Roll, pitch, yaw [3] of a rotation matrix [3, 3], each shifted by whole turns to lie closest to `near`
-    [3].
-    """
-    pitch = np.arcsin(np.clip(-matrix[2, 0], -1.0, 1.0))
-    roll = np.arctan2(matrix[2, 1], matrix[2, 2])
-    yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
-    rpy = np.array([roll, pitch, yaw])
+    """Roll, pitch, yaw [3] of a rotation matrix [3, 3], shifted by whole turns to lie closest to `near`."""
+    rpy = Rotation.from_matrix(matrix).as_euler("xyz")
     return rpy + 2 * np.pi * np.round((near - rpy) / (2 * np.pi))
 
 
 class ArmKinematics:
-    """Solves flange poses for joint angles on a private copy of the state, warm-started from the last
-    solution.
+    """Forward and inverse kinematics on a private copy of the state.
+
+    Args:
+        model: a model that holds the robot.
     """
 
     def __init__(self, model: mujoco.MjModel):
         self.model = model
         self.data = mujoco.MjData(model)
         self.sites = [model.site(f"{side}_flange").id for side in ARMS]
-        joints = [[model.joint(f"{side}_joint{i}") for i in range(1, 8)] for side in ARMS]
+        joints = [[model.joint(name) for name in arm] for arm in JOINTS]
         self.qpos = np.array([[j.qposadr[0] for j in arm] for arm in joints])  # [2, 7]
         self.dofs = np.array([[j.dofadr[0] for j in arm] for arm in joints])  # [2, 7]
         self.low = np.array([[j.range[0] for j in arm] for arm in joints])
         self.high = np.array([[j.range[1] for j in arm] for arm in joints])
         self._jac = np.zeros((6, model.nv))
 
-    def solve(self, command: Array, start: Array, iterations: int = 20, tolerance: float = 2e-4) -> Array:
-        """Joint angles [2, 7] in rad whose flanges reach `command`.
+    def flanges(self, joints: Array) -> Array:
+        """Flange poses [2, 6] = [x, y, z, roll, pitch, yaw] of joint angles [2, 7] in radians."""
+        self.data.qpos[self.qpos] = joints
+        mujoco.mj_kinematics(self.model, self.data)
+        return self.read(self.data)
+
+    def read(self, data: mujoco.MjData) -> Array:
+        """Flange poses [2, 6] that a simulation's arms have."""
+        return np.stack(
+            [
+                np.concatenate(
+                    [data.site_xpos[site], matrix_to_rpy(data.site_xmat[site].reshape(3, 3), DOWN)]
+                )
+                for site in self.sites
+            ]
+        )
+
+    def solve(self, poses: Array, start: Array, iterations: int = 20, tolerance: float = 2e-4) -> Array:
+        """Joint angles [2, 7] in rad whose flanges reach `poses`.
 
         Args:
-            command: [14] = [x, y, z, roll, pitch, yaw, gripper] of the left, then the right arm.
+            poses: [2, 6] = [x, y, z, roll, pitch, yaw] of the left, then the right flange.
             start: joint angles [2, 7] to begin at; unreachable poses give the closest posture within limits.
             iterations: upper bound; the loop ends early once both arms are within `tolerance` (m and rad).
         """
         q = np.array(start)
-        targets = [
-            (command[k * 7 : k * 7 + 3], rpy_to_matrix(command[k * 7 + 3 : k * 7 + 6])) for k in range(2)
-        ]
+        targets = [(pose[:3], rpy_to_matrix(pose[3:6])) for pose in poses]
         for _ in range(iterations):
             self.data.qpos[self.qpos] = q
             mujoco.mj_kinematics(self.model, self.data)

@@ -1,33 +1,54 @@
-"""Scripted behaviours of the bench: the expert, and a noise_level that bends it towards noise and chance.
+"""Scripted behaviours of the bench: experts of tasks, and noise that bends them towards chance.
 
-A behaviour sees the true state and returns one absolute 14-D command per control step.
+A behaviour sees the true state and says where one arm's fingertips go next, on the table's plane.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.tabletop.tasks import Layout, Push
-
 Array = NDArray[np.float64]
-SPEED = 0.22  # m/s a gripper moves at most
+SPEED = 0.22  # m/s a fingertip moves at most
 _STANDOFF = 0.055  # m from block centre to fingertip centre when the push begins
 _LATERAL = 0.012  # m off the push line at which the gripper still counts as aligned
 
 
-class PushExpert:
-    """Go behind the block as seen from the target, then push through it, steering back onto the line at every
-    step of `period` seconds.
+class FingertipExpert(ABC):
+    """A behaviour of one arm.
+
+    Attributes:
+        arm: which, by its position in scene.ARMS; the other stands still.
     """
 
-    def __init__(self, task: Push, layout: Layout, period: float = 0.1):
-        self.task, self.layout, self.period = task, layout, period
+    arm: int
+
+    @abstractmethod
+    def fingertip(self, tip: Array) -> Array:
+        """The next fingertip position [2] in metres, from the present one [2]."""
+
+
+class PushExpert(FingertipExpert):
+    """Go behind the block as seen from the target, then push through it, steering back onto the line.
+
+    Args:
+        arm: which arm pushes.
+        block: () -> the block's centre [2] as the expert believes it, in metres.
+        target: [2] where it believes the target.
+        half: half edge length of the block.
+        period: seconds between two calls.
+    """
+
+    def __init__(self, arm: int, block: Callable[[], Array], target: Array, half: float, period: float):
+        self.arm, self.block, self.target, self.half, self.period = arm, block, target, half, period
         self.behind = False
 
-    def fingertip(self, block: Array, tip: Array) -> Array:
-        """The next fingertip position [2] in metres of the near arm, from block and fingertip positions [2]."""
-        target = self.layout.target
+    def fingertip(self, tip: Array) -> Array:
+        """The next fingertip position [2] in metres."""
+        block, target = self.block(), self.target
         gap = target - block
         distance = float(np.hypot(*gap))
         if distance < 0.012:
@@ -36,7 +57,7 @@ class PushExpert:
         normal = np.array([-line[1], line[0]])
         offset = tip - block
         along, across = float(offset @ line), float(offset @ normal)
-        reach = self.layout.block_half + 0.012
+        reach = self.half + 0.012
         if self.behind and (along > -0.5 * reach or abs(across) > 0.03):
             self.behind = False
         if not self.behind and along < -reach and abs(across) < _LATERAL:
@@ -45,63 +66,65 @@ class PushExpert:
             # Lead the block towards the line: push a little from the side it has drifted to.
             goal = target - line * reach - normal * across * 1.5
             speed = min(SPEED, 0.1 + 5.0 * distance)
-        elif along > -reach and abs(across) < self.layout.block_half + 0.03:
+        elif along > -reach and abs(across) < self.half + 0.03:
             side = 1.0 if across >= 0 else -1.0  # beside or ahead of it: go round
-            goal = block + normal * side * (self.layout.block_half + 0.06) - line * 0.08
+            goal = block + normal * side * (self.half + 0.06) - line * 0.08
             speed = SPEED
         else:
             goal = block - line * _STANDOFF
             speed = SPEED
-        step = goal - tip
-        length = float(np.hypot(*step))
-        return tip + step * min(1.0, speed * self.period / max(length, 1e-9))
+        return _towards(tip, goal, speed * self.period)
 
 
-class Behaviour:
-    """An episode's behaviour, from the expert (noise_level = 0) through noise to chance (noise_level = 1).
-
-    The noise_level scales a slowly varying offset on the commanded fingertip, shifts where the expert
-    believes block
-    and target to be, and gives the chance that the whole episode follows random way-points near the block.
+class WaypointWalk(FingertipExpert):
+    """Random way-points around something, whatever the task.
 
     Args:
-        noise_level: 0 is the expert, 1 pays no heed to the task.
-        period: seconds per control step.
+        arm: which arm walks.
+        centre: () -> [2] in metres, around which way-points scatter.
+        rng: of the way-points.
+        period: seconds between two calls.
     """
 
-    def __init__(
-        self, task: Push, layout: Layout, noise_level: float, rng: np.random.Generator, period: float = 0.1
-    ):
-        if not 0.0 <= noise_level <= 1.0:
-            raise ValueError(
-                f"behaviour noise_level {noise_level} must lie in [0, 1]: 0 is the expert, 1 is random"
-            )
-        believed = layout
-        if noise_level > 0:
-            shift = rng.normal(0.0, 0.05 * noise_level, 2)
-            believed = Layout(**{**vars(layout), "target": layout.target + shift})
-        self.expert = PushExpert(task, believed, period)
-        self.noise_level, self.rng, self.period = noise_level, rng, period
-        self.keep = 0.8 ** (period / 0.1)  # the drift forgets at the same pace whatever the control rate
-        self.drift = np.zeros(2)
-        self.bias = rng.normal(0.0, 0.05 * noise_level, 2)
-        self.random = noise_level >= 1.0
+    def __init__(self, arm: int, centre: Callable[[], Array], rng: np.random.Generator, period: float):
+        self.arm, self.centre, self.rng, self.period = arm, centre, rng, period
         self.waypoint: Array | None = None
 
-    def fingertip(self, block: Array, tip: Array) -> Array:
-        """The next fingertip position [2] of the near arm in metres."""
-        if self.random:
-            if (
-                self.waypoint is None
-                or np.hypot(*(self.waypoint - tip)) < 0.02
-                or self.rng.random() < 1 - 0.95 ** (self.period / 0.1)
-            ):
-                self.waypoint = block + self.rng.normal(0.0, 0.09, 2)
-            step = self.waypoint - tip
-            goal = tip + step * min(1.0, SPEED * self.period / max(float(np.hypot(*step)), 1e-9))
-        else:
-            goal = self.expert.fingertip(block + self.bias, tip)
-        self.drift = self.keep * self.drift + self.rng.normal(
-            0.0, 0.0133 * self.noise_level * np.sqrt(1 - self.keep**2), 2
-        )
+    def fingertip(self, tip: Array) -> Array:
+        """The next fingertip position [2] in metres."""
+        if (
+            self.waypoint is None
+            or np.hypot(*(self.waypoint - tip)) < 0.02
+            or self.rng.random() < 1 - 0.95 ** (self.period / 0.1)
+        ):
+            self.waypoint = self.centre() + self.rng.normal(0.0, 0.09, 2)
+        return _towards(tip, self.waypoint, SPEED * self.period)
+
+
+class Drifting(FingertipExpert):
+    """Another behaviour under a slowly varying offset on its fingertip.
+
+    Args:
+        expert: the behaviour.
+        noise_level: 0..1, scales the offset, whose standard deviation is 13.3 mm at 1.
+        rng: of the offset.
+        period: seconds between two calls; the offset forgets at the same pace whatever the control rate.
+    """
+
+    def __init__(self, expert: FingertipExpert, noise_level: float, rng: np.random.Generator, period: float):
+        self.expert, self.arm, self.rng = expert, expert.arm, rng
+        self.keep = 0.8 ** (period / 0.1)
+        self.scale = 0.0133 * noise_level * np.sqrt(1 - self.keep**2)
+        self.drift = np.zeros(2)
+
+    def fingertip(self, tip: Array) -> Array:
+        """The next fingertip position [2] in metres."""
+        goal = self.expert.fingertip(tip)
+        self.drift = self.keep * self.drift + self.rng.normal(0.0, self.scale, 2)
         return goal + self.drift
+
+
+def _towards(tip: Array, goal: Array, stride: float) -> Array:
+    """`goal`, or the point at `stride` metres on the way to it."""
+    step = goal - tip
+    return tip + step * min(1.0, stride / max(float(np.hypot(*step)), 1e-9))

@@ -1,0 +1,205 @@
+"""The contract of a task suite: a physics bench and its tasks, whoever wrote them.
+
+A suite says which robot it has (`Embodiment`), lays out an episode from a task's name and a seed, carries out
+one action per frame period, renders, and says how the task stands. Suites live in worker processes, so
+nothing here imports torch.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.embodiment import Embodiment
+
+Array = NDArray[Any]
+Expert = Callable[[], Array]  # () -> the next action [A]
+
+
+class SuiteError(ValueError):
+    """A task suite cannot be built from its config; the message names the key and the fix."""
+
+
+@dataclass
+class Observation:
+    """What a bench says of its robot and task between two actions; pictures come from `TaskSuite.render`.
+
+    Args:
+        state: float [S], what the robot knows of itself.
+        command: float [A], the command in force; for delta actions the last action, zeros at the start.
+        instruction: the task in words.
+        success: whether the task's condition has held for `hold` seconds; once true it stays true.
+        progress: true progress in 0..1, the rule reward of physics; learned parts never see it.
+        intrinsic: float [V, 3, 3] in pixels, None if no camera is calibrated.
+        c2w: float [V, 4, 4] camera to world, OpenCV convention, None if no camera is calibrated.
+        poses: float [arms, 7], commanded flange poses [x, y, z, roll, pitch, yaw, gripper] in metres and
+            radians, where the suite knows them and the action does not say them.
+    """
+
+    state: Array
+    command: Array
+    instruction: str
+    success: bool
+    progress: float
+    intrinsic: Array | None = None
+    c2w: Array | None = None
+    poses: Array | None = None
+
+
+class TaskSuite(ABC):
+    """A physics bench with tasks, scripted experts and one robot.
+
+    Subclasses are built in worker processes from their config section: `_target_` names the class, all other
+    keys are its constructor's arguments. An episode depends on task, seed and actions alone, bit for bit.
+
+    Attributes:
+        tasks: names that `reset` takes.
+        embodiment: the robot; camera sizes are those that `render` returns.
+    """
+
+    tasks: ClassVar[tuple[str, ...]]
+    embodiment: Embodiment
+
+    @abstractmethod
+    def reset(self, task: str, seed: int) -> None:
+        """Lay out the start of `task` that `seed` draws.
+
+        Raises:
+            SuiteError: if there is no such task; see `check_task`.
+        """
+
+    @abstractmethod
+    def step(self, action: Array) -> None:
+        """Carry out one action float [A] for one frame period, 1 / embodiment.fps seconds."""
+
+    @abstractmethod
+    def render(self) -> NDArray[np.uint8]:
+        """Pictures uint8 [V, 3, H, W] of all cameras as things stand now."""
+
+    @abstractmethod
+    def observe(self) -> Observation:
+        """State, command, calibration and how the task stands now."""
+
+    @abstractmethod
+    def privileged(self) -> dict[str, Array]:
+        """What only physics knows (such as true object poses), by name; recorded under `privileged.*`."""
+
+    @abstractmethod
+    def expert(self, noise_level: float, rng: np.random.Generator) -> Expert:
+        """A scripted behaviour for the episode that was just reset.
+
+        Args:
+            noise_level: 0 is the expert, 1 pays no heed to the task.
+            rng: of the behaviour's own randomness.
+
+        Raises:
+            ValueError: if the noise level lies outside [0, 1].
+        """
+
+    def picture(self, size: tuple[int, int]) -> NDArray[np.uint8]:
+        """Pictures for people to look at, uint8 [V, 3, H, W]; suites that can render `size` do."""
+        return self.render()
+
+
+class HeldCondition:
+    """Success as a condition that held for the last frames: being there for a moment, such as a thing that
+    falls through its target, is no success.
+
+    Args:
+        hold: seconds the condition must hold.
+        fps: frames per second.
+    """
+
+    def __init__(self, hold: float, fps: float):
+        self.frames = max(1, round(hold * fps))
+        self.count, self.success = 0, False
+
+    def reset(self) -> None:
+        """Forget what held."""
+        self.count, self.success = 0, False
+
+    def update(self, satisfied: bool) -> None:
+        """Count one frame at which the condition was or was not satisfied."""
+        self.count = self.count + 1 if satisfied else 0
+        self.success = self.success or self.count >= self.frames
+
+
+def check_task(task: str, tasks: Iterable[str]) -> None:
+    """Refuse unknown task names.
+
+    Raises:
+        SuiteError: with the nearest names that exist.
+    """
+    known = sorted(tasks)
+    if task not in known:
+        near = difflib.get_close_matches(task, known, 5, 0.3) or known[:5]
+        raise SuiteError(f"task.name={task!r} is unknown; the nearest of {len(known)} names are {near}")
+
+
+def check_cameras(cameras: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse cameras that a bench has not.
+
+    Raises:
+        SuiteError: naming them and those that it has.
+    """
+    unknown = [camera for camera in cameras if camera not in known]
+    if unknown:
+        raise SuiteError(f"task.suite.cameras holds {unknown}; the cameras of this suite are {list(known)}")
+
+
+def check_noise_level(noise_level: float) -> None:
+    """Refuse noise levels outside [0, 1].
+
+    Raises:
+        ValueError: saying what they mean.
+    """
+    if not 0.0 <= noise_level <= 1.0:
+        raise ValueError(f"noise_level={noise_level} must lie in [0, 1]: 0 is the expert, 1 is random")
+
+
+def plain_section(section: Mapping[str, Any]) -> dict[str, Any]:
+    """A config section as plain dictionaries and tuples, fit for another process."""
+    return {str(key): _plain(value) for key, value in section.items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return plain_section(value)
+    if isinstance(value, Sequence) and not isinstance(value, (str, bytes)):
+        return tuple(_plain(part) for part in value)
+    return value
+
+
+def build_suite(section: Mapping[str, Any]) -> TaskSuite:
+    """Build a task suite from its config section, `_target_: package.module.Class` and the class's options.
+
+    Raises:
+        SuiteError: if `_target_` does not import, is no TaskSuite or refuses the options.
+    """
+    options = plain_section(section)
+    target = str(options.pop("_target_", ""))
+    module, _, name = target.rpartition(".")
+    if not module:
+        raise SuiteError(
+            f"task.suite._target_={target!r} must name a class with its module, such as"
+            " envs.physics.tabletop.suite.Tabletop"
+        )
+    try:
+        factory = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise SuiteError(
+            f"task.suite._target_={target} does not import ({error}); install its package or correct the name"
+        ) from error
+    if not (isinstance(factory, type) and issubclass(factory, TaskSuite)):
+        raise SuiteError(f"task.suite._target_={target} is no envs.physics.suite.TaskSuite")
+    try:
+        return factory(**options)
+    except TypeError as error:
+        raise SuiteError(f"task.suite: {target} does not take these options: {error}") from error

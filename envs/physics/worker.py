@@ -1,0 +1,214 @@
+"""What one worker process does: it holds a suite a slot, runs episodes, and answers over a pipe.
+
+`python -m envs.physics.worker FILE_DESCRIPTOR` starts it, so it imports neither torch nor the script of its
+owner.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import traceback
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.physics.suite import Array, Observation, TaskSuite, build_suite
+
+
+@dataclass
+class Track:
+    """What one episode leaves behind, a row per frame; row 0 is the start.
+
+    Args:
+        seed: of the episode.
+        instruction: the task in words.
+        intrinsic: float [V, 3, 3] in pixels, None if no camera is calibrated.
+        rows: lists by name: frames uint8 [V, 3, H, W], commands [A], states [S], success bool, and where the
+            suite has them c2w [V, 4, 4] and poses [arms, 7].
+        privileged: lists by name of what only physics knows, true progress among them.
+    """
+
+    seed: int
+    instruction: str
+    intrinsic: Array | None
+    rows: dict[str, list[Any]] = field(default_factory=dict)
+    privileged: dict[str, list[Any]] = field(default_factory=dict)
+
+    def add(self, suite: TaskSuite, observed: Observation) -> None:
+        """Append things as they stand now."""
+        row = {
+            "frames": suite.render(),
+            "commands": observed.command,
+            "states": observed.state,
+            "success": observed.success,
+            "c2w": observed.c2w,
+            "poses": observed.poses,
+        }
+        for name, value in row.items():
+            if value is not None:
+                self.rows.setdefault(name, []).append(value)
+        for name, value in {"progress": observed.progress, **suite.privileged()}.items():
+            self.privileged.setdefault(name, []).append(value)
+
+    def __len__(self) -> int:
+        return len(self.rows["frames"])
+
+    def stack(self) -> dict[str, Array]:
+        """`rows` as arrays [T, ...]."""
+        return {name: np.stack(values) for name, values in self.rows.items()}
+
+
+@dataclass(frozen=True)
+class WorkerSpec:
+    """What a worker process is made from.
+
+    Args:
+        suite: config section of the task suite, plain.
+        task: a name of the suite's tasks.
+        horizon: actions after which an episode is over.
+    """
+
+    suite: dict[str, Any]
+    task: str
+    horizon: int
+
+
+@dataclass
+class Slot:
+    """One bench with the episode that it is in."""
+
+    suite: TaskSuite
+    steps: int = 0
+    over: bool = True
+    track: Track | None = None
+
+
+class Worker:
+    """The work of one process; it runs in the caller's process where a pool has one worker.
+
+    Args:
+        spec: of the suite and its task.
+        slots: episodes side by side.
+    """
+
+    def __init__(self, spec: WorkerSpec, slots: int):
+        self.spec = spec
+        self.slots = [Slot(build_suite(spec.suite)) for _ in range(slots)]
+
+    def reset(self, seeds: dict[int, int], record: bool) -> dict[int, dict[str, Any]]:
+        """Start episodes {slot: seed}; returns an observation per slot."""
+        out = {}
+        for index, seed in seeds.items():
+            slot = self.slots[index]
+            slot.suite.reset(self.spec.task, seed)
+            slot.steps, slot.over, slot.track = 0, False, None
+            observed = slot.suite.observe()
+            if record:
+                slot.track = Track(seed, observed.instruction, observed.intrinsic)
+                slot.track.add(slot.suite, observed)
+            out[index] = self._answer(slot, observed)
+        return out
+
+    def step(self, chunks: dict[int, NDArray[Any]]) -> dict[int, dict[str, Any]]:
+        """Carry out chunks {slot: [K, A]} of commands, each to its end, as imagined worlds do; an episode
+        that is over stands still.
+        """
+        out = {}
+        for index, chunk in chunks.items():
+            slot = self.slots[index]
+            observed = slot.suite.observe()
+            for command in () if slot.over else chunk:
+                slot.suite.step(command)
+                slot.steps += 1
+                observed = slot.suite.observe()
+                if slot.track is not None:
+                    slot.track.add(slot.suite, observed)
+            slot.over = slot.over or observed.success or slot.steps >= self.spec.horizon
+            out[index] = self._answer(slot, observed)
+            if slot.over and slot.track is not None:
+                out[index]["track"], slot.track = slot.track, None
+        return out
+
+    def script(self, jobs: list[tuple[int, float]], chunk: int) -> list[Track]:
+        """Whole episodes of scripted behaviours for (seed, noise_level) pairs; recorded to the horizon, or to
+        the end of the `chunk` actions in which they succeed.
+        """
+        out = []
+        suite = self.slots[0].suite
+        for seed, noise_level in jobs:
+            suite.reset(self.spec.task, seed)
+            act = suite.expert(noise_level, np.random.default_rng([seed, 1]))
+            observed = suite.observe()
+            track = Track(seed, observed.instruction, observed.intrinsic)
+            track.add(suite, observed)
+            for step in range(self.spec.horizon):
+                if observed.success and step % chunk == 0:
+                    break
+                suite.step(act())
+                observed = suite.observe()
+                track.add(suite, observed)
+            out.append(track)
+        return out
+
+    def picture(self, seed: int, size: tuple[int, int]) -> NDArray[np.uint8]:
+        """Pictures for people of an episode's start, uint8 [V, 3, H, W]."""
+        suite = self.slots[0].suite
+        suite.reset(self.spec.task, seed)
+        return suite.picture(size)
+
+    def modules(self) -> list[str]:
+        """Names of all modules that this process has imported."""
+        return sorted(sys.modules)
+
+    def _answer(self, slot: Slot, observed: Observation) -> dict[str, Any]:
+        answer = {
+            "image": slot.suite.render() if slot.track is None else slot.track.rows["frames"][-1],
+            "state": observed.state,
+            "command": observed.command,
+            "success": observed.success,
+            "progress": observed.progress,
+            "instruction": observed.instruction,
+            "over": slot.over,
+        }
+        extra = {name: getattr(observed, name) for name in ("intrinsic", "c2w")}
+        return answer | {name: value for name, value in extra.items() if value is not None}
+
+
+def serve(pipe: Connection) -> None:
+    """Answer requests until the pipe closes: first (spec, slots), then (method, arguments), None to end."""
+    try:
+        worker = Worker(*pipe.recv())
+        pipe.send(("ok", None))
+    except EOFError:
+        return
+    except Exception:
+        pipe.send(("error", traceback.format_exc()))
+        return
+    while True:
+        try:
+            message = pipe.recv()
+        except (EOFError, OSError):
+            return
+        if message is None:
+            return
+        name, arguments = message
+        try:
+            answer = ("ok", getattr(worker, name)(*arguments))
+        except Exception:
+            answer = ("error", traceback.format_exc())
+        try:
+            pipe.send(answer)
+        except OSError:
+            return
+
+
+if __name__ == "__main__":
+    # Under its real name, so that what is sent has the types that the other side imports.
+    from envs.physics import worker as _this
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who interrupts the pool's owner ends the pipe, and so us
+    _this.serve(Connection(int(sys.argv[1])))
