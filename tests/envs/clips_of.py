@@ -73,7 +73,7 @@ def clip_of(spec: WorldSpec, batch: int, memory: int, chunks: int = 1, seed: int
                     "valid": torch.ones(batch, count, dtype=torch.bool),
                     **_maps(spec, batch, count, seed=seed + 3),
                 },
-                [batch],
+                [batch, count],
             ),
             "now": TensorDict(
                 {

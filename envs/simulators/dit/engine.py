@@ -1,4 +1,4 @@
-"""The main engine at a small size, trained from nothing: GE-Sim 2.0's architecture with our own autoencoder."""
+"""The diffusion transformer at a small size, trained from nothing with our own autoencoder."""
 
 from __future__ import annotations
 
@@ -9,117 +9,147 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.conditioning import render_ray_map
-from envs.simulators.base import WorldShape
-from envs.simulators.dit.latent_world import LatentWorld
+from envs.conditioning import ActionVector, render_ray_map
+from envs.simulators.dit.latent_world import Diffusion, LatentWorld
 from envs.simulators.dit.network import DiTShape, MultiViewDiT
-from envs.simulators.draft import Draft
-from envs.simulators.in_view import place_map
+from envs.simulators.dit.prediction import PREDICTIONS
 from envs.simulators.samplers import Euler
 from envs.simulators.tokenizers.autoencoder import STRIDE, Autoencoder
+from envs.specs import WorldSpec
+
+# The public network embeds levels as they are; at thousandfold they span the sinusoids' range.
+TIME_SCALE = 1000.0
 
 
 @dataclass(frozen=True)
-class DiTConfig:
-    """Size and sampling of the DiT engine.
+class Trunk:
+    """Sizes of the transformer.
 
     Args:
-        layers, heads, head_dim, adaln_rank: of the trunk.
-        state_heads, state_head_dim: of the state expert.
+        layers, heads, head_dim: their number, and of their attention.
+        adaln_rank: of the maps from time step and action to shifts, scales and gates.
         patch: latent rows and columns per token.
-        channels, codec_width: of the autoencoder.
-        steps: Euler steps per chunk.
-        shift: of the noise levels in training and sampling; above 1 favours noise.
-        foreground: extra weight of latents over things that differ from the median colour.
-        augment: chance that memory is spoilt in training.
+        stem: channels of the convolutional stem; 0 is without.
     """
 
-    layers: int = 6
-    heads: int = 6
-    head_dim: int = 32
-    adaln_rank: int = 64
-    state_heads: int = 4
-    state_head_dim: int = 32
-    patch: int = 2
-    channels: int = 16
-    codec_width: int = 96
-    steps: int = 4
-    shift: float = 2.0
-    foreground: float = 8.0
-    augment: float = 0.8
+    layers: int
+    heads: int
+    head_dim: int
+    adaln_rank: int
+    patch: int
+    stem: int
+
+    def shape(self, spec: WorldSpec, channels: int, action_size: int) -> DiTShape:
+        """The network for latents of so many channels, of what `spec` is conditioned on."""
+        return DiTShape(
+            in_channels=channels + 1 + 3 * spec.pose_map + 6 * spec.ray_map,
+            out_channels=channels,
+            num_attention_heads=self.heads,
+            attention_head_dim=self.head_dim,
+            num_layers=self.layers,
+            text_embed_dim=0,
+            adaln_lora_dim=self.adaln_rank,
+            patch_size=(1, self.patch, self.patch),
+            rope_scale=(1.0, 1.0, 1.0),
+            views=spec.views,
+            concat_padding_mask=False,
+            action_size=action_size,
+            stem=self.stem,
+        )
+
+
+@dataclass(frozen=True)
+class Denoising:
+    """How it is trained and sampled.
+
+    Args:
+        prediction: "velocity", or "clean" for the clean latents (see prediction.py).
+        steps: Euler steps per chunk.
+        shift: of the noise levels in training and sampling; above 1 favours noise.
+        foreground: extra loss weight of what differs from the picture's median colour.
+        augment: chance that a clip's memory is augmented in training.
+    """
+
+    prediction: str
+    steps: int
+    shift: float
+    foreground: float
+    augment: float
+
+    def __post_init__(self) -> None:
+        if self.prediction not in PREDICTIONS:
+            raise ValueError(
+                f"simulator.denoising.prediction={self.prediction!r} must be one of {list(PREDICTIONS)}"
+            )
+        if self.steps < 1:
+            raise ValueError(f"simulator.denoising.steps={self.steps} must be at least 1")
+
+    def diffusion(self) -> Diffusion:
+        """The same for LatentWorld."""
+        sampler, prediction = Euler(self.steps, self.shift), PREDICTIONS[self.prediction]
+        return Diffusion(sampler, prediction, TIME_SCALE, self.shift, self.foreground, self.augment)
 
 
 class DiTSimulator(LatentWorld):
-    """LatentWorld at a small size that corrects drafts (draft.py); beside hands and cameras it is told where
-    objects will be.
+    """LatentWorld at a small size.
+
+    The action vector reaches every block through adaLN, as in WPE; pose map and ray map stand beside the latents
+    where the spec asks for them.
 
     Args:
-        shape: what it shows; sizes must be multiples of 8 * patch.
-        config: its size.
+        spec: what it shows; sizes must be multiples of 8 * patch.
+        memory_frames: sparse memory frames, M.
+        net: options of Trunk.
+        codec: options of Autoencoder.
+        denoising: options of Denoising.
+
+    Raises:
+        ValueError: if sizes do not fit.
+        TypeError: naming an option that is unknown or missing.
     """
 
-    def __init__(self, shape: WorldShape, config: DiTConfig | None = None):
-        config = config or DiTConfig()
-        net = MultiViewDiT(
-            DiTShape(
-                in_channels=2 * config.channels + 3 + 6 + 1 + shape.objects,
-                out_channels=config.channels,
-                num_attention_heads=config.heads,
-                attention_head_dim=config.head_dim,
-                num_layers=config.layers,
-                text_embed_dim=32,
-                adaln_lora_dim=config.adaln_rank,
-                patch_size=(1, config.patch, config.patch),
-                rope_scale=(1.0, 1.0, 1.0),
-                views=shape.views,
-                pose_num_attention_heads=config.state_heads,
-                pose_attention_head_dim=config.state_head_dim,
-            ),
-            expert=False,  # it is a stage of its own, with its own depth
-        )
-        codec = Autoencoder(config.channels, config.codec_width)
-        # The public network embeds levels as they are; at thousandfold they span the sinusoids' range.
-        super().__init__(
-            shape,
-            net,
-            codec,
-            torch.zeros(1, 1, 32),
-            Euler(config.steps, config.shift),
-            1000.0,
-            config.shift,
-            config.foreground,
-            config.augment,
-        )
-        self.draft = Draft(shape.views, shape.size)
+    codec: Autoencoder
+
+    def __init__(
+        self,
+        spec: WorldSpec,
+        memory_frames: int,
+        net: dict[str, int],
+        codec: dict[str, int],
+        denoising: dict[str, float | str],
+    ):
+        vector, tokenizer = ActionVector(spec.embodiment), Autoencoder(**codec)
+        trunk = MultiViewDiT(Trunk(**net).shape(spec, tokenizer.channels, vector.size))
+        options = Denoising(**denoising)  # type: ignore[arg-type]
+        super().__init__(spec, memory_frames, trunk, tokenizer, options.diffusion())
+        self.action_vector = vector
         with torch.no_grad():
-            # it starts from the draft, for random corrections take long to unlearn
-            net.proj_out.weight.mul_(0.05)
+            # It starts from no change, or no flow: random output takes long to unlearn.
+            trunk.proj_out.weight.mul_(0.05)
 
-    def glance(self, frames: Tensor, c2w: Tensor) -> None:
-        """See Simulator.glance."""
-        self.draft.learn(frames, c2w)
+    def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
+        """See Simulator.normalise; action vectors take their units."""
+        self.action_vector.normalise(commands, moves)
 
-    def prepare(self, frames: Tensor, places: Tensor, intrinsic: Tensor, c2w: Tensor) -> TensorDict:
-        """See Simulator.prepare."""
-        return self.draft.prepare(frames, places, intrinsic, c2w)
+    def actions(self, inputs: TensorDict) -> Tensor:
+        """See LatentWorld.actions."""
+        commands = torch.cat([inputs["memory", "commands"], inputs["future", "commands"]], 1)
+        return self.action_vector(commands, inputs["now", "command"])
 
-    def drafted(self, inputs: TensorDict) -> Tensor:
-        """See LatentWorld."""
-        ahead = self.draft.look(inputs).at(slice(None), slice(1, None))
-        return torch.stack(
-            self.draft(inputs["begin"], ahead, inputs["future", "c2w"], inputs["intrinsic"]), 2
-        )
-
-    def conditioning(self, inputs: TensorDict, places: tuple[int, int]) -> Tensor:
-        """See LatentWorld; spots of the objects stand beside, known from the last remembered frame on."""
-        maps = torch.cat([inputs["memory", "pose_map"], inputs["future", "pose_map"]], 1).float() / 127.5 - 1
-        small = F.interpolate(maps.flatten(0, 2), size=places, mode="bilinear", antialias=True).unflatten(
-            0, maps.shape[:3]
-        )
-        c2w = torch.cat([inputs["memory", "c2w"], inputs["future", "c2w"]], 1).transpose(1, 2)
-        rays = render_ray_map(inputs["intrinsic"], c2w, self.shape.size, stride=STRIDE)  # [B, V, T, 6, h, w]
-        mask = torch.zeros_like(rays[:, :, :, :1])
-        mask[:, :, : self.shape.memory] = 1.0
-        spots = place_map(self.draft.look(inputs), *places)
-        spots = F.pad(spots, (0, 0, 0, 0, 0, 0, self.shape.memory - 1, 0))
-        return torch.cat([small.permute(0, 2, 1, 3, 4, 5), rays, mask, spots], 3).transpose(2, 3)
+    def conditioning(self, inputs: TensorDict, latent_hw: tuple[int, int]) -> Tensor:
+        """See LatentWorld.conditioning; maps are averaged over the pixels of a latent."""
+        shape = (*inputs.shape, self.spec.views, 1, self.memory_frames + self.ahead, *latent_hw)
+        mask = torch.zeros(shape, device=inputs["memory", "frames"].device)
+        mask[:, :, :, : self.memory_frames] = 1.0
+        channels = [mask]
+        if self.spec.pose_map:
+            maps = torch.cat([inputs["memory", "pose_map"], inputs["future", "pose_map"]], 1)
+            small = F.interpolate(
+                maps.flatten(0, 2).float() / 127.5 - 1, size=latent_hw, mode="bilinear", antialias=True
+            )
+            channels.append(small.unflatten(0, maps.shape[:3]).permute(0, 2, 3, 1, 4, 5))
+        if self.spec.ray_map:
+            c2w = torch.cat([inputs["memory", "c2w"], inputs["future", "c2w"]], 1).transpose(1, 2)
+            rays = render_ray_map(inputs["intrinsic"], c2w, self.spec.size, stride=STRIDE)
+            channels.append(rays.transpose(2, 3))
+        return torch.cat(channels, 2)

@@ -1,104 +1,113 @@
-"""What every latent diffusion world shares, small or 2B: GE-Sim 2.0's way from remembered frames to a chunk
-of new ones.
+"""What every latent diffusion world shares, small or 2B: GE-Sim 2.0's way from remembered frames to a chunk.
 
-Latents of sparse memory frames and of the chunk to come stand in one sequence, with pose map, ray map and a
-memory
-mask as further channels; memory is clean, the future is denoised along the flow. A world that has drafts of
-the frames to come (draft.py) denoises
-corrections of their latents instead.
+Latents of sparse memory frames and of the chunk to come stand in one sequence, beside them whatever conditioning
+the robot allows: pose map and ray map as channels, the action vector through adaLN. Memory is clean, the future
+is denoised along the flow.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.simulators.base import Simulator, WorldShape, foreground_weight, noise_generator, to_bytes
+from envs.simulators.base import Simulator, noise_generator, to_bytes
 from envs.simulators.dit.augment import augment_memory_frames, augment_memory_latents, chosen_clips
 from envs.simulators.dit.network import MultiViewDiT
+from envs.simulators.dit.prediction import Prediction
+from envs.simulators.foreground import foreground_weight
+from envs.simulators.inputs import build_inputs
 from envs.simulators.samplers import Sampler
 from envs.simulators.tokenizers.autoencoder import STRIDE, Codec
+from envs.specs import WorldSpec
 
-_CORRECTION = 0.5  # standard deviation of corrections, in latents of deviation one
-_CHANGED = 0.15  # of 0..1, by which a pixel was corrected beyond which nothing of the draft is put back
 MEMORY_NOISE = 1e-4 / (1 + 1e-4)  # the noise level at which memory stands, as released
 
 
-class _Setting(NamedTuple):
-    """conditioning [B, V, C, M + T', h, w]; draft frames [B, K, V, 3, H, W] and their latents base [B, V, C,
-    T', h, w], if there are any.
+@dataclass(frozen=True)
+class Diffusion:
+    """How latents are noised and denoised.
+
+    Args:
+        sampler: how the flow is followed.
+        prediction: what the network says.
+        time_scale: what levels are multiplied with for the network.
+        shift: of the levels drawn in training; above 1 favours noise.
+        foreground: extra loss weight of what differs from the picture's median colour.
+        augment: chance that a clip's memory is augmented in training.
     """
 
-    conditioning: Tensor
-    draft: Tensor | None
-    base: Tensor | None
+    sampler: Sampler
+    prediction: Prediction
+    time_scale: float
+    shift: float
+    foreground: float
+    augment: float
 
 
 class LatentWorld(Simulator):
-    """Diffusion-transformer video world; see the module's docstring. A subclass says how conditioning is
-    resized.
+    """Diffusion-transformer video world; see the module's docstring. A subclass says how it is conditioned.
 
     Args:
-        shape: what it shows; sizes must be multiples of the autoencoder's stride times the patch.
-        net: trunk (and state expert).
-        codec: video autoencoder.
-        prompt: [1, L, D], the one text embedding; the task's words never reach the simulator.
-        sampler: how the flow is followed.
-        time_scale: what levels are multiplied with for the network.
-        shift: of the levels drawn in training; above 1 favours noise.
-        foreground: extra weight of latents over things that differ from the median colour.
-        augment: chance that a clip's memory is spoilt in training.
+        spec: what it shows; sizes must be multiples of the autoencoder's stride times the patch.
+        memory_frames: sparse memory frames, M.
+        net: video trunk.
+        codec: video autoencoder, trained apart.
+        diffusion: noise levels and sampling.
+        prompt: [1, L, D], the one text embedding of a network that reads text; the task's words never reach the
+            simulator.
+
+    Raises:
+        ValueError: if the size does not fit.
     """
 
-    prompt: Tensor
+    prompt: Tensor | None
 
     def __init__(
         self,
-        shape: WorldShape,
+        spec: WorldSpec,
+        memory_frames: int,
         net: MultiViewDiT,
         codec: Codec,
-        prompt: Tensor,
-        sampler: Sampler,
-        time_scale: float,
-        shift: float,
-        foreground: float,
-        augment: float,
+        diffusion: Diffusion,
+        prompt: Tensor | None = None,
     ):
-        super().__init__(shape)
+        super().__init__(spec, memory_frames)
         patch = net.shape.patch_size
         unit = (STRIDE * patch[1], STRIDE * patch[2])
-        if shape.size[0] % unit[0] or shape.size[1] % unit[1]:
+        if spec.size[0] % unit[0] or spec.size[1] % unit[1]:
             raise ValueError(
-                f"task.size={list(shape.size)} must be multiples of {list(unit)} for this network's patches"
+                f"task.size={list(spec.size)} must be multiples of {list(unit)} for this network's patches"
             )
-        self.net, self.codec, self.sampler = net, codec, sampler
+        self.net, self.codec, self.diffusion = net, codec.requires_grad_(False), diffusion
         self.register_buffer("prompt", prompt)
-        self.time_scale, self.shift, self.foreground, self.augment = time_scale, shift, foreground, augment
-        self.ahead = codec.latents_of(shape.chunk)  # latent frames of a chunk
-        tokens = (shape.memory + self.ahead) * (shape.size[0] // unit[0]) * (shape.size[1] // unit[1])
-        self.feature_shape = (shape.views, tokens, net.shape.width)
+        self.ahead = codec.latents_of(spec.chunk)  # latent frames of a chunk
+        tokens = (memory_frames + self.ahead) * (spec.size[0] // unit[0]) * (spec.size[1] // unit[1])
+        self.feature_shape = (spec.views, tokens, net.shape.width)
+
+    @property
+    def foreground(self) -> float:
+        """Extra loss weight of what differs from the median colour; the autoencoder's stage uses it too."""
+        return self.diffusion.foreground
 
     # -- what a subclass gives
     # -----------------------------------------------------------------------------------
-    def conditioning(self, inputs: TensorDict, places: tuple[int, int]) -> Tensor:
-        """Channels [B, V, C, M + T', h, w] beside the latents, at places = (h, w): pose map, ray map, memory
-        mask, and what else the network reads.
+    def conditioning(self, inputs: TensorDict, latent_hw: tuple[int, int]) -> Tensor:
+        """Channels [B, V, C, M + T', h, w] beside the latents at latent_hw = (h, w): a memory mask, and the pose
+        map and ray map that the spec asks for.
         """
         raise NotImplementedError
 
-    def drafted(self, inputs: TensorDict) -> Tensor | None:
-        """Drafts of the chunk, float [B, K, V, 3, H, W] in 0..1, if this world corrects drafts; their latents
-        then stand beside the conditioning.
-        """
+    def actions(self, inputs: TensorDict) -> Tensor | None:
+        """Action vectors [B, M + T', action_size] of all latent frames, of a network that reads them."""
         return None
 
     # -- latents
     # ---------------------------------------------------------------------------------------------------
-    def remember(self, frames: Tensor) -> Tensor:
+    def encode_stills(self, frames: Tensor) -> Tensor:
         """Latents [B, V, C, M, h, w] of memory frames, float [B, M, V, 3, H, W] in 0..1, each encoded on its
         own.
         """
@@ -119,95 +128,116 @@ class LatentWorld(Simulator):
         clips = self.codec.decode_clips(latents.flatten(0, 1)).float()
         return clips.unflatten(0, latents.shape[:2]).transpose(1, 2)
 
-    def _setting(self, inputs: TensorDict, memory: Tensor) -> _Setting:
-        """What stays the same at every step of a chunk."""
-        conditioning, draft = (
-            self.conditioning(inputs, (memory.shape[-2], memory.shape[-1])),
-            self.drafted(inputs),
-        )
-        if draft is None:
-            return _Setting(conditioning, None, None)
-        base = self.encode(draft)
-        return _Setting(
-            torch.cat([conditioning, F.pad(base, (0, 0, 0, 0, self.shape.memory, 0))], 2), draft, base
-        )
-
-    def _says(
-        self,
-        future: Tensor,
-        memory: Tensor,
-        level: Tensor,
-        conditioning: Tensor,
-        layers: list[Tensor] | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """What the network says of the future latents [B, V, C, T', h, w] at noise level [B], and the fused
-        features.
-
-        Of whole latents it says their velocity, as released. Of corrections it says the correction: for the
-            most part
-        that is nothing, which a network says well from the start, where nothing by velocity is a cancellation
-        of noise.
-        """
-        latents = torch.cat([torch.cat([memory, future], 3), conditioning], 2)
-        steps = torch.full((len(future), latents.shape[3]), MEMORY_NOISE, device=future.device)
-        steps[:, self.shape.memory :] = level[:, None]
-        views = self.shape.views
-        velocity, fused = self.net(
-            latents.flatten(0, 1),
-            self.time_scale * steps.repeat_interleave(views, 0),
-            self.prompt.expand(len(future), -1, -1),
-            views,
-            self.shape.fps,
-            layers,
-        )
-        return velocity.unflatten(0, (-1, views))[:, :, :, self.shape.memory :].float(), fused.unflatten(
-            0, (-1, views)
-        )
-
     # -- contract
     # --------------------------------------------------------------------------------------------------
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; noise comes from (seed, chunk_index), features from the last step."""
-        latents, fused, setting = self._denoise(inputs)
-        frames = self.decode(latents)
-        if setting.draft is None or setting.base is None:
-            return to_bytes(frames), fused
-        # Where the draft needs no correction, what the autoencoder blurs is put back.
-        blurred = self.decode(setting.base)
-        keep = (1 - (frames - blurred).abs().amax(3, keepdim=True) / _CHANGED).clamp(min=0)
-        return to_bytes(frames + keep * (setting.draft - blurred)), fused
+        latents, features = self._denoise(inputs)
+        return to_bytes(self.decode(latents)), features
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is decoded to pixels."""
         return self._denoise(inputs)[1]
 
     def layers(self, inputs: TensorDict) -> list[Tensor]:
-        """What every block of the trunk says at the last step, each [B * V, tokens, width], from which the
-        state expert learns its mix.
+        """Outputs of every block of the trunk at the last step, each [B * V, tokens, width], from which a state
+        expert learns its mix.
         """
-        said: list[Tensor] = []
-        self._denoise(inputs, said)
-        return said
+        outputs: list[Tensor] = []
+        self._denoise(inputs, outputs)
+        return outputs
 
-    def _denoise(
-        self, inputs: TensorDict, layers: list[Tensor] | None = None
-    ) -> tuple[Tensor, Tensor, _Setting]:
-        """Future latents [B, V, C, T', h, w], the features of the last step, and what was given."""
-        memory = self.remember(unit(inputs["memory", "frames"]))
-        setting = self._setting(inputs, memory)
+    def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of the future latents of one chunk (memory has none), any of the clip's; the frames of those
+        before it are the model's own.
+        """
+        chunk = self.spec.chunk
+        # Chunks wholly past the end of every episode teach nothing.
+        whole = clip["future", "valid"].bool().any(0).unflatten(0, (-1, chunk)).any(1)
+        chosen = int(torch.randint(max(1, int(whole.long().sum())), (1,), generator=generator))
+        inputs = self._unroll(clip, chosen, generator)
+        part = slice(chosen * chunk, (chosen + 1) * chunk)
+        truth, valid = unit(clip["future", "frames"][:, part]), clip["future", "valid"][:, part]
+        augmented = chosen_clips(len(truth), self.diffusion.augment, generator)
+        remembered = augment_memory_frames(unit(inputs["memory", "frames"]), augmented, generator)
+        memory = augment_memory_latents(self.encode_stills(remembered), augmented, generator)
+        clean = self.encode(truth)
+        draw = torch.rand(clip.shape, generator=generator).to(clean.device)
+        level = self.diffusion.shift * draw / (1 + (self.diffusion.shift - 1) * draw)
+        noise = torch.randn(clean.shape, generator=generator).to(clean.device)
+        mixed = level[:, None, None, None, None, None]
+        output, _ = self._run(
+            (1 - mixed) * clean + mixed * noise, memory, level, self._channels(inputs, memory)
+        )
+        error = self.diffusion.prediction.error(output, clean, noise, memory[:, :, :, -1:])
+        weight = self._weight(truth, valid)
+        value = (error.square() * weight).sum() / (weight.sum() * clean.shape[2]).clamp(min=1)
+        return value, {}
+
+    # -- parts
+    # -----------------------------------------------------------------------------------------------------
+    def _unroll(self, clip: TensorDict, chosen: int, generator: torch.Generator) -> TensorDict:
+        """Inputs of chunk number `chosen`, whose memory shows the model's own frames of the chunks before."""
+        own: Tensor | None = None
+        for number in range(chosen):
+            with torch.no_grad():
+                frames = self.predict(build_inputs(self.spec, clip, number, own, generator))[0]
+            own = frames if own is None else torch.cat([own, frames], 1)
+        return build_inputs(self.spec, clip, chosen, own, generator)
+
+    def _channels(self, inputs: TensorDict, memory: Tensor) -> tuple[Tensor, Tensor | None]:
+        """What stays the same at every step: conditioning channels and action vectors."""
+        return self.conditioning(inputs, (memory.shape[-2], memory.shape[-1])), self.actions(inputs)
+
+    def _weight(self, truth: Tensor, valid: Tensor) -> Tensor:
+        """Loss weights [B, V, 1, T', h, w] of true frames [B, K, V, 3, H, W] and valid [B, K]."""
+        weight = foreground_weight(truth, self.foreground) * valid[:, :, None, None, None, None]
+        pooled = F.avg_pool2d(self.codec.pool_time(weight).flatten(0, 2), STRIDE)
+        return pooled.unflatten(0, (len(truth), self.ahead, -1)).permute(0, 2, 3, 1, 4, 5)
+
+    def _run(
+        self,
+        future: Tensor,
+        memory: Tensor,
+        level: Tensor,
+        conditions: tuple[Tensor, Tensor | None],
+        layers: list[Tensor] | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """The network's output for future latents [B, V, C, T', h, w] at noise level [B], and features
+        [B, V, tokens, width].
+        """
+        channels, actions = conditions
+        latents = torch.cat([torch.cat([memory, future], 3), channels], 2)
+        steps = torch.full((len(future), latents.shape[3]), MEMORY_NOISE, device=future.device)
+        steps[:, self.memory_frames :] = level[:, None]
+        views = self.spec.views
+        output, fused = self.net(
+            latents.flatten(0, 1),
+            self.diffusion.time_scale * steps.repeat_interleave(views, 0),
+            None if self.prompt is None else self.prompt.expand(len(future), -1, -1),
+            self.spec.fps,
+            None if actions is None else actions.repeat_interleave(views, 0),
+            layers,
+        )
+        ahead = output.unflatten(0, (-1, views))[:, :, :, self.memory_frames :].float()
+        return ahead, fused.unflatten(0, (-1, views))
+
+    def _denoise(self, inputs: TensorDict, layers: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
+        """Future latents [B, V, C, T', h, w] and the features of the last step."""
+        memory = self.encode_stills(unit(inputs["memory", "frames"]))
+        conditions, base = self._channels(inputs, memory), memory[:, :, :, -1:]
         kept: list[Tensor] = []
 
         def velocity(z: Tensor, level: float) -> Tensor:
             if layers is not None:
                 layers.clear()
-            value, fused = self._says(
-                z, memory, torch.full((len(z),), level, device=z.device), setting.conditioning, layers
-            )
-            kept[:] = [fused]
-            return value if setting.base is None else (z - value) / level
+            levels = torch.full((len(z),), level, device=z.device)
+            output, features = self._run(z, memory, levels, conditions, layers)
+            kept[:] = [features]
+            return self.diffusion.prediction.velocity(output, z, level, base)
 
-        latents = self.sampler(velocity, self._noise(inputs["seed"], inputs["chunk_index"], memory))
-        return latents if setting.base is None else setting.base + _CORRECTION * latents, kept[0], setting
+        noise = self._noise(inputs["seed"], inputs["chunk_index"], memory)
+        return self.diffusion.sampler(velocity, noise), kept[0]
 
     def _noise(self, seed: Tensor, chunk_index: Tensor, like: Tensor) -> Tensor:
         """Noise [B, V, C, T', h, w], row by row from its own generator, so that it is the same in any batch."""
@@ -218,53 +248,6 @@ class LatentWorld(Simulator):
                 torch.randn(views, channels, self.ahead, height, width, generator=noise_generator(s, c))
             )
         return torch.stack(rows).to(like.device)
-
-    def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        """Flow matching on the future latents of one chunk (memory has no loss), any of the clip's; those
-        before it are the model's own.
-        """
-        chunk = self.shape.chunk
-        # Chunks wholly past the end of every episode teach nothing.
-        whole = clip["future", "valid"].any(0).unflatten(0, (-1, chunk)).any(1)
-        chosen = int(torch.randint(max(1, int(whole.long().sum())), (1,), generator=generator))
-        drawn: Tensor | None = None
-        begin: TensorDict | None = None
-        for number in range(chosen):
-            with torch.no_grad():
-                inputs = self.build_inputs(clip, number, drawn, generator, begin)
-                begin, pictures = inputs["begin"], self.predict(inputs)[0]
-            drawn = pictures if drawn is None else torch.cat([drawn, pictures], 1)
-        inputs, part = (
-            self.build_inputs(clip, chosen, drawn, generator, begin),
-            slice(chosen * chunk, (chosen + 1) * chunk),
-        )
-        truth = unit(clip["future", "frames"][:, part])
-        spoilt = chosen_clips(len(truth), self.augment, generator)
-        memory = augment_memory_latents(
-            self.remember(augment_memory_frames(unit(inputs["memory", "frames"]), spoilt, generator)),
-            spoilt,
-            generator,
-        )
-        target, setting = self.encode(truth), self._setting(inputs, memory)
-        if setting.base is not None:
-            target = (target - setting.base) / _CORRECTION
-        draw = torch.rand(clip.shape, generator=generator).to(clip.device)
-        level = self.shift * draw / (1 + (self.shift - 1) * draw)
-        noise = torch.randn(target.shape, generator=generator).to(clip.device)
-        mixed = level[:, None, None, None, None, None]
-        said, _ = self._says((1 - mixed) * target + mixed * noise, memory, level, setting.conditioning)
-        wanted = noise - target if setting.base is None else target
-        weight = (
-            foreground_weight(truth, self.foreground)
-            * clip["future", "valid"][:, part][:, :, None, None, None, None]
-        )
-        weight = (
-            F.avg_pool2d(self.codec.pool_time(weight).flatten(0, 2), STRIDE)
-            .unflatten(0, (len(truth), self.ahead, -1))
-            .permute(0, 2, 3, 1, 4, 5)
-        )
-        value = ((said - wanted).square() * weight).sum() / (weight.sum() * target.shape[2]).clamp(min=1)
-        return value, {}
 
 
 def unit(frames: Tensor) -> Tensor:

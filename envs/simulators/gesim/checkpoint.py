@@ -20,11 +20,13 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from envs.simulators.dit.network import DiTShape, MultiViewDiT
+from envs.simulators.dit.state_network import StateDiT
 from envs.simulators.gesim.fixture import shape_of
 from envs.simulators.samplers import EDM
 from envs.simulators.tokenizers.wan import WanCodec
 
-JOINTS = 16
+JOINTS = 16  # of the released robot's actions and states
+_MIX = ("video_buffer_weights", "video_buffer_norm.weight", "video_buffer_norm.bias")
 
 
 class CheckpointError(ValueError):
@@ -33,12 +35,11 @@ class CheckpointError(ValueError):
 
 @dataclass
 class Released:
-    """What a checkpoint holds.
+    """What a checkpoint holds of the video world.
 
     Args:
-        net: trunk, and state expert if there is one; float32, or as stored if `dtype` was given.
+        net: trunk; float32, or as stored if `dtype` was given.
         codec, prompt: autoencoder, and prompt embedding [1, L, D].
-        stats: "action" and "state", each mean and spread [2, 16]; None for version 1.
         edm: the undistilled sampler's numbers.
         distilled: whether the four-step sampler is meant.
     """
@@ -46,29 +47,31 @@ class Released:
     net: MultiViewDiT
     codec: WanCodec
     prompt: Tensor
-    stats: dict[str, Tensor] | None
     edm: EDM
     distilled: bool
 
 
 def load_released(path: Path, dtype: torch.dtype = torch.float32) -> Released:
-    """Load a checkpoint folder of GE-Sim 2.0 or a file of GE-Sim 1.
+    """Load the video world of a checkpoint folder of GE-Sim 2.0 or a file of GE-Sim 1.
 
     Raises:
         CheckpointError: if parts are missing or do not fit.
     """
-    path = Path(path)
-    folder, weights = (path, path / "model.safetensors") if path.is_dir() else (path.parent, path)
+    folder, weights = _locate(path)
     parts = {name: folder / name for name in ("prompt_embeds.pt", "vae", "scheduler/scheduler_config.json")}
     if path.is_dir():
         parts["norm_stats.json"] = folder / "norm_stats.json"
     missing = [str(part) for part in (weights, *parts.values()) if not part.exists()]
     if missing:
         raise CheckpointError(
-            f"simulator.checkpoint={path}: {missing} are missing; a checkpoint is a folder with model.safetensors, prompt_embeds.pt, norm_stats.json, vae/ and scheduler/"
+            f"simulator.checkpoint={path}: {missing} are missing; a checkpoint is a folder with"
+            " model.safetensors, prompt_embeds.pt, norm_stats.json, vae/ and scheduler/"
         )
-    net = _network(weights, dtype)
-    stats = _stats(parts["norm_stats.json"]) if "norm_stats.json" in parts else None
+    shape, tensors = _read(weights, dtype)
+    with torch.device("meta"):
+        net = MultiViewDiT(shape)
+    defaults = {name: value for name, value in _default_mix(shape).items() if name not in tensors}
+    net.load_state_dict({name: (tensors | defaults)[name] for name in net.state_dict()}, assign=True)
     try:
         codec = WanCodec.load(parts["vae"])
     except (OSError, ValueError, KeyError) as error:
@@ -77,25 +80,46 @@ def load_released(path: Path, dtype: torch.dtype = torch.float32) -> Released:
         raise CheckpointError(
             f"{parts['vae']} has {codec.channels} latent channels, {weights} makes {net.shape.out_channels}"
         )
-    return Released(
-        net,
-        codec,
-        _prompt(parts["prompt_embeds.pt"], net.shape.text_embed_dim),
-        stats,
-        _edm(parts["scheduler/scheduler_config.json"]),
-        distilled=net.shape.pose_expert,
-    )
+    prompt = _prompt(parts["prompt_embeds.pt"], net.shape.text_embed_dim)
+    edm = _edm(parts["scheduler/scheduler_config.json"])
+    return Released(net.eval(), codec, prompt, edm, distilled=shape.pose_expert)
 
 
-def _network(path: Path, dtype: torch.dtype) -> MultiViewDiT:
+def load_state_network(path: Path) -> tuple[StateDiT, dict[str, Tensor]] | None:
+    """The state expert of a checkpoint, and the units "action" and "state", each mean and spread [2, 16]; None
+    of GE-Sim 1, which has none.
+
+    Raises:
+        CheckpointError: if parts are missing or do not fit.
+    """
+    folder, weights = _locate(path)
+    shape, tensors = _read(weights, torch.float32)
+    if not shape.pose_expert:
+        return None
+    net = StateDiT(shape)
+    net.load_state_dict({name: tensors[name] for name in net.state_dict()})
+    return net.eval(), _stats(folder / "norm_stats.json")
+
+
+def _locate(path: Path) -> tuple[Path, Path]:
+    """The checkpoint's folder and its file of weights."""
+    return (path, path / "model.safetensors") if path.is_dir() else (path.parent, path)
+
+
+def _default_mix(shape: DiTShape) -> dict[str, Tensor]:
+    """The mix of features of a network whose file has no state expert."""
+    values = (torch.ones(shape.num_layers), torch.ones(shape.width), torch.zeros(shape.width))
+    return dict(zip(_MIX, values, strict=True))
+
+
+def _read(path: Path, dtype: torch.dtype) -> tuple[DiTShape, dict[str, Tensor]]:
+    """Sizes and all weights of a file, strictly those of trunk and state expert."""
     try:
         with safe_open(str(path), "pt") as file:
             meta = file.metadata() or {}
             shapes = {key: tuple(file.get_slice(key).get_shape()) for key in file.keys()}
             shape = sizes_of(shapes, meta, path)
-            with torch.device("meta"):
-                net = MultiViewDiT(shape)
-            wanted = {key: tuple(value.shape) for key, value in net.state_dict().items()}
+            wanted = _wanted(shape)
             absent, extra = sorted(wanted.keys() - shapes.keys()), sorted(shapes.keys() - wanted.keys())
             other = [
                 f"{key}: file {shapes[key]}, network {wanted[key]}"
@@ -104,12 +128,20 @@ def _network(path: Path, dtype: torch.dtype) -> MultiViewDiT:
             ]
             if absent or extra or other:
                 raise CheckpointError(
-                    f"{path} is not this network. Missing: {_listed(absent)}. Unexpected: {_listed(extra)}. Of other shapes: {_listed(other)}."
+                    f"{path} is not this network. Missing: {_listed(absent)}. Unexpected: {_listed(extra)}."
+                    f" Of other shapes: {_listed(other)}."
                 )
-            net.load_state_dict({key: file.get_tensor(key).to(dtype) for key in wanted}, assign=True)
+            return shape, {key: file.get_tensor(key).to(dtype) for key in wanted}
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"{path} cannot be read: {error}") from error
-    return net.eval()
+
+
+def _wanted(shape: DiTShape) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of all weights of a released file."""
+    with torch.device("meta"):
+        parts = [MultiViewDiT(shape), *([StateDiT(shape)] if shape.pose_expert else [])]
+    wanted = {key: tuple(value.shape) for part in parts for key, value in part.state_dict().items()}
+    return {key: size for key, size in wanted.items() if shape.pose_expert or key not in _MIX}
 
 
 def _listed(names: list[str], most: int = 40) -> str:
@@ -177,7 +209,8 @@ def _prompt(path: Path, width: int) -> Tensor:
         raise CheckpointError(f"{path} cannot be read as tensors alone: {error}") from error
     if not isinstance(prompt, Tensor) or prompt.ndim not in (2, 3) or prompt.shape[-1] != width:
         raise CheckpointError(
-            f"{path} must hold one tensor [L, {width}] or [N, L, {width}], got {tuple(getattr(prompt, 'shape', ()))}"
+            f"{path} must hold one tensor [L, {width}] or [N, L, {width}],"
+            f" got {tuple(getattr(prompt, 'shape', ()))}"
         )
     return (prompt if prompt.ndim == 3 else prompt[None])[:1].float()
 
@@ -196,7 +229,8 @@ def _stats(path: Path) -> dict[str, Tensor]:
     for kind, values in stats.items():
         if values.shape != (2, JOINTS) or not torch.isfinite(values).all() or not (values[1] > 0).all():
             raise CheckpointError(
-                f"{path}: {kind} must have {JOINTS} finite means and positive spreads, got {tuple(values.shape)}"
+                f"{path}: {kind} must have {JOINTS} finite means and positive spreads,"
+                f" got {tuple(values.shape)}"
             )
     return stats
 

@@ -1,15 +1,13 @@
-"""GE-Sim as released: its network, its autoencoder, its way of resizing conditioning, and on request its
-quirks.
+"""GE-Sim as released: its network, its autoencoder, its way of resizing conditioning, and on request its quirks.
 
 Version 2.0 (three views of 384 x 512 at 30 Hz, chunks of 25, joint commands, four distilled steps, a state
-expert) and
-version 1 (15 undistilled steps, no state expert) are this class with other weights; gesim_folder.py loads
-them.
+expert) and version 1 (15 undistilled steps, no state expert) are this class with other weights; checkpoint.py
+loads them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,192 +18,162 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.conditioning import render_ray_map
-from envs.simulators.base import WorldShape
-from envs.simulators.dit.latent_world import LatentWorld
+from envs.simulators.dit.latent_world import Diffusion, LatentWorld
 from envs.simulators.dit.network import DiTShape, MultiViewDiT
+from envs.simulators.dit.prediction import Velocity
 from envs.simulators.gesim.checkpoint import CheckpointError, load_released
 from envs.simulators.samplers import DISTILLED, EDM, Distilled, Sampler
-from envs.simulators.state_experts.flow import StateExpert
-from envs.simulators.tokenizers.autoencoder import Codec
 from envs.simulators.tokenizers.wan import WanCodec
+from envs.specs import WorldSpec
 
-PARITY = ("right", "released", "released_replay")
+_CONDITIONING = 3 + 6 + 1  # channels of pose map, ray map, memory mask
 
 
 @dataclass(frozen=True)
-class GESimConfig:
-    """How GE-Sim is run and trained.
+class Parity:
+    """Which of the released code's quirks are repeated.
 
     Args:
-        sampling: "distilled" or "edm"; "" takes what the checkpoint was made for.
-        steps: of the sampler; 0 takes the released number, 4 or 15.
-        parity: "right" remembers the first frame, and every remembered frame with the pose it had. "released"
-            does as the
-            released code does in closed loop: the first frame is forgotten after the first chunk, memory is
-                shown with
-            the pose of the chunk's first command, and the state expert's past is each chunk's last frame.
-            "released_replay" forgets the first frame only, as the released code does when it replays a
-            recording.
-        shift: of the noise levels drawn in training.
-        foreground: extra weight in training of what differs from the median colour.
-        augment: chance that a clip's memory is spoilt in training.
-        checkpointing: compute blocks anew in the backward pass, for memory.
-        net: sizes of a network that begins from nothing (DiTShape); a checkpoint brings its own.
-        vae: sizes of its autoencoder (diffusers' AutoencoderKLWan).
+        forgets_first: the first frame leaves the history after the first chunk.
+        shows_current: remembered frames stand with the pose of the chunk's first command, instead of their own.
+        thins_history: of commands and states the state expert's past holds each chunk's last frame only.
     """
 
-    sampling: str = ""
-    steps: int = 0
-    parity: str = "right"
-    shift: float = 1.0
-    foreground: float = 0.0
-    augment: float = 0.8
-    checkpointing: bool = False
-    net: dict[str, Any] = field(default_factory=dict)
-    vae: dict[str, Any] = field(default_factory=dict)
+    forgets_first: bool
+    shows_current: bool
+    thins_history: bool
+
+
+# As the paper says; as the released code does in closed loop; as it does when it replays a recording.
+PARITY = {
+    "right": Parity(False, False, False),
+    "released": Parity(True, True, True),
+    "released_replay": Parity(True, False, False),
+}
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How chunks are sampled.
+
+    Args:
+        kind: "distilled" or "edm"; "" takes what the checkpoint was made for.
+        steps: of the sampler; 0 takes the released number, 4 or 15.
+    """
+
+    kind: str
+    steps: int
 
     def __post_init__(self) -> None:
-        if self.parity not in PARITY:
-            raise ValueError(f"parity={self.parity!r} must be one of {list(PARITY)}")
-        if self.sampling not in ("", "distilled", "edm"):
-            raise ValueError(f"sampling={self.sampling!r} must be distilled or edm")
-        if self.sampling != "edm" and self.steps > len(DISTILLED):
+        if self.kind not in ("", "distilled", "edm"):
+            raise ValueError(f"simulator.sampling.kind={self.kind!r} must be distilled or edm")
+        if self.kind != "edm" and self.steps > len(DISTILLED):
             raise ValueError(
-                f"steps={self.steps}, but the distilled sampler has {len(DISTILLED)} levels; use sampling=edm for more"
+                f"simulator.sampling.steps={self.steps}, but the distilled sampler has {len(DISTILLED)} levels;"
+                " use simulator.sampling.kind=edm for more"
             )
 
-    def sampler(self, edm: EDM | None = None, distilled: bool = True) -> Sampler:
+    def sampler(self, edm: EDM, distilled: bool) -> Sampler:
         """The sampler; `edm` and `distilled` are what the checkpoint says."""
-        if self.sampling == "edm" or (not self.sampling and not distilled):
-            edm = edm or EDM()
+        if self.kind == "edm" or (not self.kind and not distilled):
             return EDM(self.steps or edm.steps, edm.sigma_max, edm.sigma_min, edm.rho)
         return Distilled(DISTILLED[: self.steps or len(DISTILLED)])
+
+
+@dataclass(frozen=True)
+class Training:
+    """How it is trained on.
+
+    Args:
+        shift: of the noise levels drawn; above 1 favours noise.
+        foreground: extra loss weight of what differs from the picture's median colour.
+        augment: chance that a clip's memory is augmented.
+        checkpointing: compute blocks anew in the backward pass, for memory.
+    """
+
+    shift: float
+    foreground: float
+    augment: float
+    checkpointing: bool
 
 
 class GESimulator(LatentWorld):
     """GE-Sim behind the Simulator contract.
 
-    Args:
-        shape: views, size, chunk = 1 + 4 k, memory, fps, and the layout of commands.
-        net, codec, prompt: as loaded or made.
-        config: how it is run.
-        sampler: of chunks.
-        units: mean and spread of joint commands and of joint states, [2, 2, 16], if the checkpoint has them.
-    """
+    It is conditioned on pose maps and ray maps, as released; commands reach it through the pose map alone.
 
-    units: Tensor
+    Args:
+        spec: views, size, chunk = 1 + 4 k, of any robot with calibrated cameras and known flange poses.
+        memory_frames: sparse memory frames, M; the released weights know 4.
+        checkpoint: folder of GE-Sim 2.0 or file of GE-Sim 1; None begins from nothing.
+        parity: a name in PARITY.
+        sampling: options of Sampling.
+        training: options of Training.
+        scratch: sizes of what begins from nothing, {"net": DiTShape's, "vae": diffusers' AutoencoderKLWan's}.
+
+    Raises:
+        CheckpointError: if the checkpoint does not fit.
+        ValueError: if an option cannot be.
+    """
 
     def __init__(
         self,
-        shape: WorldShape,
-        net: MultiViewDiT,
-        codec: Codec,
-        prompt: Tensor,
-        config: GESimConfig,
-        sampler: Sampler | None = None,
-        units: Tensor | None = None,
+        spec: WorldSpec,
+        memory_frames: int,
+        checkpoint: str | None,
+        parity: str,
+        sampling: dict[str, Any],
+        training: dict[str, Any],
+        scratch: dict[str, dict[str, Any]],
     ):
-        super().__init__(
-            shape,
-            net,
-            codec,
-            prompt,
-            sampler or config.sampler(),
-            1.0,
-            config.shift,
-            config.foreground,
-            config.augment,
-        )
-        self.config = config
-        net.checkpointing = config.checkpointing
-        self.register_buffer("units", torch.full((2, 2, 16), torch.nan) if units is None else units)
-
-    @classmethod
-    def build(cls, shape: WorldShape, config: GESimConfig, checkpoint: str | None) -> GESimulator:
-        """From a released checkpoint, or from nothing at the sizes of `config.net` and `config.vae`.
-
-        Raises:
-            CheckpointError: if the checkpoint does not fit.
-            ValueError: if sizes are not options of the network.
-        """
+        if not (spec.pose_map and spec.ray_map):
+            raise ValueError(
+                f"simulator=gesim is conditioned on pose and ray maps, and {spec.embodiment.robot} comes without;"
+                " it needs calibrated cameras, simulator.kinematics for joint commands, and"
+                " simulator.pose_map=true simulator.ray_map=true"
+            )
+        if parity not in PARITY:
+            raise ValueError(f"simulator.parity={parity!r} must be one of {list(PARITY)}")
+        options, chosen = Training(**training), Sampling(**sampling)
         if checkpoint:
             released = load_released(Path(checkpoint))
-            if released.net.shape.views != shape.views:
-                raise CheckpointError(
-                    f"simulator.checkpoint={checkpoint} was made for {released.net.shape.views} views, task.views names {shape.views}"
-                )
-            released.net.add_expert()
-            units = (
-                None
-                if released.stats is None
-                else torch.stack([released.stats["action"], released.stats["state"]])
-            )
-            return cls(
-                shape,
-                released.net,
-                released.codec,
-                released.prompt,
-                config,
-                config.sampler(released.edm, released.distilled),
-                units,
-            )
-        sizes: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value for key, value in config.net.items()
-        }
-        try:
-            net = MultiViewDiT(DiTShape(**{"views": shape.views, **sizes}))
-            codec = WanCodec(AutoencoderKLWan(**config.vae))
-        except TypeError as error:
-            raise ValueError(f"net or vae: {error}") from error
-        return cls(shape, net, codec, torch.zeros(1, 1, net.shape.text_embed_dim), config)
-
-    def state_expert(self) -> StateExpert:
-        """A copy of the network's state expert, to decode with or to train."""
-        half = MultiViewDiT(self.net.shape, trunk=False)
-        mine = self.net.state_dict()
-        half.load_state_dict({name: mine[name] for name in half.state_dict()})
-        every = self.shape.chunk if self.config.parity == "released" else 1
-        expert = StateExpert(
-            half,
-            self.shape.views,
-            self.shape.chunk,
-            self.shape.memory,
-            self.shape.layout,
-            self.sampler,
-            1.0,
-            every,
+            net, codec, prompt = released.net, released.codec, released.prompt
+            sampler = chosen.sampler(released.edm, released.distilled)
+            _check(checkpoint, net.shape, spec)
+        else:
+            net, codec = _from_nothing(spec, **scratch)
+            prompt, sampler = torch.zeros(1, 1, net.shape.text_embed_dim), chosen.sampler(EDM(), True)
+        diffusion = Diffusion(
+            sampler, Velocity(), 1.0, options.shift, options.foreground, options.augment
         )
-        if torch.isfinite(self.units).all():
-            expert.action_mean.copy_(self.units[0, 0]), expert.action_std.copy_(self.units[0, 1])
-            expert.state_mean.copy_(self.units[1, 0]), expert.state_std.copy_(self.units[1, 1])
-            expert.normalised = True
-        return expert
+        super().__init__(spec, memory_frames, net, codec, diffusion, prompt)
+        self.parity, net.checkpointing = PARITY[parity], options.checkpointing
 
-    def conditioning(self, inputs: TensorDict, places: tuple[int, int]) -> Tensor:
+    def conditioning(self, inputs: TensorDict, latent_hw: tuple[int, int]) -> Tensor:
         """See LatentWorld: full-size pose and ray maps, memory resized frame by frame, the future in time
         too, without antialiasing.
         """
         # [B, T, V, 3, H, W]
         maps = torch.cat([inputs["memory", "pose_map"], inputs["future", "pose_map"]], 1).float() / 127.5 - 1
         c2w = torch.cat([inputs["memory", "c2w"], inputs["future", "c2w"]], 1).transpose(1, 2)
-        rays = render_ray_map(inputs["intrinsic"], c2w, self.shape.size)  # [B, V, T, 6, H, W]
+        rays = render_ray_map(inputs["intrinsic"], c2w, self.spec.size)  # [B, V, T, 6, H, W]
         raw = torch.cat([maps.permute(0, 2, 3, 1, 4, 5), rays.transpose(2, 3)], 2)  # [B, V, 9, T, H, W]
-        flat, count = raw.flatten(0, 1), self.shape.memory
+        flat, count = raw.flatten(0, 1), self.memory_frames
         past = (
-            F.interpolate(flat[:, :, :count].transpose(1, 2).flatten(0, 1), places, mode="bilinear")
+            F.interpolate(flat[:, :, :count].transpose(1, 2).flatten(0, 1), latent_hw, mode="bilinear")
             .unflatten(0, (len(flat), count))
             .transpose(1, 2)
         )
-        ahead = F.interpolate(flat[:, :, count:], (self.ahead, *places), mode="trilinear")
+        ahead = F.interpolate(flat[:, :, count:], (self.ahead, *latent_hw), mode="trilinear")
         mask = torch.zeros_like(torch.cat([past, ahead], 2)[:, :1])
         mask[:, :, :count] = 1.0
         return torch.cat([torch.cat([past, ahead], 2), mask], 1).unflatten(0, raw.shape[:2])
 
-    def recall(self, state: TensorDict, pose_map: Tensor, c2w: Tensor) -> TensorDict:
-        """See Simulator; with the released quirks if parity asks for them."""
-        if self.config.parity == "right":
-            return super().recall(state, pose_map, c2w)
-        length, count = state["length"], self.shape.memory
+    def recall(self, state: TensorDict, future: TensorDict) -> TensorDict:
+        """See Simulator.recall; with the released quirks if parity asks for them."""
+        if not self.parity.forgets_first:
+            return super().recall(state, future)
+        length, count = state["length"], self.memory_frames
         # Frame 0 is the first one, which the released history does not hold; its indices are cut, not
         # rounded.
         at = torch.stack(
@@ -217,8 +185,37 @@ class GESimulator(LatentWorld):
             ]
         )
         rows = torch.arange(len(state), device=length.device)[:, None]
-        memory = state["history"].select("frames", "pose_map", "c2w")[rows, at.to(length.device)]
-        if self.config.parity == "released":
-            memory["pose_map"] = pose_map[:, :1].expand(-1, count, *pose_map.shape[2:])
-            memory["c2w"] = c2w[:, :1].expand(-1, count, *c2w.shape[2:])
+        names = ("frames", "commands", "pose_map", "c2w")
+        memory = state["history"].select(*names)[rows, at.to(length.device)]
+        if self.parity.shows_current:
+            for name in ("pose_map", "c2w"):
+                memory[name] = future[name][:, :1].expand_as(memory[name])
         return memory
+
+
+def _check(checkpoint: str, shape: DiTShape, spec: WorldSpec) -> None:
+    """Refuse weights that were made for something else."""
+    if shape.views != spec.views:
+        raise CheckpointError(
+            f"simulator.checkpoint={checkpoint} was made for {shape.views} views, {spec.embodiment.robot} has"
+            f" {spec.views}: {list(spec.embodiment.views)}"
+        )
+    if shape.in_channels != shape.out_channels + _CONDITIONING:
+        raise CheckpointError(
+            f"simulator.checkpoint={checkpoint} takes {shape.in_channels} channels, GE-Sim's conditioning makes"
+            f" {shape.out_channels + _CONDITIONING}"
+        )
+
+
+def _from_nothing(
+    spec: WorldSpec, net: dict[str, Any], vae: dict[str, Any]
+) -> tuple[MultiViewDiT, WanCodec]:
+    """Untrained networks of the given sizes."""
+    sizes: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in net.items()
+    }
+    try:
+        trunk = MultiViewDiT(DiTShape(**{"views": spec.views, **sizes}))
+        return trunk, WanCodec(AutoencoderKLWan(**vae))
+    except TypeError as error:
+        raise ValueError(f"simulator.scratch.net or simulator.scratch.vae: {error}") from error

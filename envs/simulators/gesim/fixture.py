@@ -8,15 +8,17 @@ fused_feature, pose}; the metadata hold the configuration, the number of views a
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
+from torch import Tensor, nn
 
 from envs.simulators.dit.network import DiTShape, MultiViewDiT
+from envs.simulators.dit.state_network import StateDiT
 
 # What the public configuration may say besides sizes, and the only values that this network knows.
 _FIXED = {"extra_pos_embed_type": None, "use_view_embed": True}
@@ -83,19 +85,28 @@ def verify(path: Path) -> dict[str, float]:
         for key, value in tensors.items()
         if key.startswith("weights.")
     }
-    net = MultiViewDiT(shape_of(json.loads(meta["config"]), len(weights["view_embed"]))).eval()
-    try:
-        net.load_state_dict(weights)
-    except RuntimeError as error:
-        raise FixtureError(f"{path} holds weights of another network: {error}") from error
-    views = int(meta["n_view"])
-    video, fused = net(
-        tensors["in.hidden_states"], tensors["in.timestep"], tensors["in.text"], views, float(meta["fps"])
+    shape, views = shape_of(json.loads(meta["config"]), len(weights["view_embed"])), int(meta["n_view"])
+    trunk, expert = MultiViewDiT(shape).eval(), StateDiT(shape).eval()
+    _load((trunk, expert), weights, path)
+    video, fused = trunk(
+        tensors["in.hidden_states"], tensors["in.timestep"], tensors["in.text"], float(meta["fps"])
     )
-    pose = net.decode_states(
-        tensors["in.pose_states"], tensors["in.pose_timestep"], fused, views, tensors.get("in.pose_mask")
-    )
+    keys = expert.feature_keys(fused.unflatten(0, (-1, views)))
+    pose = expert(tensors["in.pose_states"], tensors["in.pose_timestep"], keys, tensors.get("in.pose_mask"))
     return {
         name: float((ours - tensors[f"out.{name}"]).abs().max())
         for name, ours in (("video", video), ("fused_feature", fused), ("pose", pose))
     }
+
+
+def _load(parts: Sequence[nn.Module], weights: dict[str, Tensor], path: Path) -> None:
+    """Load networks that share one file, strictly."""
+    unknown = weights.keys() - {name for part in parts for name in part.state_dict()}
+    try:
+        if unknown:
+            raise RuntimeError(f"unexpected {sorted(unknown)}")
+        for part in parts:
+            names = part.state_dict().keys()
+            part.load_state_dict({name: value for name, value in weights.items() if name in names})
+    except RuntimeError as error:
+        raise FixtureError(f"{path} holds weights of another network: {error}") from error

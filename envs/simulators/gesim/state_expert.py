@@ -1,0 +1,53 @@
+"""GE-Sim 2.0's own state expert: its released weights, sampled as its video is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from envs.simulators.dit.prediction import Velocity
+from envs.simulators.dit.state_network import StateDiT
+from envs.simulators.gesim.checkpoint import JOINTS, CheckpointError, load_state_network
+from envs.simulators.gesim.engine import GESimulator
+from envs.simulators.state_experts.flow import FlowStateDecoder
+
+
+class GESimStateExpert(FlowStateDecoder):
+    """The released state expert, or an untrained one of its form where there are no weights (GE-Sim 1, or none).
+
+    Args:
+        simulator: whose features it reads.
+        checkpoint: as of the simulator.
+
+    Raises:
+        CheckpointError: if the weights are of another robot.
+    """
+
+    def __init__(self, simulator: GESimulator, checkpoint: str | None):
+        robot = simulator.spec.embodiment
+        found = load_state_network(Path(checkpoint)) if checkpoint else None
+        width = max(robot.action_dim, robot.state_dim)
+        if found is not None and (found[0].shape.pose_in_channels, robot.action_dim, robot.state_dim) != (
+            (JOINTS,) * 3
+        ):
+            raise CheckpointError(
+                f"the state expert of simulator.checkpoint={checkpoint} knows {JOINTS} joints, but"
+                f" {robot.robot} has actions of {robot.action_dim} and states of {robot.state_dim}; train one with"
+                " simulator.state_expert._target_=envs.simulators.state_experts.flow.StateExpert"
+            )
+        untrained = replace(simulator.net.shape, pose_in_channels=width, pose_out_channels=robot.state_dim)
+        every = simulator.spec.chunk if simulator.parity.thins_history else 1
+        super().__init__(
+            simulator,
+            StateDiT(untrained) if found is None else found[0],
+            simulator.diffusion.sampler,
+            simulator.diffusion.time_scale,
+            Velocity(),
+            every=every,
+        )
+        if found is not None:
+            stats = found[1]
+            for name in ("action", "state"):
+                getattr(self.tokens, f"{name}_mean").copy_(stats[name][0])
+                getattr(self.tokens, f"{name}_std").copy_(stats[name][1])
+            self.normalised = True
