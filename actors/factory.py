@@ -28,7 +28,7 @@ from envs.judges.base import Judge
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import TaskPool, available_cores
 from envs.physics.suite import SuiteError, build_suite
-from envs.simulators.base import Simulator
+from envs.simulators.base import WORLD_OPTIONS, Simulator
 from envs.simulators.state_experts.base import StateDecoder
 from envs.specs import ActionMode, Rewards, WorldSpec
 from envs.targets import ConfigError, build, options, to_plain
@@ -60,16 +60,6 @@ __all__ = [
 
 T = TypeVar("T")
 
-# Keys of the simulator's section that are not its class's own options.
-_AROUND_SIMULATOR = (
-    "pose_map",
-    "ray_map",
-    "pose_map_style",
-    "kinematics",
-    "shared_noise",
-    "bf16",
-    "state_expert",
-)
 _robots: dict[str, Embodiment] = {}
 
 
@@ -201,7 +191,7 @@ def open_clips(cfg: Mapping[str, Any], folders: Iterable[Path | str]) -> ClipSto
 
 def build_simulator(cfg: Mapping[str, Any], weights: Path | None = None) -> Simulator:
     """The learned world of the simulator section, with weights if given."""
-    section = {name: value for name, value in cfg["simulator"].items() if name not in _AROUND_SIMULATOR}
+    section = {name: value for name, value in cfg["simulator"].items() if name not in WORLD_OPTIONS}
     model: Simulator = build(section, "simulator", spec=world_spec(cfg))
     return load(model, weights).to(device_of(cfg))
 
