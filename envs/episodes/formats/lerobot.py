@@ -36,6 +36,8 @@ class LeRobotDataset:
         size: (height, width) to which all pictures are brought, intrinsics with them; None keeps the
             recorded size.
         privileged: whether to read what only physics knows, too.
+        embodiment: the robot, where the reader knows more of it than the data set says; it must have the same
+            cameras and as many numbers.
 
     Attributes:
         info: the contents of meta/info.json.
@@ -46,12 +48,20 @@ class LeRobotDataset:
         EpisodeError: if the folder is not such a data set; the message says what is missing.
     """
 
-    def __init__(self, root: Path, size: tuple[int, int] | None = None, privileged: bool = False):
+    def __init__(
+        self,
+        root: Path,
+        size: tuple[int, int] | None = None,
+        privileged: bool = False,
+        embodiment: Embodiment | None = None,
+    ):
         self.root, self.privileged = Path(root), privileged
         self.info = read_info(self.root)
         self.features: dict[str, dict[str, Any]] = self.info["features"]
         try:
             recorded = _known_cameras(Embodiment.from_info(self.info), self.features)
+            if embodiment is not None:
+                recorded = _agreed(recorded, embodiment, self.features["action"])
         except (EmbodimentError, KeyError, ValueError, TypeError) as error:
             raise EpisodeError(f"{self.root / 'meta/info.json'}: {error}") from error
         sizes = {camera.name: camera.size for camera in recorded.cameras}
@@ -85,20 +95,14 @@ class LeRobotDataset:
             EpisodeError: naming the file that is missing or damaged.
         """
         row = self.rows[number]
-        path = self.root / self._format("data_path", row, "data")
-        table = self._numbers(path)
-        mine = np.asarray(table["episode_index"]) == row["episode_index"]
-        table, length = table.filter(pa.array(mine)), int(row["length"])
-        if len(table) != length:
-            raise EpisodeError(
-                f"{path}: holds {len(table)} rows of episode {row['episode_index']}, meta/episodes says"
-                f" {length}; the file is damaged"
-            )
+        table, path = self._table(row)
         cameras = camera_features(self.features)
         try:
             known = self._known(table)
             present = known["present"]
-            frames = np.stack([self._pictures(key, row, path, length) for key in cameras.values()], axis=1)
+            frames = np.stack(
+                [self._pictures(key, row, path, len(table)) for key in cameras.values()], axis=1
+            )
             if present is not None:
                 frames[~present] = 0
             return Episode(
@@ -114,7 +118,36 @@ class LeRobotDataset:
         except (EpisodeError, ValueError, pa.ArrowInvalid) as error:
             raise EpisodeError(f"{path}: episode {row['episode_index']}: {error}") from error
 
+    def column(self, name: str) -> NDArray[Any]:
+        """A column of numbers of all episodes, [N, ...] in their order.
+
+        Raises:
+            EpisodeError: if there is none of that name.
+        """
+        parts = []
+        for row in self.rows:
+            table = self._table(row)[0]
+            if name not in table.column_names:
+                raise EpisodeError(
+                    f"{self.root}: there is no column {name}; columns are {table.column_names}"
+                )
+            parts.append(column_array(table, name).reshape(len(table), *self._shape(name)))
+        return np.concatenate(parts)
+
     # -- numbers
+    def _table(self, row: dict[str, Any]) -> tuple[pa.Table, Path]:
+        """The rows of an episode, without pictures, and the file they are from."""
+        path = self.root / self._format("data_path", row, "data")
+        table = self._numbers(path)
+        mine = np.asarray(table["episode_index"]) == row["episode_index"]
+        table = table.filter(pa.array(mine))
+        if len(table) != int(row["length"]):
+            raise EpisodeError(
+                f"{path}: holds {len(table)} rows of episode {row['episode_index']}, meta/episodes says"
+                f" {row['length']}; the file is damaged"
+            )
+        return table, path
+
     def _format(self, template: str, row: dict[str, Any], prefix: str, **keys: str) -> str:
         path = self.info.get(template) or getattr(names, template.upper())
         return str(
@@ -256,6 +289,29 @@ def _known_cameras(robot: Embodiment, features: dict[str, Any]) -> Embodiment:
         f"{names.C2W} holds poses of {count} cameras, but {len(calibrated(robot))} of {list(robot.views)} are"
         " calibrated; correct features.action.info.worldloop, or remove the column"
     )
+
+
+def _agreed(recorded: Embodiment, given: Embodiment, action: dict[str, Any]) -> Embodiment:
+    """The given robot with the recorded cameras' sizes, if it fits what was recorded.
+
+    A data set with our description must agree in all that numbers mean; of another one, names that it lacks
+    and what its actions are is taken from the given robot.
+    """
+    known = recorded
+    if INFO_KEY not in (action.get("info") or {}):
+        known = replace(recorded, action_kind=given.action_kind, delta=given.delta, arms=given.arms)
+        for field in ("action_names", "state_names"):
+            unnamed = tuple(str(k) for k in range(len(getattr(recorded, field))))
+            if getattr(recorded, field) == unnamed and len(getattr(given, field)) == len(unnamed):
+                known = replace(known, **{field: getattr(given, field)})
+    other = given.differs(known)
+    if other:
+        raise EmbodimentError(f"the data are of another robot: {other}")
+    cameras = tuple(
+        replace(mine, size=theirs.size, calibrated=mine.calibrated and theirs.calibrated)
+        for mine, theirs in zip(given.cameras, recorded.cameras, strict=True)
+    )
+    return replace(given, cameras=cameras)
 
 
 def _first_command(robot: Embodiment, action: NDArray[Any], states: NDArray[Any]) -> NDArray[Any]:

@@ -1,0 +1,21 @@
+"""What only physics knows of recorded episodes, such as true object poses; for pipeline/evaluation alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from envs.episodes.clips import ClipStore
+from envs.episodes.formats.lerobot import LeRobotDataset
+from envs.episodes.formats.lerobot_columns import PRIVILEGED
+
+
+def read_privileged(store: ClipStore, name: str) -> Tensor:
+    """The column privileged.<name> [N, ...] of all rows of a store, read from the data anew.
+
+    Raises:
+        EpisodeError: if a data set has no such column; the message names those it has.
+    """
+    sets = [LeRobotDataset(part.folder, store.spec.size, privileged=True) for part in store.parts]
+    return torch.from_numpy(np.concatenate([data.column(PRIVILEGED + name) for data in sets]))
