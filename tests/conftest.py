@@ -1,22 +1,18 @@
-"""Shared fixtures: material outside the repository, and small data made once per session."""
+"""Shared fixtures: material outside the repository, and small data of any robot made once per session."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import torch
 
+from envs.embodiment import Embodiment
 from envs.episodes import Episode, LeRobotWriter
 from envs.episodes.clips import ClipStore
-from envs.physics.pool import BenchPool
-from envs.physics.tabletop.bench import BenchConfig
-from envs.simulators.base import WorldShape
-from envs.simulators.unet.engine import UNetConfig, UNetSimulator
-
-BENCH = BenchConfig()
-HORIZON = 16
+from tests.embodiments import BIMANUAL_POSES, world_spec
+from tests.moving_square import SIZE, episodes_of
 
 
 @pytest.fixture(scope="session")
@@ -29,40 +25,45 @@ def shared() -> Path:
 
 
 @pytest.fixture(scope="session")
+def tiny_data(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Embodiment], Path]:
+    """Makes, once for every robot, a LeRobot data set of moving_square.py in two shards."""
+    made: dict[Embodiment, Path] = {}
+
+    def data(robot: Embodiment) -> Path:
+        if robot not in made:
+            root = tmp_path_factory.mktemp("data") / robot.robot
+            writer, some = LeRobotWriter(root, robot.at(SIZE)), episodes_of(robot)
+            writer.write(some[:10])
+            writer.write(some[10:])
+            made[robot] = root
+        return made[robot]
+
+    return data
+
+
+@pytest.fixture(scope="session")
+def tiny_store(tiny_data: Callable[[Embodiment], Path]) -> Callable[[Embodiment], ClipStore]:
+    """Opens the data of `tiny_data` at the size they have, with every conditioning that the robot allows."""
+
+    def store(robot: Embodiment) -> ClipStore:
+        return ClipStore([tiny_data(robot)], world_spec(robot.at(SIZE), SIZE))
+
+    return store
+
+
+@pytest.fixture(scope="session")
 def episodes() -> list[Episode]:
-    """Eight short true episodes of every behaviour."""
-    pool = BenchPool(BENCH, 1, HORIZON, workers=1)
-    noise_levels = [0.0, 0.3, 0.6, 1.0] * 2
-    names = ["expert", "noisy", "noisy", "random"] * 2
-    tracks = pool.script([(seed, noise_level) for seed, noise_level in enumerate(noise_levels)])
-    pool.close()
-    return [
-        Episode.from_track(track, name, BENCH.views, 10.0) for track, name in zip(tracks, names, strict=True)
-    ]
+    """Twenty short episodes of two arms that command poses; every other one a success."""
+    return episodes_of(BIMANUAL_POSES)
 
 
 @pytest.fixture(scope="session")
-def dataset(episodes: list[Episode], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dataset(tiny_data: Callable[[Embodiment], Path]) -> Path:
     """Those episodes as a LeRobot data set of two shards."""
-    root = tmp_path_factory.mktemp("data") / "dataset"
-    writer = LeRobotWriter(root, BENCH.views, BENCH.size, 10.0)
-    writer.write(episodes[:4])
-    writer.write(episodes[4:])
-    return root
+    return tiny_data(BIMANUAL_POSES)
 
 
 @pytest.fixture(scope="session")
-def store(dataset: Path) -> ClipStore:
+def store(tiny_store: Callable[[Embodiment], ClipStore]) -> ClipStore:
     """The data set behind its cache."""
-    return ClipStore([dataset])
-
-
-@pytest.fixture
-def simulator() -> UNetSimulator:
-    """A tiny untrained simulator whose output is not trivial."""
-    torch.manual_seed(0)
-    model = UNetSimulator(WorldShape(chunk=4), UNetConfig(width=16, blocks=(1, 1)))
-    with torch.no_grad():
-        for head in model.heads:
-            head[-1].weight.normal_(std=0.05)
-    return model.eval()
+    return tiny_store(BIMANUAL_POSES)

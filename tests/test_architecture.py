@@ -3,13 +3,27 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 ORDER = ["envs", "actors", "learners", "pipeline"]
-FILES = [path for room in ORDER for path in sorted((ROOT / capacity).rglob("*.py"))]
+FILES = [path for room in ORDER for path in sorted((ROOT / room).rglob("*.py"))]
+# Where robots learn, act and are judged: nothing here may open what only physics knows.
+UNPRIVILEGED = ("envs/simulators", "envs/judges", "envs/transforms", "envs/world.py", "actors", "learners")
+# What physics workers import; torch takes seconds and hundreds of megabytes in each of them.
+TORCH_FREE = ("envs/physics", "envs/embodiment.py", "envs/targets.py", "envs/files.py")
+WITH_TORCH = ("envs/physics/env.py", "envs/physics/toy_tracking.py")
+
+
+def named(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def within(path: Path, places: tuple[str, ...]) -> bool:
+    return any(named(path) == place or named(path).startswith(place + "/") for place in places)
 
 
 def imported(path: Path) -> set[str]:
@@ -22,16 +36,62 @@ def imported(path: Path) -> set[str]:
     return names
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def words(tree: ast.AST) -> Iterator[str]:
+    """Every name and every string of code, but no docstring."""
+    said = {
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        and node.body
+        and isinstance(node.body[0], ast.Expr)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in said:
+            yield node.value
+        for field in ("id", "attr", "arg", "name", "module"):
+            value = getattr(node, field, None)
+            if isinstance(value, str):
+                yield value
+
+
+@pytest.mark.parametrize("path", FILES, ids=named)
 def test_imports_only_go_down(path: Path) -> None:
-    capacity = path.relative_to(ROOT).parts[0]
-    above = set(ORDER[ORDER.index(capacity) + 1 :])
+    room = path.relative_to(ROOT).parts[0]
+    above = set(ORDER[ORDER.index(room) + 1 :])
     assert not imported(path) & above
 
 
+@pytest.mark.parametrize("path", [path for path in FILES if within(path, UNPRIVILEGED)], ids=named)
+def test_nothing_that_learns_names_privileged_columns(path: Path) -> None:
+    assert not [word for word in words(ast.parse(path.read_text())) if "privileged" in word.lower()]
+
+
+def test_only_evaluation_reads_privileged_columns() -> None:
+    readers = {
+        named(path)
+        for path in FILES
+        if any("read_privileged" in word for word in words(ast.parse(path.read_text())))
+    }
+    assert all(
+        reader == "envs/episodes/privileged.py" or reader.startswith("pipeline/evaluation/")
+        for reader in readers
+    ), readers
+
+
+def test_the_search_for_privileged_names_finds_them() -> None:
+    for code in (
+        "from envs.episodes.privileged import f",
+        "store.privileged('x')",
+        "data['privileged.pose']",
+        "f(privileged=1)",
+    ):
+        assert any("privileged" in word for word in words(ast.parse(code))), code
+    assert not any("privileged" in word for word in words(ast.parse('"""privileged"""')))
+
+
 def test_physics_workers_start_without_torch() -> None:
-    for path in sorted((ROOT / "envs/physics").glob("*.py")):
-        if path.name != "env.py":
+    for path in FILES:
+        if within(path, TORCH_FREE) and not within(path, WITH_TORCH):
             assert "torch" not in imported(path), path
 
 
@@ -43,3 +103,9 @@ def test_files_are_short_and_say_what_they_are() -> None:
             f"{path} has no docstring"
         )
         assert path.stem not in {"utils", "helpers"}
+
+
+def test_folders_hold_about_a_dozen_files() -> None:
+    for folder in {path.parent for path in FILES}:
+        files = [path for path in folder.glob("*.py") if path.name != "__init__.py"]
+        assert len(files) <= 14, f"{named(folder)} holds {len(files)} files"
