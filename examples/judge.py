@@ -1,0 +1,61 @@
+"""Your own judge: the task is done when a camera's picture looks like a goal picture.
+
+judge:
+  _target_: examples.judge.GoalPicture
+  hold: 2
+  picture: goal.png
+  sharpness: 30.0
+  rewards: {progress: 1.0, success: 1.0}
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from envs.judges.base import Judge, Verdict, verdict_status
+from envs.specs import WorldSpec
+
+
+class GoalPicture(Judge):
+    """Likeness of the main camera's picture to a goal, relative to the episode's first frame.
+
+    Args:
+        spec: what frames show.
+        hold: frames in a row that make an episode a success.
+        picture: path of the goal as a picture file, of any size.
+        sharpness: how steeply likeness becomes success.
+
+    Raises:
+        ValueError: if the picture cannot be read.
+    """
+
+    goal: Tensor
+
+    def __init__(self, spec: WorldSpec, hold: int, picture: str, sharpness: float):
+        super().__init__(hold)
+        found = cv2.imread(picture)
+        if found is None:
+            raise ValueError(f"picture={picture} is no picture that OpenCV reads")
+        height, width = spec.size
+        small = cv2.resize(
+            cv2.cvtColor(found, cv2.COLOR_BGR2RGB), (width, height), interpolation=cv2.INTER_AREA
+        )
+        self.view, self.sharpness = spec.embodiment.main_view, sharpness
+        self.register_buffer(
+            "goal", torch.from_numpy(np.ascontiguousarray(small.transpose(2, 0, 1))).float() / 255
+        )
+
+    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Verdict:
+        """See Judge.score."""
+        now = self._away(frames[:, :, self.view])
+        begin = self._away(first[:, self.view])[:, None].clamp(min=1e-3)
+        progress = (1 - now / begin).clamp(0, 1)
+        success = (self.sharpness * (progress - 0.9)).sigmoid()
+        return Verdict(success, progress, verdict_status(success))
+
+    def _away(self, pictures: Tensor) -> Tensor:
+        """Mean absolute difference [...] of pictures uint8 [..., 3, H, W] from the goal, 0..1."""
+        return (pictures.float() / 255 - self.goal).abs().mean((-3, -2, -1))
