@@ -6,10 +6,11 @@ The manifest is written last, so a folder without one is unfinished work.
 from __future__ import annotations
 
 import json
-import os
 import platform
 import subprocess
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -18,43 +19,21 @@ from omegaconf import OmegaConf
 from safetensors.torch import save_file
 from torch import nn
 
+from envs.files import atomic, write_text
 from learners.training.parallel import leads
+from pipeline.code_version import digest
 
 _PACKAGES = ("worldloop", "torch", "torchrl", "tensordict", "numpy", "mujoco")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file through a neighbour and a rename."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        temporary.write_text(text)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OSError(
-            f"cannot write {path}: {error.strerror}; free disk space and start again, finished stages are kept"
-        ) from error
-    os.replace(temporary, path)
 
 
 def save_weights(module: nn.Module, folder: Path, name: str = "weights") -> Path:
     """Write a module's state as safetensors; of several workers that hold it, the leading one writes."""
     if not leads():
         return folder / f"{name}.safetensors"
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.safetensors"
-    temporary = folder / f".{name}.part"
-    try:
-        save_file(
-            {key: value.detach().cpu().contiguous().clone() for key, value in module.state_dict().items()},
-            temporary,
-        )
-    except Exception as error:
-        temporary.unlink(missing_ok=True)
-        raise OSError(
-            f"cannot write {path}: {error}; free disk space and start again, finished stages are kept"
-        ) from error
-    os.replace(temporary, path)
+    tensors = {key: value.detach().cpu().contiguous().clone() for key, value in module.state_dict().items()}
+    with atomic(path) as part:
+        save_file(tensors, part)
     return path
 
 
@@ -74,26 +53,74 @@ def versions() -> dict[str, str]:
     return out
 
 
+@dataclass(frozen=True)
+class Identity:
+    """All that an artefact's key is made of.
+
+    Args:
+        stage: the node's name.
+        config: hash of every config section that it reads, by dotted path.
+        settings: plain values that tell it from other nodes of the same stage.
+        parents: keys of the nodes that it builds on, by name.
+        roles: names of those nodes, by the role they play.
+        code: hash of every source file behind it, by path.
+    """
+
+    stage: str
+    config: Mapping[str, str]
+    settings: Mapping[str, Any]
+    parents: Mapping[str, str]
+    roles: Mapping[str, list[str]]
+    code: Mapping[str, str]
+
+    @cached_property
+    def key(self) -> str:
+        """Twelve hexadecimal digits; equal for equal identities."""
+        return digest(json.dumps(asdict(self), sort_keys=True))
+
+    def changed(self, older: Mapping[str, Any]) -> str:
+        """In words, what differs from an older artefact's identity of the same node."""
+        reasons = []
+        for kind, mine in (
+            ("config", self.config),
+            ("settings", self.settings),
+            ("stages", self.parents),
+            ("code", self.code),
+        ):
+            theirs = older.get({"stages": "parents"}.get(kind, kind), {})
+            names = [name for name in sorted({*mine, *theirs}) if mine.get(name) != theirs.get(name)]
+            if names:
+                more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+                reasons.append(f"{kind} {', '.join(names[:3])}{more}")
+        if not reasons and dict(self.roles) != older.get("roles"):
+            reasons.append("the roles of its inputs")
+        return f"changed since it last ran: {'; '.join(reasons)}" if reasons else ""
+
+
 def finish(
-    folder: Path,
-    stage: str,
-    key: str,
-    config: Mapping[str, Any],
-    parents: Mapping[str, str],
-    seconds: float,
-    result: Mapping[str, Any],
-) -> None:
-    """Write config.yaml and, last, manifest.json."""
-    write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
+    folder: Path, identity: Identity, config: Mapping[str, Any], seconds: float, result: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Write config.yaml and, last, manifest.json; returns the manifest.
+
+    Args:
+        config: the sections that the stage read, by dotted path.
+    """
+    nested = OmegaConf.create({})
+    for path, value in config.items():
+        OmegaConf.update(nested, path, value, force_add=True)
+    write_text(folder / "config.yaml", OmegaConf.to_yaml(nested))
     manifest = {
-        "stage": stage,
-        "key": key,
-        "parents": dict(parents),
+        "stage": identity.stage,
+        "key": identity.key,
+        "parents": dict(identity.parents),
         "seconds": round(seconds, 2),
         "versions": versions(),
         "result": dict(result),
+        "identity": asdict(identity),
     }
-    write_text(folder / "manifest.json", json.dumps(manifest, indent=1, default=float))
+    text = json.dumps(manifest, indent=1, default=float)
+    write_text(folder / "manifest.json", text)
+    return dict(json.loads(text))
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:

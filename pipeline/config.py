@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from actors.factory import ConfigError
+from envs.targets import ConfigError, nearest
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 
@@ -23,39 +24,92 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
         overrides: Hydra overrides, such as experiment=smoke rl.lr=1e-4.
 
     Raises:
-        ConfigError: for unknown keys or choices, naming the nearest fix.
+        ConfigError: for unknown keys or choices and values that cannot work, naming the nearest fix.
     """
     try:
-        with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-            cfg = compose("config", list(overrides))
-        plain = OmegaConf.to_container(cfg, resolve=True)
+        cfg = _compose(overrides)
     except (HydraException, OmegaConfBaseException) as error:
+        hint = _unknown_key(overrides)
         text = str(error).split("\nSee https")[0].split("\nfull_key")[0]
-        choices = ", ".join(
-            sorted(p.name for p in CONFIGS.iterdir() if p.is_dir() and not p.name.startswith("_"))
-        )
         raise ConfigError(
-            f"{text}\nGroups are {choices}; `worldloop config` prints every key with its value."
+            hint
+            or f"{text}\nGroups are {', '.join(groups())}; `worldloop config` prints every key with its value."
         ) from error
-    assert isinstance(plain, dict)
-    cfg_plain: dict[str, Any] = {str(key): value for key, value in plain.items()}
-    _check(cfg_plain)
-    return cfg_plain
+    check(cfg)
+    return cfg
 
 
-def _check(cfg: dict[str, Any]) -> None:
-    """Refuse what can be seen to fail before anything starts."""
-    task = cfg["task"]
+def groups() -> list[str]:
+    """Names of the folders of choices."""
+    return sorted(p.name for p in CONFIGS.iterdir() if p.is_dir() and not p.name.startswith("_"))
+
+
+def check(cfg: Mapping[str, Any]) -> None:
+    """Refuse what can be seen to fail before anything starts.
+
+    Raises:
+        ConfigError: naming the key and the fix.
+    """
+    task, rounds = cfg["task"], cfg["rounds"]
     if task["horizon"] % task["chunk"]:
         raise ConfigError(f"task.horizon={task['horizon']} must be a multiple of task.chunk={task['chunk']}")
     if task["mode"] not in ("relative", "absolute"):
         raise ConfigError(f"task.mode={task['mode']!r} must be relative or absolute")
     if any(side % 16 for side in task["size"]):
         raise ConfigError(f"task.size={task['size']} must be multiples of 16 in both directions")
+    if not task.get("suite") and not task.get("data"):
+        raise ConfigError(
+            "task has neither a suite (physics) nor data (recordings): task.data=[folder of a LeRobot data set],"
+            " or another task"
+        )
     if abs(sum(cfg["collect"]["mix"].values()) - 1) > 1e-6:
         raise ConfigError(f"collect.mix={cfg['collect']['mix']} must add up to 1")
-    if cfg["rounds"]["count"] < 1:
+    if rounds["count"] < 1:
         raise ConfigError("rounds.count must be at least 1")
     for key in ("deploy", "iterations"):
-        if not cfg["rounds"][key]:
+        if not rounds[key]:
             raise ConfigError(f"rounds.{key} must hold at least one number")
+    if sum(rounds["splits"].values()) >= 1:
+        raise ConfigError(
+            f"rounds.splits={rounds['splits']} must add up to less than 1; the rest is for learning"
+        )
+    if cfg["rl"]["envs"] % cfg["rl"]["shards"]:
+        raise ConfigError(
+            f"rl.envs={cfg['rl']['envs']} must be a multiple of rl.shards={cfg['rl']['shards']}"
+        )
+
+
+def _compose(overrides: Sequence[str]) -> dict[str, Any]:
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        plain = OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
+
+
+def _unknown_key(overrides: Sequence[str]) -> str:
+    """What to say of the first override whose key does not exist, "" if all do."""
+    choices = [word for word in overrides if word.split("=")[0] in groups()]
+    try:
+        base = _compose(choices)
+    except (HydraException, OmegaConfBaseException):
+        return ""
+    paths = list(_paths(base))
+    for word in overrides:
+        key = word.split("=")[0]
+        if word in choices or key.startswith(("+", "~")) or key in paths:
+            continue
+        parent = key.rpartition(".")[0]
+        siblings = [path for path in paths if path.rpartition(".")[0] == parent]
+        same = [path for path in paths if path.rpartition(".")[2] == key.rpartition(".")[2]]
+        near = difflib.get_close_matches(key, paths, 3, 0.75)
+        if near or same:
+            return f"{key} is not a key; did you mean {' or '.join((near + same)[:3])}?"
+        return f"{key} is not a key{nearest(key, siblings or [*base, *groups()])}"
+    return ""
+
+
+def _paths(section: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    for key, value in section.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from _paths(value, f"{prefix}{key}.")

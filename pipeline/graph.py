@@ -1,136 +1,194 @@
-"""The stage graph: a stage is keyed by its config and its parents, run once, reused for ever, resumed when
-cut short.
-"""
+"""The stage graph: a node is keyed by what it reads, its parents and its code; it runs once and is reused."""
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from pipeline.artefact import finish, read_manifest, write_text
+from envs.files import write_text
+from pipeline.artefact import Identity, finish, read_manifest
+from pipeline.code_version import code_of, digest
+from pipeline.stage import Inputs, Stage
+from pipeline.stage_workers import run_stage
+from pipeline.track import NullTracker, Tracker
+from pipeline.view import sections
+
+Names = Mapping[str, str | Sequence[str] | None]
 
 
-@dataclass
-class Stage:
-    """One node.
+@dataclass(frozen=True)
+class Node:
+    """A stage in a graph.
 
     Args:
-        name: unique in the graph; rounds add a number, as in vision-2.
-        parents: names of the stages whose folders it reads.
-        config: all it depends on besides its parents; equal configs and parents give equal keys.
-        run: (folder, folders of the parents) -> result for the manifest.
+        stage: what it does.
+        inputs: names of the nodes that it builds on, by role.
+        settings: what tells it from other nodes of the same stage.
+        identity: what its key is made of.
     """
 
-    name: str
-    parents: tuple[str, ...]
-    config: Mapping[str, Any]
-    run: Callable[[Path, dict[str, Path]], Mapping[str, Any]]
+    stage: Stage
+    inputs: Mapping[str, str | tuple[str, ...]]
+    settings: Mapping[str, Any]
+    identity: Identity
+
+    @property
+    def parents(self) -> tuple[str, ...]:
+        """Names of all nodes that it builds on, each once."""
+        return tuple(self.identity.parents)
 
 
 @dataclass
 class Graph:
-    """Stages in the order they were added, which must be one in which parents come first.
+    """Nodes in the order they were added, in which parents come first.
 
     Args:
-        root: folder that holds the stages' folders.
+        cfg: the resolved config, plain containers.
+        root: folder that holds the nodes' folders.
     """
 
+    cfg: Mapping[str, Any]
     root: Path
-    stages: dict[str, Stage] = field(default_factory=dict, init=False)
-    _keys: dict[str, str] = field(default_factory=dict, init=False, repr=False)
+    nodes: dict[str, Node] = field(default_factory=dict, init=False)
 
-    def add(self, stage: Stage) -> str:
-        """Add a stage and return its name."""
-        if stage.name in self.stages:
-            raise ValueError(f"stage {stage.name} exists already")
-        unknown = [parent for parent in stage.parents if parent not in self.stages]
-        if unknown:
-            raise ValueError(f"stage {stage.name} comes before its parents {unknown}")
-        # Worked out once: by way of all its parents again, the ways through a graph multiply with every
-        # round.
-        text = json.dumps(
-            [stage.name, stage.config, [self.key(parent) for parent in stage.parents]],
-            sort_keys=True,
-            default=str,
-        )
-        self.stages[stage.name], self._keys[stage.name] = (
-            stage,
-            hashlib.sha256(text.encode()).hexdigest()[:12],
-        )
-        return stage.name
-
-    def key(self, name: str) -> str:
-        """Hash of the stage's config, as it was when the stage was added, and of its ancestors' keys."""
-        return self._keys[name]
-
-    def folder(self, name: str) -> Path:
-        """Where the stage's artefact lies or will lie."""
-        return self.root / f"{name}-{self.key(name)}"
-
-    def run(self, until: str | None = None) -> dict[str, dict[str, Any]]:
-        """Run what is unfinished, in order; returns every stage's manifest.
+    def add(self, name: str, stage: Stage, inputs: Names | None = None, **settings: Any) -> str:
+        """Add a node and return its name.
 
         Args:
-            until: stop after this stage and run only what it needs.
+            name: unique in the graph; rounds add a number, as in simulator-2.
+            stage: what it does.
+            inputs: node names by role; roles of None or () are left out.
+            settings: plain values handed to the stage, part of the key.
 
         Raises:
-            KeyError: if `until` is not a stage.
+            ValueError: if the name is taken, or an input is not there yet.
         """
-        wanted = set(self.stages) if until is None else self._needs(until)
-        manifests = {}
-        for name, stage in self.stages.items():
-            if name not in wanted:
-                continue
-            folder = self.folder(name)
-            manifest = read_manifest(folder)
-            if manifest is None:
-                folder.mkdir(parents=True, exist_ok=True)
-                resumed = any(folder.iterdir())
-                tqdm.write(f"=== {name}{' (resumed)' if resumed else ''} -> {folder}")
-                spent = folder / "seconds.json"  # what earlier, interrupted attempts took
-                earlier = json.loads(spent.read_text()) if spent.exists() else 0.0
-                began = time.perf_counter()
-                try:
-                    result = stage.run(folder, {parent: self.folder(parent) for parent in stage.parents})
-                except BaseException:
-                    with contextlib.suppress(OSError):  # a full disk must not hide what went wrong
-                        write_text(spent, json.dumps(earlier + time.perf_counter() - began))
-                    raise
-                seconds = earlier + time.perf_counter() - began
-                spent.unlink(missing_ok=True)
-                finish(
-                    folder,
-                    name,
-                    self.key(name),
-                    stage.config,
-                    {p: self.key(p) for p in stage.parents},
-                    seconds,
-                    result,
-                )
-                manifest = read_manifest(folder)
-                assert manifest is not None
-                tqdm.write(f"    {name} took {seconds:.0f} s {_brief(manifest['result'])}")
-            else:
-                tqdm.write(f"=== {name} is finished, reused from {folder}")
-            manifests[name] = manifest
-        return manifests
+        if name in self.nodes:
+            raise ValueError(f"stage {name} exists already")
+        roles = {
+            role: names if isinstance(names, str) else tuple(names)
+            for role, names in (inputs or {}).items()
+            if names
+        }
+        parents = dict.fromkeys(n for names in roles.values() for n in _names(names))
+        unknown = [parent for parent in parents if parent not in self.nodes]
+        if unknown:
+            raise ValueError(f"stage {name} comes before its inputs {unknown}")
+        read = sections(self.cfg, stage.reads_of(settings))
+        identity = Identity(
+            stage=name,
+            config={path: digest(json.dumps(value, sort_keys=True)) for path, value in read.items()},
+            settings=settings,
+            parents={parent: self.key(parent) for parent in parents},
+            roles={role: list(_names(names)) for role, names in roles.items()},
+            code=code_of(stage.run.__module__, read),
+        )
+        self.nodes[name] = Node(stage, roles, settings, identity)
+        return name
 
-    def _needs(self, name: str) -> set[str]:
-        if name not in self.stages:
-            raise KeyError(f"no stage {name}; this graph has {list(self.stages)}")
-        out = {name}
-        for earlier in reversed(self.stages):  # parents come first, so that every child was met before
+    def key(self, name: str) -> str:
+        """Hash of the config sections that the node reads, its settings, its parents' keys and its code."""
+        return self.nodes[name].identity.key
+
+    def folder(self, name: str) -> Path:
+        """Where the node's artefact lies or will lie."""
+        return self.root / f"{name}-{self.key(name)}"
+
+    def inputs(self, name: str) -> Inputs:
+        """What a node's stage is handed."""
+        node = self.nodes[name]
+        found = {
+            role: self.folder(names) if isinstance(names, str) else tuple(self.folder(n) for n in names)
+            for role, names in node.inputs.items()
+        }
+        return Inputs(found, node.settings)
+
+    def result(self, name: str) -> dict[str, Any]:
+        """What a finished node returned.
+
+        Raises:
+            KeyError: if it is not finished.
+        """
+        manifest = read_manifest(self.folder(name))
+        if manifest is None:
+            raise KeyError(f"stage {name} is not finished")
+        return dict(manifest["result"])
+
+    def run(
+        self, until: str | Sequence[str] = (), tracker: Tracker | None = None
+    ) -> dict[str, dict[str, Any]]:
+        """Run what is unfinished, in order; returns every node's manifest.
+
+        Args:
+            until: run only these nodes and what they need; () runs all.
+            tracker: follows what nodes log while they run.
+
+        Raises:
+            KeyError: if `until` names no node.
+        """
+        wanted = self._needs(_names(until)) if until else set(self.nodes)
+        following = tracker or NullTracker()
+        return {name: self._finished(name, following) for name in self.nodes if name in wanted}
+
+    def _finished(self, name: str, tracker: Tracker) -> dict[str, Any]:
+        """The manifest of a node, after running it if need be."""
+        folder = self.folder(name)
+        manifest = read_manifest(folder)
+        if manifest is not None:
+            tqdm.write(f"=== {name} is finished, reused from {folder}")
+            tracker.catch_up(name, folder)
+            return manifest
+        folder.mkdir(parents=True, exist_ok=True)
+        resumed = any(folder.iterdir())
+        tqdm.write(f"=== {name}{' (resumed)' if resumed else ''} -> {folder}")
+        spent = folder / "seconds.json"  # of earlier, interrupted attempts
+        earlier = json.loads(spent.read_text()) if spent.exists() else 0.0
+        began, node = time.perf_counter(), self.nodes[name]
+        try:
+            with tracker.follow(name, folder):
+                result = run_stage(node.stage, name, self.cfg, folder, self.inputs(name))
+        except BaseException:
+            with contextlib.suppress(OSError):  # a full disk must not hide what went wrong
+                write_text(spent, json.dumps(earlier + time.perf_counter() - began))
+            raise
+        seconds = earlier + time.perf_counter() - began
+        spent.unlink(missing_ok=True)
+        read = sections(self.cfg, node.stage.reads_of(node.settings))
+        manifest = finish(folder, node.identity, read, seconds, result)
+        tqdm.write(f"    {name} took {seconds:.0f} s {_brief(manifest['result'])}")
+        return manifest
+
+    def why(self, name: str) -> str:
+        """Why an unfinished node will run although an older artefact of it exists; "" if there is none."""
+        older = [
+            manifest
+            for path in sorted(self.root.glob(f"{name}-*/manifest.json"), key=lambda p: p.stat().st_mtime)
+            if (manifest := read_manifest(path.parent)) is not None and manifest["stage"] == name
+        ]
+        if not older or (self.folder(name) / "manifest.json").exists():
+            return ""
+        return self.nodes[name].identity.changed(older[-1]["identity"])
+
+    def _needs(self, names: Sequence[str]) -> set[str]:
+        unknown = [name for name in names if name not in self.nodes]
+        if unknown:
+            raise KeyError(f"no stage {unknown[0]}; this graph has {list(self.nodes)}")
+        out = set(names)
+        for earlier in reversed(self.nodes):  # parents come first, so every child was met before
             if earlier in out:
-                out.update(self.stages[earlier].parents)
+                out.update(self.nodes[earlier].parents)
         return out
+
+
+def _names(names: str | Sequence[str]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else tuple(names)
 
 
 def _brief(result: Mapping[str, Any]) -> str:

@@ -1,186 +1,153 @@
 """The whole loop as a graph: collect, imitate, then rounds of deploy -> refresh the world -> RL in it, then
 the proof.
 
-Reading this file top to bottom is reading the method. What each stage does is in pipeline/work.
+Reading this file top to bottom is reading the method. What each stage does is in pipeline/stages.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from pipeline import stages as work
-from pipeline.graph import Graph, Stage
-from pipeline.stage_workers import learners_of, run_stage
+from pipeline.graph import Graph
+from pipeline.stage_workers import learners_of
+from pipeline.stages import collect, imitation, prove, rl, show, world
 
 Cfg = Mapping[str, Any]
+T = TypeVar("T")
 
 
-def build_loop(cfg: Cfg, root: Path) -> Graph:
-    """The graph of an experiment; `cfg` is the resolved config as plain containers."""
-    graph = Graph(root / "stages")
-    seed = cfg["seed"]
-    learners_of(cfg)  # what cannot be shared out is refused before anything starts
-    world = {"task": cfg["task"], "seed": seed}
-    learned = {**world, "simulator": cfg["simulator"], "microbatches": cfg["microbatches"]}
+@dataclass
+class World:
+    """Names of the stages that make the imagined world; "" before there is one."""
 
-    def add(name: str, parents: tuple[str, ...], config: dict[str, Any], run: Any, **known: Any) -> str:
-        def go(folder: Path, found: dict[str, Path]) -> Mapping[str, Any]:
-            return run_stage(run.__name__, cfg, folder, found, known)
+    simulator: str = ""
+    state: str = ""
+    judge: str = ""
 
-        return graph.add(Stage(name, parents, config, go))
+    def roles(self) -> dict[str, str]:
+        """Inputs of whatever runs in it."""
+        return dict(vars(self))
 
-    collect = add("collect", (), {**world, "collect": cfg["collect"]}, work.collect, part="train")
-    held_out = add("held-out", (), {**world, "collect": cfg["collect"]}, work.collect, part="held_out")
-    imitation = add(
-        "imitation",
-        (collect,),
-        {
-            **world,
-            "policy": cfg["policy"],
-            "imitation": cfg["imitation"],
-            "microbatches": cfg["microbatches"],
-        },
-        work.imitation,
-    )
-    policy, data = imitation, [collect]
-    vision = state = judge = ""
-    for number in range(1, cfg["rounds"]["count"] + 1):
-        size = cfg["rounds"]["deploy"][min(number, len(cfg["rounds"]["deploy"])) - 1]
-        deploy = add(
-            f"deploy-{number}",
-            (policy,),
-            {**world, "deploy": size, "policy": cfg["policy"]},
-            work.deploy,
-            number=number,
-            episodes=size,
-        )
-        data = [*data, deploy]
-        steps = "first" if number == 1 else "refresh"
-        warm = (vision,) if vision else ()
-        if cfg["simulator"]["engine"] == "dit" and not vision:
-            warm = (
-                add(
-                    "tokenizer",
-                    tuple(data),
-                    {**learned, "tokenizer": cfg["tokenizer"]},
-                    work.tokenizer,
-                    data=tuple(data),
-                ),
-            )
-        vision = add(
-            f"vision-{number}",
-            (*data, *warm),
-            {**learned, "vision": cfg["vision"][steps]},
-            work.vision,
-            data=tuple(data),
-            warm=warm,
-            steps=steps,
-        )
-        state = add(
-            f"state-{number}",
-            (*data, vision, *((state,) if state else ())),
-            {**learned, "state": cfg["state"][steps]},
-            work.state,
-            data=tuple(data),
-            vision=vision,
-            warm=state,
-            steps=steps,
-        )
-        settings = {**learned, "judge": cfg["judge"], "judge_fit": cfg["judge_fit"][steps]}
-        judge = add(
-            f"judge-{number}",
-            (*data, vision, *((judge,) if judge else ())),
-            settings,
-            work.judge,
-            data=tuple(data),
-            vision=vision,
-            warm=judge,
-            steps=steps,
-        )
-        settings = {**settings, "policy": cfg["policy"]}
-        gap = add(
-            f"gap-{number}",
-            (*data, vision, state, judge, policy, held_out),
-            {**settings, "measure": cfg["measure"]},
-            work.gap,
-            data=tuple(data),
-            vision=vision,
-            state=state,
-            judge=judge,
-            policy=policy,
-            number=number,
-        )
-        cloned = add(
-            f"clone-{number}",
-            (*data, policy, vision),
-            {**learned, "policy": cfg["policy"], "imitation": cfg["imitation"], "clone": cfg["clone"]},
-            work.clone,
-            data=tuple(data),
-            policy=policy,
-            vision=vision,
-            number=number,
-        )
-        iterations = cfg["rounds"]["iterations"][min(number, len(cfg["rounds"]["iterations"])) - 1]
-        settings = {**settings, "algorithm": cfg["algorithm"], "rl": cfg["rl"], "iterations": iterations}
-        policy = add(
-            f"rl-{number}",
-            (*data, vision, state, judge, cloned, gap),
-            settings,
-            work.rl,
-            data=tuple(data),
-            vision=vision,
-            state=state,
-            judge=judge,
-            policy=cloned,
-            iterations=iterations,
-            number=number,
-        )
-    measured = {**learned, "judge": cfg["judge"], "policy": cfg["policy"], "measure": cfg["measure"]}
-    world_parents = (*data, vision, state, judge)
-    known = {"data": tuple(data), "vision": vision, "state": state, "judge": judge}
-    add(
-        "evaluate-before",
-        (imitation,),
-        {**world, "policy": cfg["policy"], "evaluate": cfg["evaluate"]},
-        work.evaluate_physics,
-        policy=imitation,
-    )
-    add(
-        "evaluate-after",
-        (policy,),
-        {**world, "policy": cfg["policy"], "evaluate": cfg["evaluate"]},
-        work.evaluate_physics,
-        policy=policy,
-    )
-    add(
-        "evaluate-imagined",
-        (*world_parents, imitation, policy),
-        {**measured, "evaluate": cfg["evaluate"]},
-        work.evaluate_imagined,
-        before=imitation,
-        after=policy,
-        **known,
-    )
-    add("measure", (*world_parents, held_out), measured, work.measure, held_out=held_out, **known)
-    add(
-        "videos",
-        (*world_parents, held_out, imitation, policy),
-        measured,
-        work.videos,
-        held_out=held_out,
-        before=imitation,
-        after=policy,
-        **known,
-    )
-    everything = tuple(graph.stages)
-    add(
-        "report",
-        everything,
-        {"name": cfg["name"], "seed": seed},
-        work.report,
-        rounds=cfg["rounds"]["count"],
-        root=root,
-    )
+
+def build_loop(cfg: Cfg, root: Path, with_rl: bool = True) -> Graph:
+    """The graph of an experiment.
+
+    Args:
+        cfg: the resolved config.
+        root: the run's folder.
+        with_rl: false leaves the iterations of RL out of every round, as a control of what they bring; the
+            deployed policy is then the one that was cloned.
+
+    Raises:
+        ConfigError: for what can be seen to fail before anything starts.
+    """
+    learners_of(cfg)
+    graph = Graph(cfg, root / "stages")
+    if has_physics(cfg):
+        _physics_loop(graph, cfg, with_rl)
+    else:
+        _data_loop(graph, cfg)
     return graph
+
+
+def has_physics(cfg: Cfg) -> bool:
+    """Whether the task is one that can be tried; else there are recordings only (task.data)."""
+    return bool(cfg["task"].get("suite"))
+
+
+def last_round(cfg: Cfg) -> int:
+    """Number of the last round; recordings do not grow, so without physics there is one."""
+    return int(cfg["rounds"]["count"]) if has_physics(cfg) else 1
+
+
+def of_round(values: Sequence[T], number: int) -> T:
+    """The entry of round `number`; the last one repeats."""
+    return values[min(number, len(values)) - 1]
+
+
+def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
+    data: list[str] = [graph.add("collect", collect.collect)]
+    first = policy = graph.add("imitation", imitation.imitation, {"data": data})
+    made = World()
+    for number in range(1, last_round(cfg) + 1):
+        episodes = of_round(cfg["rounds"]["deploy"], number)
+        data = [*data, graph.add(
+            f"deploy-{number}", collect.deploy, {"policy": policy}, number=number, episodes=episodes
+        )]  # fmt: skip
+        made = _refresh(graph, cfg, data, made, number)
+        inputs = {"data": data, **made.roles()}
+        graph.add(f"gap-{number}", prove.gap, {**inputs, "policy": policy}, number=number)
+        policy = graph.add(
+            f"clone-{number}",
+            imitation.clone,
+            {"data": data, "policy": policy, "simulator": made.simulator},
+            number=number,
+        )
+        if with_rl:
+            policy = _learn(graph, cfg, data, made, policy, number)
+    before = graph.add("evaluate-before", prove.evaluate_physics, {"policy": first})
+    after = graph.add("evaluate-after", prove.evaluate_physics, {"policy": policy})
+    _conclude(graph, data, made, first, policy, {"physics_before": before, "physics_after": after})
+
+
+def _data_loop(graph: Graph, cfg: Cfg) -> None:
+    mark = collect.fingerprint(cfg["task"]["data"])
+    data = [graph.add("recordings", collect.recordings, fingerprint=mark)]
+    made = _refresh(graph, cfg, data, World(), 1)
+    first = graph.add("imitation", imitation.imitation, {"data": data})
+    policy = _learn(graph, cfg, data, made, first, 1, deployed=0)
+    _conclude(graph, data, made, first, policy, {})
+
+
+def _refresh(graph: Graph, cfg: Cfg, data: list[str], before: World, number: int) -> World:
+    """The stages that train the imagined world on all data so far, from its predecessor if there is one."""
+    phase, warm = ("refresh", before.simulator) if before.simulator else ("first", "")
+    if not warm and "tokenizer" in cfg["simulator"]:
+        warm = graph.add("tokenizer", world.tokenizer, {"data": data})
+    simulator = graph.add(f"simulator-{number}", world.simulator, {"data": data, "warm": warm}, phase=phase)
+    inputs = {"data": data, "simulator": simulator}
+    state = graph.add(f"state-{number}", world.state, {**inputs, "warm": before.state}, phase=phase)
+    judge = graph.add(f"judge-{number}", world.judge, {**inputs, "warm": before.judge}, phase=phase)
+    return World(simulator, state, judge)
+
+
+def _learn(
+    graph: Graph,
+    cfg: Cfg,
+    data: list[str],
+    made: World,
+    policy: str,
+    number: int,
+    deployed: int | None = None,
+) -> str:
+    """RL in the imagined world; `deployed` is the round whose successes anchor it, this one by default."""
+    return graph.add(
+        f"rl-{number}",
+        rl.rl,
+        {"data": data, **made.roles(), "policy": policy},
+        number=number,
+        deployed=number if deployed is None else deployed,
+        iterations=of_round(cfg["rounds"]["iterations"], number),
+    )
+
+
+def _conclude(
+    graph: Graph, data: list[str], made: World, first: str, last: str, proofs: dict[str, str]
+) -> None:
+    """What is measured at the end: success imagined, errors of world and judge, videos, and the report."""
+    inputs, policies = {"data": data, **made.roles()}, {"before": first, "after": last}
+    imagined = graph.add("evaluate-imagined", prove.evaluate_imagined, {**inputs, **policies})
+    measured = graph.add("measure", prove.measure, inputs)
+    if proofs:
+        videos = graph.add("videos", show.videos, {"simulator": made.simulator, **policies})
+    else:
+        videos = graph.add("videos", show.replays, {"data": data, "simulator": made.simulator})
+    everything = list(graph.nodes)
+    graph.add(
+        "report",
+        show.report,
+        {**proofs, "imagined": imagined, "measured": measured, "videos": videos, "stages": everything},
+    )

@@ -2,44 +2,77 @@
 says.
 
 Ray Train starts the processes that learn; all of them run the stage, the leading one writes. Which parts of a
-stage are shared out is told in learners/parallel.py. A worker that dies takes the others with it; Ray
+stage are shared out is told in learners/training/parallel.py. A worker that dies takes the others with it; Ray
 Train starts all anew, and the stage goes on from its last checkpoint.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from actors.factory import ConfigError
-from pipeline.artefact import write_text
+from envs.files import write_text
+from envs.targets import ConfigError
+from pipeline.stage import Inputs, Place, Stage, find_stage
 
-# Stages that are more than one worker's work; the others run in the driver.
-SHARED = ("imitation", "tokenizer", "vision", "state", "judge", "clone", "rl")
-# Stages that measure policies and worlds.
-EVALUATORS = ("gap", "evaluate_physics", "evaluate_imagined", "measure")
+
+@dataclass(frozen=True)
+class Job:
+    """A stage to be run, in a form that any process can take.
+
+    Args:
+        stage: Stage.path.
+        name: of the node.
+        cfg: the resolved config.
+        folder: of the artefact, absolute.
+        found: folders by role, absolute.
+        settings: of the node.
+    """
+
+    stage: str
+    name: str
+    cfg: Mapping[str, Any]
+    folder: str
+    found: Mapping[str, str | list[str]]
+    settings: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, stage: Stage, name: str, cfg: Mapping[str, Any], folder: Path, inputs: Inputs) -> Job:
+        """The job of a node."""
+        found: dict[str, str | list[str]] = {
+            role: str(paths.resolve()) if isinstance(paths, Path) else [str(path.resolve()) for path in paths]
+            for role, paths in inputs.found.items()
+        }
+        return cls(stage.path, name, dict(cfg), str(folder.resolve()), found, dict(inputs.settings))
+
+    def run(self) -> dict[str, Any]:
+        """Do it here."""
+        stage = find_stage(self.stage)
+        found = {
+            role: Path(paths) if isinstance(paths, str) else tuple(Path(path) for path in paths)
+            for role, paths in self.found.items()
+        }
+        view = stage.view(self.name, self.cfg, self.settings)
+        return dict(stage.run(view, Path(self.folder), Inputs(found, self.settings)))
 
 
 def run_stage(
-    function: str, cfg: Mapping[str, Any], folder: Path, found: Mapping[str, Path], known: Mapping[str, Any]
+    stage: Stage, name: str, cfg: Mapping[str, Any], folder: Path, inputs: Inputs
 ) -> dict[str, Any]:
-    """Run a stage of pipeline/work where the config wants it: in this process, on Ray's evaluator, or in
-    launch.learners processes.
+    """Run a stage where it belongs: in this process, on Ray's evaluator, or in launch.learners processes.
 
     Raises:
         ConfigError: if the processes cannot be placed, or failed.
     """
-    from pipeline import stages as work
-
-    if function in SHARED and learners_of(cfg) > 1:
-        return run_shared(function, cfg, folder, found, known)
-    if function in EVALUATORS and cfg["launch"]["backend"] == "ray":
-        return run_placed(function, cfg, folder, found, known)
-    return dict(getattr(work, function)(cfg, folder, found, **known))
+    run = _PLACES[stage.place](cfg)
+    if run is not None:
+        return run(Job.of(stage, name, cfg, folder, inputs))
+    return dict(stage.run(stage.view(name, cfg, inputs.settings), folder, inputs))
 
 
 def learners_of(cfg: Mapping[str, Any]) -> int:
@@ -51,15 +84,14 @@ def learners_of(cfg: Mapping[str, Any]) -> int:
     count = int(cfg["launch"].get("learners", 1))
     if count > 1 and cfg["microbatches"] % count:
         raise ConfigError(
-            f"microbatches={cfg['microbatches']} must be a multiple of launch.learners={count}; say microbatches={count}"
+            f"microbatches={cfg['microbatches']} must be a multiple of launch.learners={count};"
+            f" say microbatches={count}"
         )
     return count
 
 
-def run_shared(
-    function: str, cfg: Mapping[str, Any], folder: Path, found: Mapping[str, Path], known: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Run a stage of pipeline/work in launch.learners processes; returns what the leading one returned.
+def run_shared(job: Job) -> dict[str, Any]:
+    """Run a stage in launch.learners processes; returns what the leading one returned.
 
     Raises:
         ConfigError: if the processes cannot be placed, or failed more than launch.patience.retries times.
@@ -70,22 +102,15 @@ def run_shared(
 
     from actors.fleets.cluster import Plan, connect
 
-    launch = cfg["launch"]
+    launch, folder = job.cfg["launch"], Path(job.folder)
     plan = Plan.of(launch)
     plan.check(connect(launch))
     gpus = plan.gpus["learner"]
     answer = folder / "answer.json"
     answer.unlink(missing_ok=True)
-    asked = {
-        "function": function,
-        "cfg": dict(cfg),
-        "folder": str(folder.resolve()),
-        "found": {name: str(path.resolve()) for name, path in found.items()},
-        "known": dict(known),
-    }
     trainer = TorchTrainer(
         work_loop,
-        train_loop_config=asked,
+        train_loop_config=vars(job),
         torch_config=TorchConfig(backend="nccl" if gpus else "gloo"),
         scaling_config=ScalingConfig(
             num_workers=launch["learners"],
@@ -94,7 +119,7 @@ def run_shared(
         ),
         run_config=RunConfig(
             name=folder.name,
-            storage_path=str((folder / "ray-train").resolve()),
+            storage_path=str(folder / "ray-train"),
             failure_config=FailureConfig(max_failures=launch["patience"]["retries"]),
         ),
     )
@@ -102,16 +127,14 @@ def run_shared(
         trainer.fit()
     except Exception as error:
         raise ConfigError(
-            f"the {launch['learners']} learners of {folder.name} failed: {_last(error)}; the same command goes on from the last checkpoint"
+            f"the {launch['learners']} learners of {folder.name} failed: {_last(error)};"
+            " the same command goes on from the last checkpoint"
         ) from error
     return dict(json.loads(answer.read_text()))
 
 
-def run_placed(
-    function: str, cfg: Mapping[str, Any], folder: Path, found: Mapping[str, Path], known: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Run a stage of pipeline/work as a Ray task with the evaluator's resources; a lost node only costs a
-    second try.
+def run_placed(job: Job) -> dict[str, Any]:
+    """Run a stage as a Ray task with the evaluator's resources; a lost node only costs a second try.
 
     Raises:
         ConfigError: if the task cannot be placed.
@@ -120,54 +143,50 @@ def run_placed(
 
     from actors.fleets.cluster import Plan, connect
 
-    plan = Plan.of(cfg["launch"])
-    plan.check(connect(cfg["launch"]))
-    task = ray.remote(_measure).options(
-        max_retries=int(cfg["launch"]["patience"]["retries"]), **plan.options("evaluator")
-    )
-    paths = {name: str(path.resolve()) for name, path in found.items()}
-    ref = task.remote(function, dict(cfg), str(folder.resolve()), paths, dict(known))
-    deadline, waited = float(cfg["launch"]["patience"]["stage"]), 0.0
+    launch, name = job.cfg["launch"], Path(job.folder).name
+    plan = Plan.of(launch)
+    plan.check(connect(launch))
+    retries = int(launch["patience"]["retries"])
+    task = ray.remote(_measure).options(max_retries=retries, **plan.options("evaluator"))
+    ref = task.remote(vars(job))
+    deadline, waited = float(launch["patience"]["stage"]), 0.0
     while not ray.wait([ref], timeout=60)[0]:
         waited += 60
-        tqdm.write(f"the driver waits for the evaluator ({folder.name}), {waited:.0f} s")
+        tqdm.write(f"the driver waits for the evaluator ({name}), {waited:.0f} s")
         if waited >= deadline:
             ray.cancel(ref, force=True)
             raise ConfigError(
-                f"{folder.name} took over launch.patience.stage={deadline:.0f} s on the evaluator; raise it, or see whether launch.place.evaluator can be placed"
+                f"{name} took over launch.patience.stage={deadline:.0f} s on the evaluator; raise it,"
+                " or see whether launch.place.evaluator can be placed"
             )
     answer: dict[str, Any] = ray.get(ref)
     return answer
 
 
-def _measure(
-    function: str, cfg: dict[str, Any], folder: str, found: dict[str, str], known: dict[str, Any]
-) -> dict[str, Any]:
-    from pipeline import stages as work
-
-    return dict(
-        getattr(work, function)(
-            cfg, Path(folder), {name: Path(path) for name, path in found.items()}, **known
-        )
-    )
+def _measure(job: dict[str, Any]) -> dict[str, Any]:
+    return Job(**job).run()
 
 
-def work_loop(asked: dict[str, Any]) -> None:
-    """What every worker does."""
+def work_loop(job: dict[str, Any]) -> None:
+    """What every learner process does."""
     import torch
     from ray.train.torch import get_device
 
     from learners.training.parallel import leads
-    from pipeline import stages as work
 
     if torch.cuda.is_available():
         torch.cuda.set_device(get_device())
-    folder = Path(asked["folder"])
-    result = getattr(work, asked["function"])(
-        asked["cfg"], folder, {name: Path(path) for name, path in asked["found"].items()}, **asked["known"]
-    )
+    result = Job(**job).run()
     if leads():
-        write_text(folder / "answer.json", json.dumps(result, default=float))
+        write_text(Path(job["folder"]) / "answer.json", json.dumps(result, default=float))
+
+
+# How a place runs a job under a launch; None is this process.
+_PLACES: dict[Place, Callable[[Mapping[str, Any]], Callable[[Job], dict[str, Any]] | None]] = {
+    Place.DRIVER: lambda cfg: None,
+    Place.LEARNERS: lambda cfg: run_shared if learners_of(cfg) > 1 else None,
+    Place.EVALUATOR: lambda cfg: run_placed if cfg["launch"]["backend"] == "ray" else None,
+}
 
 
 def _last(error: Exception) -> str:

@@ -11,25 +11,35 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from envs.episodes.clips import ClipStore
 from envs.episodes.video import write_video
 from envs.simulators.replay import Replay
 
+_HEIGHT = 192  # pixels of a view in videos, about
+
 
 def paired_frames(
-    store: ClipStore, number: int, made: Replay, title: str, scale: int = 3
+    store: ClipStore, episodes: Tensor, made: Replay, number: int, title: str
 ) -> list[NDArray[np.uint8]]:
-    """Frames RGB of one episode: what was imagined above, what was true below, all views side by side."""
+    """Frames RGB of one episode: what was imagined above, what was recorded below, all views side by side.
+
+    Args:
+        episodes: int64 [N], those that `made` replays.
+        number: which of them.
+        title: stands beside "imagined".
+    """
     valid = made.valid[number]
     imagined, true = made.frames[number][valid].numpy(), store.frames(made.rows[number][valid]).numpy()
-    first = store.frames(store.start[number : number + 1]).numpy()
+    first = store.frames(store.start[episodes[number : number + 1]]).numpy()
+    scale = max(1, round(_HEIGHT / store.spec.size[0]))
     out = []
     for above, below in zip(np.concatenate([first, imagined]), np.concatenate([first, true]), strict=True):
         rows = [np.concatenate(list(views.transpose(0, 2, 3, 1)), 1) for views in (above, below)]
         big = [cv2.resize(row, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST) for row in rows]
         bars = [np.full((22, big[0].shape[1], 3), 24, np.uint8) for _ in range(2)]
-        for bar, text in zip(bars, (f"imagined   {title}", "true"), strict=True):
+        for bar, text in zip(bars, (f"imagined   {title}", "recorded"), strict=True):
             cv2.putText(bar, text, (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (230, 230, 230), 1, cv2.LINE_AA)
         out.append(np.concatenate([bars[0], big[0], bars[1], big[1]]))
     return [
@@ -37,11 +47,10 @@ def paired_frames(
     ]
 
 
-def paired_video(path: Path, store: ClipStore, number: int, made: Replay, title: str) -> None:
+def paired_video(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> None:
     """Write `paired_frames` as an mp4 that browsers play."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    frames = paired_frames(store, number, made, title)
-    write_video(path, [*frames, *[frames[-1]] * 5], store.fps, crf=20, browser=True)
+    write_video(path, [*frames, *[frames[-1]] * 5], fps, crf=20, browser=True)
 
 
 def write_gif(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> None:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import comb, sqrt
 from typing import Any
 
+from scipy.stats import binomtest
 from torch import Tensor
 
 
-def wilson(successes: int, episodes: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson score interval of a success rate (Wilson 1927), by default at 95%; (0, 1) without episodes."""
+def wilson(successes: int, episodes: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Wilson score interval of a success rate (Wilson 1927); (0, 1) without episodes."""
     if episodes == 0:
         return 0.0, 1.0
-    rate = successes / episodes
-    centre = (rate + z * z / (2 * episodes)) / (1 + z * z / episodes)
-    half = z / (1 + z * z / episodes) * sqrt(rate * (1 - rate) / episodes + z * z / (4 * episodes**2))
-    return max(0.0, centre - half), min(1.0, centre + half)
+    interval = binomtest(successes, episodes).proportion_ci(confidence, method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def rate_entry(success: Tensor) -> dict[str, Any]:
@@ -26,21 +24,29 @@ def rate_entry(success: Tensor) -> dict[str, Any]:
     return {"successes": successes, "episodes": episodes, "low": round(low, 4), "high": round(high, 4)}
 
 
+def rate(entry: Mapping[str, Any]) -> float:
+    """The share of successes in a `rate_entry`, 0 without episodes."""
+    return float(entry["successes"] / max(1, entry["episodes"]))
+
+
 def rate_line(entry: Mapping[str, Any]) -> str:
     """A `rate_entry` in words: successes of episodes, the rate in percent, and its interval."""
-    return f"{entry['successes']}/{entry['episodes']} = {100 * entry['successes'] / max(1, entry['episodes']):.1f}% [{100 * entry['low']:.1f}, {100 * entry['high']:.1f}]"
+    return (
+        f"{entry['successes']}/{entry['episodes']} = {100 * rate(entry):.1f}%"
+        f" [{100 * entry['low']:.1f}, {100 * entry['high']:.1f}]"
+    )
 
 
 def mcnemar(before: Tensor, after: Tensor) -> dict[str, Any]:
     """Exact two-sided McNemar test of paired outcomes bool [N] -> {"gained", "lost", "p"}."""
     gained, lost = int((after & ~before).sum()), int((before & ~after).sum())
-    n, k = gained + lost, min(gained, lost)
-    p = 1.0 if n == 0 else min(1.0, 2.0 * sum(comb(n, i) for i in range(k + 1)) / 2**n)
+    discordant = gained + lost
+    p = float(binomtest(gained, discordant, 0.5).pvalue) if discordant else 1.0
     return {"gained": gained, "lost": lost, "p": p}
 
 
-def confusion(said: Tensor, truth: Tensor) -> dict[str, Any]:
-    """{"tp", "fp", "fn", "tn", "accuracy"} of verdicts and truth bool [N]."""
-    tp, fp = int((said & truth).sum()), int((said & ~truth).sum())
-    fn, tn = int((~said & truth).sum()), int((~said & ~truth).sum())
+def confusion(predicted: Tensor, truth: Tensor) -> dict[str, Any]:
+    """{"tp", "fp", "fn", "tn", "accuracy"} of predictions and truth bool [N]."""
+    tp, fp = int((predicted & truth).sum()), int((predicted & ~truth).sum())
+    fn, tn = int((~predicted & truth).sum()), int((~predicted & ~truth).sum())
     return {"tp": tp, "fp": fp, "fn": fn, "tn": tn, "accuracy": round((tp + tn) / max(1, len(truth)), 4)}

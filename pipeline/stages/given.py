@@ -1,34 +1,43 @@
-"""What stages are given: episode seeds, options of a section, data and worlds of the stages before."""
+"""What stages are given: data of the stages before and its splits, options of a section, imagined worlds."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from actors.factory import build_judge, build_simulator, build_state_decoder, build_world, open_clips, options
+from actors.factory import build_judge, build_simulator, build_state_decoder, build_world, open_clips
 from envs.episodes.clips import ClipStore
+from envs.specs import ActionMode
+from envs.targets import ConfigError, options
 from envs.world import InitialStates
 from learners.rl.algorithm import RLConfig
 from learners.training.fit import FitConfig
+from pipeline.stage import Inputs
 
 Cfg = Mapping[str, Any]
-Found = Mapping[str, Path]
 
-# Episode seeds of different purposes never meet, whatever the experiment's own seed is.
-_SPACE = 10_000_000
-TRAIN, HELD_OUT, DEPLOY, EVALUATE = 0, 2_000_000, 4_000_000, 9_000_000
+# Config sections behind the shapes of a robot's world, a policy for it, the imagined world, and physics.
+ROBOT = (
+    *("seed", "task", "simulator.kinematics"),
+    *("simulator.pose_map", "simulator.pose_map_style", "simulator.ray_map"),
+)
+POLICY = (*ROBOT, "policy")
+WORLD = ("seed", "task", "simulator", "judge")
+PHYSICS = (*POLICY, "judge.rewards")
 
+# What a report shows.
+EVERYTHING = (
+    *("name", "seed", "microbatches", "task", "simulator", "judge", "policy", "algorithm", "rl", "rounds"),
+    *("collect", "imitation", "clone", "tokenizer_fit", "simulator_fit", "state_fit", "judge_fit"),
+    *("evaluate", "measure"),
+)
 
-def seeds_of(cfg: Cfg, purpose: int, count: int, offset: int = 0) -> list[int]:
-    """Episode seeds for a purpose. Evaluation seeds are the same for every experiment seed, so that runs can
-    be compared.
-    """
-    base = purpose if purpose == EVALUATE else purpose + _SPACE * (1 + cfg["seed"])
-    return list(range(base + offset, base + offset + count))
+DATASETS = "datasets.json"  # of a stage whose data sets lie elsewhere: a list of their paths
 
 
 def fit_options(cfg: Cfg, section: Mapping[str, Any], key: str) -> FitConfig:
@@ -41,50 +50,81 @@ def rl_options(cfg: Cfg, **more: Any) -> RLConfig:
     return options(RLConfig, {**cfg["rl"], "microbatches": cfg["microbatches"], **more}, "rl")
 
 
-def open_store(cfg: Cfg, found: Found, data: Iterable[str]) -> ClipStore:
-    """The data sets of several stages as one store, with the commands that the simulator takes."""
-    return open_clips(cfg, [found[name] / "dataset" for name in data])
+def mode_of(cfg: Cfg) -> ActionMode:
+    """How the numbers of a policy's chunks are meant."""
+    return ActionMode(cfg["task"]["mode"])
 
 
-def split(store: ClipStore) -> tuple[Tensor, Tensor]:
-    """Training and held-out episodes: every eighth of a policy's episodes is kept from all training, for
-    measuring.
+def datasets(folders: Iterable[Path]) -> list[Path]:
+    """The data sets that stages left in their folders, or point to."""
+    out = []
+    for folder in folders:
+        elsewhere = folder / DATASETS
+        out += json.loads(elsewhere.read_text()) if elsewhere.exists() else [folder / "dataset"]
+    return [Path(path) for path in out]
+
+
+def open_store(cfg: Cfg, inputs: Inputs, role: str = "data") -> ClipStore:
+    """The data sets of a role as one store."""
+    return open_clips(cfg, datasets(inputs.folders(role)))
+
+
+def learning_episodes(store: ClipStore) -> Tensor:
+    """Episodes that simulators and policies learn from, int64 [N]: all but the held-out ones.
+
+    Those of the calibration split are kept from judges only.
     """
-    numbers = torch.arange(len(store))
-    kept = torch.tensor(
-        [row["behaviour"].startswith("policy") and row["seed"] % 8 == 0 for row in store.episodes]
-    )
-    return numbers[~kept], numbers[kept]
+    return torch.cat((store.split("train"), store.split("calibration"))).sort().values
+
+
+def newest_episodes(store: ClipStore, episodes: Tensor) -> Tensor:
+    """Those of `episodes` that lie in the store's last data set."""
+    owner = torch.tensor([row["dataset"] for row in store.episodes])
+    return episodes[owner[episodes] == owner.max()]
+
+
+def demonstrations(cfg: Cfg, store: ClipStore) -> Tensor:
+    """The episodes that the first policy is cloned from, int64 [N]: of imitation.sources, and not failed.
+
+    Raises:
+        ConfigError: if there are fewer than imitation.demos.
+    """
+    section = cfg["imitation"]
+    learnable = learning_episodes(store)
+    mine = store.select(list(section["sources"]))
+    mine = mine[torch.isin(mine, learnable)]
+    good = [n for n in mine.tolist() if store.episodes[n]["success"] is not False]
+    chosen = torch.tensor(good[: section["demos"]], dtype=torch.int64)
+    if len(chosen) < section["demos"]:
+        sources = sorted({row["source"] for row in store.episodes})
+        raise ConfigError(
+            f"imitation.demos={section['demos']}, but the data hold {len(chosen)} successful episodes of"
+            f" imitation.sources={list(section['sources'])} for learning (sources there: {sources[:8]});"
+            " lower imitation.demos, name other sources ['*' for all], or collect more"
+        )
+    return chosen
 
 
 def successful_episodes(cfg: Cfg, store: ClipStore, number: int) -> Tensor:
     """Episodes known to have worked in physics: successes of the policy deployed in round `number`, and the
-    demonstrations where those are fewer.
+    demonstrations where those are fewer; without deployments (number 0) the demonstrations alone.
 
     What older policies did pulls a better one back: cloned with theirs, one that succeeded in 44% was left
-    with 38%,
-    on its own 44%.
+    with 38%, on its own 44%.
     """
-    own, demos = (
-        store.select([f"policy-{number}"], succeeded=True),
-        store.select(["expert"], succeeded=True)[: cfg["imitation"]["demos"]],
-    )
-    own = own[torch.isin(own, split(store)[0])]
+    own, demos = store.select([f"policy-{number}"], succeeded=True), demonstrations(cfg, store)
+    own = own[torch.isin(own, learning_episodes(store))]
     return own if len(own) >= len(demos) else torch.cat([demos, own])
 
 
-def load_world(
-    cfg: Cfg,
-    found: Found,
-    store: ClipStore,
-    vision: str,
-    state: str,
-    judge: str,
-    batch: int,
-    episodes: Tensor | None = None,
-) -> Any:
-    """The imagined world with the weights of three stages, starting where the store's episodes start."""
-    simulator = build_simulator(cfg, found[vision] / "weights.safetensors")
-    decoder = build_state_decoder(cfg, simulator, found[state] / "weights.safetensors")
-    referee = build_judge(cfg, found[judge] / "weights.safetensors")
-    return build_world(cfg, simulator, decoder, referee, InitialStates.of(store, episodes), batch)
+def learns(module: nn.Module) -> bool:
+    """Whether a part has anything to train."""
+    return any(parameter.requires_grad for parameter in module.parameters())
+
+
+def load_world(cfg: Cfg, inputs: Inputs, store: ClipStore, batch: int, episodes: Tensor | None = None) -> Any:
+    """The imagined world of the roles simulator, state and judge, starting where the store's episodes start."""
+    simulator = build_simulator(cfg, inputs.weights("simulator"))
+    decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
+    judge = build_judge(cfg, inputs.weights("judge"))
+    return build_world(cfg, simulator, decoder, judge, InitialStates.of(store, episodes), batch)

@@ -1,0 +1,148 @@
+"""The version of a stage's code: hashes of every source file that its module imports, directly or not.
+
+Imports are found in the syntax tree, also those inside functions, so nothing is run. Comments, docstrings and
+formatting do not count. Installed packages count by their version.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import importlib.metadata
+import importlib.util
+from collections.abc import Iterable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+ROOMS = ("envs", "actors", "learners", "pipeline")  # packages of this repository
+_INSTALLED = ("site-packages", "dist-packages")
+
+
+def code_of(module: str, config: Mapping[str, Any]) -> dict[str, str]:
+    """Hashes of the sources behind a stage, by path, and versions of foreign packages, by name.
+
+    Args:
+        module: import path of the stage's module.
+        config: what the stage reads; modules of the `_target_`s in it count as imported.
+    """
+    out: dict[str, str] = {}
+    for name in sorted({module, *(target.rpartition(".")[0] for target in targets(config))}):
+        for found in _closure(name):
+            out |= _version(found)
+    return out
+
+
+def digest(value: Any) -> str:
+    """A short hash of a text."""
+    return hashlib.sha256(str(value).encode()).hexdigest()[:12]
+
+
+def targets(section: Any) -> Iterable[str]:
+    """Every `_target_` in a config section, however deep."""
+    if isinstance(section, Mapping):
+        if isinstance(section.get("_target_"), str):
+            yield section["_target_"]
+        for value in section.values():
+            yield from targets(value)
+    elif isinstance(section, (list, tuple)):
+        for value in section:
+            yield from targets(value)
+
+
+@cache
+def _closure(module: str) -> frozenset[str]:
+    """Modules that `module` imports, itself and packages on the way included; foreign ones are not entered."""
+    found: set[str] = set()
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name in found or not name:
+            continue
+        found.add(name)
+        package = name.rpartition(".")[0]
+        if package:
+            waiting.append(package)
+        path = _source(name)
+        if path is not None:
+            waiting += [other for other in _imports(name, path) if _same_house(other, name)]
+    return frozenset(found)
+
+
+def _same_house(name: str, importer: str) -> bool:
+    """Whether an import is followed: modules of this repository, and of the importer's own package."""
+    return name.split(".")[0] in (*ROOMS, importer.split(".")[0])
+
+
+@cache
+def _source(module: str) -> Path | None:
+    """The module's source file, None for one that does not exist or is part of an installed package."""
+    if module.split(".")[0] in ROOMS:
+        base = ROOT.joinpath(*module.split("."))
+        for path in (base.with_suffix(".py"), base / "__init__.py"):
+            if path.is_file():
+                return path
+        return None
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        return None
+    if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
+        return None
+    path = Path(spec.origin)
+    return None if any(part in _INSTALLED for part in path.parts) else path
+
+
+@cache
+def _tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(), filename=str(path))
+
+
+@cache
+def _imports(module: str, path: Path) -> tuple[str, ...]:
+    """Names of the modules that a file imports; of `from a import b` both a and a.b, if the latter is one."""
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    out: set[str] = set()
+    for node in ast.walk(_tree(path)):
+        if isinstance(node, ast.Import):
+            out.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                parents = package.split(".")[: len(package.split(".")) - node.level + 1]
+                base = ".".join([*parents, *([base] if base else [])])
+            out.add(base)
+            out.update(f"{base}.{alias.name}" for alias in node.names)
+    return tuple(name for name in sorted(out) if name.split(".")[0] not in ROOMS or _source(name))
+
+
+@cache
+def _file_hash(path: Path) -> str:
+    """Hash of a file's syntax tree without docstrings and positions."""
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
+            first = node.body[0] if node.body else None
+            if (
+                isinstance(first, ast.Expr)
+                and isinstance(first.value, ast.Constant)
+                and isinstance(first.value.value, str)
+            ):
+                node.body = node.body[1:]
+    return digest(ast.dump(tree))
+
+
+def _version(module: str) -> dict[str, str]:
+    """{path: hash} of a module that has sources here, {distribution: version} of an installed one."""
+    path = _source(module)
+    if path is not None:
+        name = str(path.relative_to(ROOT)) if path.is_relative_to(ROOT) else str(path)
+        return {name: _file_hash(path)}
+    top = module.split(".")[0]
+    if top in ROOMS:
+        return {}
+    try:
+        return {top: importlib.metadata.version(top)}
+    except importlib.metadata.PackageNotFoundError:
+        return {}

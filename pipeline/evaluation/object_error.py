@@ -1,0 +1,59 @@
+"""How far the first object strays in generated video, where physics recorded its pose and the main camera is
+calibrated and stands still.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from envs.episodes.clips import ClipStore
+from envs.episodes.privileged import read_privileged
+from envs.geometry.cameras import on_plane, project
+from envs.simulators.replay import Replay
+from pipeline.evaluation.object_locator import locate
+from pipeline.evaluation.quantiles import quantiles
+
+POSES = "object_poses"  # privileged: [x, y, z, heading] of every object, metres and radians
+
+
+def object_error(store: ClipStore, episodes: Tensor, made: Replay, truth: Tensor) -> dict[str, Any]:
+    """Error of the object's place in generated against true video, as one colour locator sees both.
+
+    Args:
+        truth: uint8 [N, T, V, 3, H, W], the true frames beside made.frames.
+
+    Returns:
+        object_px and object_cm (median, 90th percentile over all frames), object_cm_at_end, object_lost (share
+        of frames), and locator_px, the locator's own error on true video; {} where this cannot be measured.
+    """
+    view = store.spec.embodiment.main_view
+    if not store.spec.embodiment.calibrated or store.spec.embodiment.cameras[view].wrist is not None:
+        return {}
+    poses = read_privileged(store, POSES)
+    if poses is None:
+        return {}
+    places = poses.reshape(len(poses), -1, 4)[:, 0, :3]
+    start = store.start[episodes]
+    first = store.frames(start)[:, view]
+    intrinsic, c2w = store.intrinsic[episodes][:, view], store.arrays["c2w"][start][:, view]
+    found, lost = locate(made.frames[:, :, view], first, places[start], intrinsic, c2w)
+    seen, hidden = locate(truth[:, :, view], first, places[start], intrinsic, c2w)
+    true, _ = project(places[made.rows], intrinsic, c2w)
+    height = places[start][:, None, None, 2].expand(-1, found.shape[1], 1)
+    metres = (on_plane(found, height, intrinsic, c2w) - places[made.rows])[..., :2].norm(dim=-1)
+    pixels = (found - true).norm(dim=-1)
+    ends = torch.zeros_like(made.valid)
+    ends[torch.arange(len(ends)), made.valid.long().cumsum(1).argmax(1)] = True
+    use = made.valid & ~hidden  # where the locator fails on true video it says nothing of generated video
+    if not use.any():
+        return {}
+    return {
+        "object_px": quantiles(pixels[use & ~lost]),
+        "object_cm": quantiles(metres[use & ~lost] * 100),
+        "object_cm_at_end": quantiles(metres[use & ~lost & ends] * 100),
+        "object_lost": float(lost[use].float().mean()),
+        "locator_px": quantiles((seen - true).norm(dim=-1)[use]),
+    }

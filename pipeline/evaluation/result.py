@@ -1,0 +1,134 @@
+"""result.json: the figures of a finished run, and the one sentence that they come to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pipeline.artefact import read_manifest
+from pipeline.evaluation.statistics import mcnemar, rate
+from pipeline.stage import Inputs
+
+_ENTRY = ("successes", "episodes", "low", "high")
+
+
+def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
+    """The figures of a run.
+
+    Args:
+        inputs: roles imagined, measured, stages (all of them), and, of runs with physics, physics_before and
+            physics_after.
+
+    Returns:
+        name, seed, simulator, algorithm, verdict; physics_before and physics_after (rate entries) with paired
+        (McNemar), None without physics; imagined_before, imagined_after; judge, rollout, frames_per_second (see
+        the measure stage); rounds (gaps); episodes used and held out; seconds per stage; alarms.
+    """
+    finished = manifests(inputs)
+    imagined, measured = (result_of(inputs.folder(role)) for role in ("imagined", "measured"))
+    learned = [entry for name, entry in finished.items() if name.startswith("rl-")]
+    gathered = [
+        entry["result"]
+        for name, entry in finished.items()
+        if name.split("-")[0] in ("collect", "deploy", "recordings")
+    ]
+    result: dict[str, Any] = {
+        "name": cfg["name"],
+        "seed": cfg["seed"],
+        "task": cfg["task"]["name"],
+        "simulator": _class_name(cfg["simulator"]),
+        "policy": _class_name(cfg["policy"]),
+        "algorithm": cfg["algorithm"].get("name") or _class_name(cfg["algorithm"]),
+        **_physics(inputs),
+        "imagined_before": imagined["before"],
+        "imagined_after": imagined["after"],
+        "judge": measured["judge"],
+        "rollout": measured["rollout"],
+        "frames_per_second": measured["frames_per_second"],
+        "rounds": [entry["result"] for name, entry in finished.items() if name.startswith("gap-")],
+        "episodes_used": sum(entry["episodes"] - entry.get("held_out", 0) for entry in gathered),
+        "episodes_held_out": sum(entry.get("held_out", 0) for entry in gathered),
+        "imagined_episodes_used": [entry["result"]["ledger"]["learned"] for entry in learned],
+        "stage_seconds": {name: entry["seconds"] for name, entry in finished.items()},
+        "alarms": [text for entry in learned for text in entry["result"]["alarms"]],
+    }
+    result["verdict"] = verdict(result)
+    return result
+
+
+def manifests(inputs: Inputs) -> dict[str, dict[str, Any]]:
+    """Manifests of the stages of a run, by name, in their order."""
+    found = (read_manifest(folder) for folder in inputs.folders("stages"))
+    return {manifest["stage"]: manifest for manifest in found if manifest is not None}
+
+
+def result_of(folder: Path) -> dict[str, Any]:
+    """What a finished stage returned."""
+    manifest = read_manifest(folder)
+    assert manifest is not None, f"{folder} is an input of the report and must be finished"
+    return dict(manifest["result"])
+
+
+def outcomes(folder: Path) -> torch.Tensor:
+    """Success bool [N] of the evaluation seeds, as evaluate_physics left it."""
+    success: torch.Tensor = torch.load(folder / "outcomes.pt", weights_only=True)["success"]
+    return success
+
+
+def verdict(result: Mapping[str, Any]) -> str:
+    """One sentence: gain or none, and in the latter case what the figures say of why."""
+    imagined = 100 * (rate(result["imagined_after"]) - rate(result["imagined_before"]))
+    if result["physics_before"] is None:
+        return (
+            f"imagined success moved by {imagined:+.1f} points; without physics nobody knows what that is worth:"
+            " try the policy on the robot"
+        )
+    before, after, paired = result["physics_before"], result["physics_after"], result["paired"]
+    points = 100 * (rate(after) - rate(before))
+    head = (
+        f"true success {before['successes']}/{before['episodes']} -> {after['successes']}/{after['episodes']}"
+        f" ({points:+.1f} points, McNemar p = {paired['p']:.2g})"
+    )
+    if points > 0 and paired["p"] < 0.01:
+        return f"gain: {head}"
+    return f"no gain: {head}. {_why(result, points, imagined)}"
+
+
+def _why(result: Mapping[str, Any], points: float, imagined: float) -> str:
+    """What the figures say of why true success did not rise by enough."""
+    gap = result["rounds"][-1]["gap"] if result["rounds"] else float("nan")
+    if min(points, imagined) > 0 and imagined - points < 5:
+        return (
+            f"true success rose as imagined success did ({imagined:+.0f} points), but too little to tell from"
+            " chance; give RL more iterations (rounds.iterations) or evaluate on more episodes"
+        )
+    if imagined > 5:
+        return (
+            f"imagined success rose by {imagined:.0f} points and true success did not follow: the policy exploits"
+            f" the simulator (gap in the last round {100 * gap:+.0f} points); deploy more episodes per round"
+        )
+    if imagined > -2 and result["alarms"]:
+        return f"RL did not improve even imagined success; {result['alarms'][0]}"
+    return (
+        f"RL moved imagined success by {imagined:+.0f} points only; give it more iterations (rounds.iterations)"
+        " or a higher rl.lr"
+    )
+
+
+def _physics(inputs: Inputs) -> dict[str, Any]:
+    """True success before and after, and their paired test; None without physics."""
+    if "physics_before" not in inputs.found:
+        return {"physics_before": None, "physics_after": None, "paired": None}
+    folders = {when: inputs.folder(f"physics_{when}") for when in ("before", "after")}
+    entries = {
+        f"physics_{when}": {key: result_of(folder)[key] for key in _ENTRY} for when, folder in folders.items()
+    }
+    return {**entries, "paired": mcnemar(outcomes(folders["before"]), outcomes(folders["after"]))}
+
+
+def _class_name(section: Mapping[str, Any]) -> str:
+    """The class that a config section chooses, without its module."""
+    return str(section.get("_target_", "")).rpartition(".")[2]

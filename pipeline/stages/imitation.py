@@ -1,0 +1,60 @@
+"""Stages that clone: the first policy from demonstrations, and deployed policies from what worked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from actors.factory import build_policy, build_simulator, prepare_process
+from learners.stages.generated import generated_frames
+from learners.stages.imitation import Cloning, train_imitation
+from pipeline.artefact import save_weights
+from pipeline.stage import Inputs, Place, stage
+from pipeline.stages.given import (
+    POLICY,
+    WORLD,
+    Cfg,
+    demonstrations,
+    fit_options,
+    learning_episodes,
+    mode_of,
+    open_store,
+    successful_episodes,
+)
+
+
+@stage(reads=(*POLICY, "imitation", "microbatches"), place=Place.LEARNERS)
+def imitation(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """Behaviour cloning of demonstrations (imitation.sources, imitation.demos)."""
+    store = open_store(cfg, inputs)
+    demos = demonstrations(cfg, store)
+    prepare_process(cfg["seed"])
+    policy = build_policy(cfg)
+    fit = fit_options(cfg, cfg["imitation"]["fit"], "imitation.fit")
+    stats = train_imitation(Cloning(policy, store, demos, mode_of(cfg)), fit, folder)
+    save_weights(policy, folder)
+    return {**stats, "demos": len(demos)}
+
+
+@stage(reads=(*WORLD, "policy", "imitation", "clone", "microbatches"), place=Place.LEARNERS)
+def clone(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """The deployed policy, perception and all, learns from what worked in physics, and to see generated
+    pictures as it sees true ones.
+
+    Settings: number of the round.
+    """
+    store, section = open_store(cfg, inputs), cfg["clone"]
+    prepare_process(cfg["seed"])
+    policy = build_policy(cfg, inputs.weights("policy"))
+    episodes = successful_episodes(cfg, store, inputs.settings["number"])
+    own = store.select(["policy-*"])
+    own = own[torch.isin(own, learning_episodes(store))].flip(0)[: section["imagined"]]  # the newest first
+    simulator = build_simulator(cfg, inputs.weights("simulator"))
+    made = generated_frames(simulator, store, own, cfg["simulator"]["bf16"])
+    fit = fit_options(cfg, section["fit"], "clone.fit")
+    cloning = Cloning(policy, store, episodes, mode_of(cfg), made)
+    stats = train_imitation(cloning, fit, folder, fresh=False)
+    save_weights(policy, folder)
+    return {**stats, "episodes": len(episodes), "generated_frames": len(made)}

@@ -1,0 +1,124 @@
+"""Stages that prove: imagined against true success, policies in physics, the world on held-out episodes."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from actors.factory import (
+    build_judge,
+    build_physics,
+    build_policy,
+    build_simulator,
+    build_state_decoder,
+    prepare_process,
+)
+from actors.rollouts.evaluate import evaluate
+from envs.simulators.replay import replay
+from pipeline.evaluation import measurement
+from pipeline.evaluation.judging import episode_success, judge_table
+from pipeline.evaluation.statistics import rate_entry
+from pipeline.stage import Inputs, Place, stage
+from pipeline.stages.given import PHYSICS, WORLD, Cfg, load_world, open_store
+from pipeline.stages.seeds import Purpose, episode_seeds
+
+_SIDE_BY_SIDE = 64  # imagined episodes
+
+
+@stage(reads=(*WORLD, "policy", "measure"), place=Place.EVALUATOR)
+def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """How far imagination and truth lie apart for the policy just deployed: same starts, same stochastic
+    policy.
+
+    Settings: number of the round.
+    """
+    number = inputs.settings["number"]
+    store = open_store(cfg, inputs)
+    mine = store.select([f"policy-{number}"])[: cfg["measure"]["starts"]]
+    prepare_process(cfg["seed"])
+    policy = build_policy(cfg, inputs.weights("policy"))
+    truth = episode_success(store, mine)
+    world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(mine)), mine)
+    seeds = list(range(len(mine)))
+    outcome = evaluate(world, policy, seeds, stochastic=True, label="gap", sampling_seed=cfg["seed"])
+    imagined = outcome.success[outcome.judged]
+    result = {
+        "round": number,
+        "true": rate_entry(truth),
+        "imagined": rate_entry(imagined),
+        "gap": float(imagined.float().mean() - truth.float().mean()),
+    }
+    held = store.split("held_out")
+    held = held[torch.isin(held, store.select(["policy-*"]))]
+    if len(held):
+        made = replay(world.base_env.simulator, store, held, bf16=cfg["simulator"]["bf16"])
+        judge = build_judge(cfg, inputs.weights("judge"))
+        result["replayed"] = judge_table(judge, made.frames, made.valid, store, held)
+    return result
+
+
+@stage(reads=(*PHYSICS, "evaluate"), place=Place.EVALUATOR)
+def evaluate_physics(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """Deterministic success in physics on the evaluation seeds."""
+    section = cfg["evaluate"]
+    policy = build_policy(cfg, inputs.weights("policy"))
+    env = build_physics(cfg, section["envs"])
+    began = time.perf_counter()
+    try:
+        seeds = episode_seeds(cfg["seed"], Purpose.EVALUATE, section["episodes"])
+        outcome = evaluate(env, policy, seeds, label="physics")
+    finally:
+        env.close()
+    torch.save({"success": outcome.success, "progress": outcome.progress}, folder / "outcomes.pt")
+    return {
+        "rate": outcome.rate,
+        **rate_entry(outcome.success),
+        "progress": float(outcome.progress.mean()),
+        "evaluation_seconds": time.perf_counter() - began,
+    }
+
+
+@stage(reads=(*WORLD, "policy", "evaluate"), place=Place.EVALUATOR)
+def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """Deterministic success in the last imagined world, of the policies in the roles before and after, from
+    the starts of held-out episodes first.
+    """
+    store = open_store(cfg, inputs)
+    held = store.split("held_out")
+    others = torch.arange(len(store))
+    starts = torch.cat((held, others[~torch.isin(others, held)]))[: cfg["evaluate"]["imagined"]]
+    world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(starts)), starts)
+    out: dict[str, Any] = {}
+    for label in ("before", "after"):
+        policy = build_policy(cfg, inputs.weights(label))
+        outcome = evaluate(world, policy, list(range(len(starts))), label=f"imagined {label}")
+        out[label] = {**rate_entry(outcome.success[outcome.judged]), "dropped": int((~outcome.judged).sum())}
+    return out
+
+
+@stage(reads=(*WORLD, "measure"), place=Place.EVALUATOR)
+def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """Rollout error, state error, speed and the judge's tables on held-out episodes of every source."""
+    prepare_process(cfg["seed"])
+    simulator = build_simulator(cfg, inputs.weights("simulator"))
+    decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
+    judge = build_judge(cfg, inputs.weights("judge"))
+    store = open_store(cfg, inputs)
+    result: dict[str, Any] = {"rollout": {}, "judge": {}}
+    for name, episodes in measurement.groups(store, store.split("held_out")).items():
+        made = replay(simulator, store, episodes, decoder, bf16=cfg["simulator"]["bf16"])
+        result["rollout"][name] = measurement.rollout_error(store, episodes, made)
+        real = store.frames(made.rows)
+        tables = {
+            "recorded": judge_table(judge, real, made.valid, store, episodes),
+            "generated": judge_table(judge, made.frames, made.valid, store, episodes),
+        }
+        if all(tables.values()):
+            result["judge"][name] = tables
+    result["frames_per_second"] = {
+        f"batch {n}": measurement.speed(simulator, store, n, cfg["measure"]["speed_chunks"]) for n in (1, 32)
+    }
+    return result

@@ -1,0 +1,99 @@
+"""Stages of reinforcement learning: in the imagined world, and in physics for comparison."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from actors.factory import build_algorithm, build_policy, prepare_process
+from actors.fleets.launch import build_fleet
+from actors.rollouts.recipe import Recipe
+from learners.rl.loop import train_rl
+from learners.stages.imitation import Cloning
+from learners.training.parallel import leads
+from pipeline.artefact import save_weights
+from pipeline.stage import Inputs, Place, stage
+from pipeline.stages.given import (
+    PHYSICS,
+    WORLD,
+    Cfg,
+    datasets,
+    mode_of,
+    open_store,
+    rl_options,
+    successful_episodes,
+)
+from pipeline.stages.seeds import Purpose, episode_seeds
+
+LEARNING = ("policy", "algorithm", "rl", "imitation", "microbatches")
+
+
+@stage(reads=(*WORLD, *LEARNING), place=Place.LEARNERS)
+def rl(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """Reinforcement learning inside the simulator.
+
+    Settings: number of the round, iterations; deployed, the round whose true successes anchor the policy (0:
+    demonstrations alone).
+    """
+    number, deployed = inputs.settings["number"], inputs.settings["deployed"]
+    prepare_process(cfg["seed"])
+    store = open_store(cfg, inputs)
+    policy = build_policy(cfg, inputs.weights("policy"))
+    settings = rl_options(cfg, iterations=inputs.settings["iterations"], seed=cfg["seed"] * 100 + number)
+    anchor = Cloning(policy, store, successful_episodes(cfg, store, deployed), mode_of(cfg))
+    if settings.freeze_perception:
+        policy.freeze_perception()
+        anchor.encode()
+    algorithm = build_algorithm(cfg, policy)
+    recipe = Recipe(
+        config=cfg.plain(),
+        episodes=settings.envs // settings.shards,
+        policy=str(inputs.weights("policy")),
+        simulator=str(inputs.weights("simulator")),
+        decoder=str(inputs.weights("state")),
+        judge=str(inputs.weights("judge")),
+        data=tuple(str(path) for path in datasets(inputs.folders("data"))),
+        freeze_perception=settings.freeze_perception,
+        bootstrap=algorithm.bootstraps,
+        later=settings.rewards_later,
+    )
+    fleet = build_fleet(recipe) if leads() else None
+    try:
+        stats = train_rl(fleet, policy, algorithm, settings, folder, starts=len(store), anchor=anchor)
+    finally:
+        if fleet is not None:
+            fleet.close()
+    save_weights(policy, folder)
+    last = {f"last_{key}": value for key, value in stats.pop("last").items()}
+    return {**stats, **last}
+
+
+@stage(reads=(*PHYSICS, *LEARNING))
+def rl_in_physics(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """The same reinforcement learning in physics, from the same policy: the control of learning in imagination.
+
+    Settings: iterations, envs.
+    """
+    prepare_process(cfg["seed"])
+    envs, iterations = inputs.settings["envs"], inputs.settings["iterations"]
+    policy = build_policy(cfg, inputs.weights("policy"))
+    settings = rl_options(cfg, envs=envs, iterations=iterations, anchor=0.0, seed=cfg["seed"] * 100)
+    if settings.freeze_perception:
+        policy.freeze_perception()
+    algorithm = build_algorithm(cfg, policy)
+    recipe = Recipe(
+        config=cfg.plain(),
+        episodes=envs // settings.shards,
+        policy=str(inputs.weights("policy")),
+        freeze_perception=settings.freeze_perception,
+        bootstrap=algorithm.bootstraps,
+    )
+    pool = episode_seeds(cfg["seed"], Purpose.PRACTICE, 4 * envs * iterations)
+    fleet = build_fleet(recipe)
+    try:
+        stats = train_rl(fleet, policy, algorithm, settings, folder, name="rl", seed_pool=pool)
+    finally:
+        fleet.close()
+    save_weights(policy, folder)
+    stats.pop("last")
+    return dict(stats)

@@ -1,0 +1,136 @@
+"""Stages that make the imagined world: the simulator, its tokenizer, its state expert, and the judge."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from actors.factory import build_judge, build_simulator, build_state_decoder, prepare_process
+from envs.episodes.clips import ClipStore
+from envs.targets import ConfigError, options
+from learners.stages.generated import generated_frames
+from learners.stages.judge import calibrate, judge_recordings, train_judge
+from learners.stages.simulator import SimulatorFitConfig, train_simulator
+from learners.stages.state import train_state
+from learners.stages.tokenizer import train_tokenizer
+from pipeline.artefact import save_weights
+from pipeline.evaluation.judging import episode_success, labelled
+from pipeline.stage import Inputs, Place, stage
+from pipeline.stages.given import (
+    WORLD,
+    Cfg,
+    fit_options,
+    learning_episodes,
+    learns,
+    newest_episodes,
+    open_store,
+)
+
+SIMULATOR = ("seed", "task", "simulator", "microbatches")
+
+
+@stage(reads=(*SIMULATOR, "tokenizer_fit"), place=Place.LEARNERS)
+def tokenizer(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """The video autoencoder of a simulator that works on latents."""
+    store = open_store(cfg, inputs)
+    prepare_process(cfg["seed"])
+    model = build_simulator(cfg)
+    fit = fit_options(cfg, cfg["tokenizer_fit"], "tokenizer_fit")
+    stats = train_tokenizer(model, store, learning_episodes(store), fit, folder)
+    save_weights(model, folder)
+    return stats
+
+
+@stage(reads=(*SIMULATOR, "simulator_fit.{phase}"), place=Place.LEARNERS)
+def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """The simulator, going on from the role `warm` (its tokenizer or its predecessor) if there is one.
+
+    Settings: phase, first or refresh.
+    """
+    phase = inputs.settings["phase"]
+    section = dict(cfg["simulator_fit"][phase])
+    fit = fit_options(cfg, section.pop("fit"), f"simulator_fit.{phase}.fit")
+    how = options(SimulatorFitConfig, section, f"simulator_fit.{phase}")
+    store = open_store(cfg, inputs)
+    episodes = learning_episodes(store)
+    prepare_process(cfg["seed"])
+    model = build_simulator(cfg, inputs.weights("warm"))
+    stats = (
+        train_simulator(
+            *(model, store, episodes, how, fit, folder),
+            newest=newest_episodes(store, episodes),
+            fresh=phase == "first",
+        )
+        if learns(model)
+        else {}
+    )
+    save_weights(model, folder)
+    return {**stats, "parameters": sum(p.numel() for p in model.parameters())}
+
+
+@stage(reads=(*SIMULATOR, "state_fit.{phase}"), place=Place.LEARNERS)
+def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """The state expert on the frozen simulator.
+
+    Settings: phase, first or refresh.
+    """
+    phase = inputs.settings["phase"]
+    store = open_store(cfg, inputs)
+    prepare_process(cfg["seed"])
+    model = build_simulator(cfg, inputs.weights("simulator"))
+    decoder = build_state_decoder(cfg, model, inputs.weights("warm"))
+    section = cfg["state_fit"][phase]
+    fit = fit_options(cfg, section["fit"], f"state_fit.{phase}.fit")
+    episodes, how = learning_episodes(store), {"lora": section["lora"], "fresh": phase == "first"}
+    stats = train_state(decoder, model, store, episodes, fit, folder, **how) if learns(decoder) else {}
+    save_weights(decoder, folder)
+    return stats
+
+
+@stage(reads=(*WORLD, "judge_fit.{phase}", "microbatches"), place=Place.LEARNERS)
+def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """The judge on recorded and on generated frames; its threshold on recorded video that no judge learns
+    from. A judge without weights is only calibrated.
+
+    Settings: phase, first or refresh.
+    """
+    phase = inputs.settings["phase"]
+    section = cfg["judge_fit"][phase]
+    store = open_store(cfg, inputs)
+    prepare_process(cfg["seed"])
+    model = build_judge(cfg, inputs.weights("warm"))
+    stats: dict[str, Any] = {}
+    if learns(model):
+        train = labelled(store, store.split("train"))
+        if not len(train):
+            raise ConfigError(
+                f"judge={cfg['judge']['_target_']} learns from success, which no training episode of the data"
+                " says; record next.success, or choose a judge that needs none (judge=...)"
+            )
+        shuffled = torch.randperm(len(train), generator=torch.Generator().manual_seed(cfg["seed"]))
+        pick = train[shuffled[: section["imagined"]]]
+        world = build_simulator(cfg, inputs.weights("simulator"))
+        generated = generated_frames(world, store, pick, cfg["simulator"]["bf16"])
+        fit = fit_options(cfg, section["fit"], f"judge_fit.{phase}.fit")
+        stats = dict(train_judge(model, store, train, fit, folder, generated))
+        stats["generated_frames"] = len(generated)
+    _calibrate(model, store)
+    save_weights(model, folder)
+    return {**stats, "threshold": float(model.threshold)}
+
+
+def _calibrate(model: Any, store: ClipStore) -> None:
+    """Set the judge's threshold on the calibration split, where its scores tell success."""
+    unseen = labelled(store, store.split("calibration"))
+    if not len(unseen):
+        return
+    score = judge_recordings(model, store, unseen)
+    succeeded = episode_success(store, unseen)
+    if not calibrate(model, score, succeeded):
+        tqdm.write(
+            f"judge: {int(succeeded.sum())} of {len(succeeded)} calibration episodes succeeded, and its scores"
+            f" do not tell which; threshold left at {float(model.threshold):.3f}"
+        )
