@@ -128,7 +128,8 @@ class Embodiment:
         for camera in self.cameras:
             if camera.wrist is not None and camera.wrist not in known:
                 raise EmbodimentError(
-                    f"{self.robot}: camera {camera.name} is on the wrist of {camera.wrist!r}, arms are {known}"
+                    f"{self.robot}: camera {camera.name} is on the wrist of {camera.wrist!r};"
+                    f" arms are {known}"
                 )
         for arm in self.arms:
             used = [*arm.numbers, *([] if arm.gripper is None else [arm.gripper])]
@@ -222,8 +223,8 @@ class Embodiment:
             missing.append(f"{IMAGE_PREFIX}*")
         if missing:
             raise EmbodimentError(
-                f"features {missing} are missing from info.json, which has {sorted(features)}; Worldloop needs"
-                " images, action and observation.state"
+                f"features {missing} are missing from info.json, which has {sorted(features)};"
+                " Worldloop needs images, action and observation.state"
             )
         own = (features["action"].get("info") or {}).get(INFO_KEY, {})
         action, state = (feature_names(features[name]) for name in ("action", "observation.state"))
@@ -307,7 +308,7 @@ def feature_names(feature: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def guess_action(names: tuple[str, ...]) -> tuple[ActionKind, bool]:
-    """Kind of an action and whether it is a change, as far as its names tell; what they do not tell is OTHER."""
+    """Kind of an action and whether it is a change, as far as its names tell; OTHER where they do not."""
     words = [name.lower() for name in names]
     delta = any("delta" in word for word in words)
     tails = {word.replace("delta", "").split(".")[-1].split("_")[-1] for word in words}
@@ -321,7 +322,7 @@ def guess_action(names: tuple[str, ...]) -> tuple[ActionKind, bool]:
 
 def _image_size(feature: Mapping[str, Any]) -> tuple[int, int]:
     """(height, width) of an image feature, whose shape may be [H, W, C] or [C, H, W]; `names` says which."""
-    shape, names = list(feature["shape"]), feature.get("names")
+    shape, names = list(feature["shape"]), list(feature.get("names") or ())
     named = bool(names) and str(names[0]) in ("channel", "channels", "c")
     if named or (not names and shape[0] in (1, 3) and shape[-1] not in (1, 3)):
         return shape[1], shape[2]

@@ -159,7 +159,7 @@ def _load(folder: Path, place: Path) -> CachedSet:
     )
 
 
-def _reserve(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+def _reserve(path: Path, shape: tuple[int, ...]) -> np.memmap[Any, np.dtype[np.uint8]]:
     """A writable memory map of a new .npy file whose room on disk is certain: a full disk would otherwise end
     the process with a bus error in the middle of writing.
     """
@@ -171,8 +171,8 @@ def _reserve(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     except OSError as error:
         raise OSError(
             error.errno,
-            f"a cache of {size / 1e9:.2f} GB does not fit at {path.parent}: {error.strerror}; make room, or name"
-            " another folder in $WORLDLOOP_CACHE",
+            f"a cache of {size / 1e9:.2f} GB does not fit at {path.parent}: {error.strerror}; make room, or"
+            " name another folder in $WORLDLOOP_CACHE",
             str(path),
         ) from error
     return np.lib.format.open_memmap(path, "r+")

@@ -160,7 +160,8 @@ class Episode:
 
         Args:
             track: with `rows` (lists by name: frames, commands, states, success, and where the bench knows
-                them c2w, poses, reward and `privileged`, a dictionary of lists), seed, instruction, intrinsic.
+                them c2w, poses, reward and `privileged`, a dictionary of lists), seed, instruction,
+                intrinsic.
             source: who acted.
             embodiment: the bench's robot.
         """
@@ -168,9 +169,8 @@ class Episode:
         privileged = rows.pop("privileged", None) or getattr(track, "privileged", None) or {}
 
         def stacked(name: str, kind: Any) -> Any:
-            values = rows.get(name)
-            known = values is not None and len(values) > 0 and values[0] is not None
-            return np.stack(values).astype(kind) if known else None
+            values = rows.get(name) or [None]
+            return None if values[0] is None else np.stack(values).astype(kind)
 
         intrinsic = getattr(track, "intrinsic", None)
         frames = np.stack(rows["frames"])

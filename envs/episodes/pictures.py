@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 
 def resize_picture(picture: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """A picture uint8 [H, W, 3] at another (height, width): averaged when smaller, interpolated when larger."""
+    """A picture uint8 [H, W, 3] at another (height, width): averaged if smaller, interpolated if larger."""
     if picture.shape[:2] == tuple(size):
         return picture
     shrinks = size[0] * size[1] < picture.shape[0] * picture.shape[1]
@@ -19,7 +19,7 @@ def resize_picture(picture: NDArray[np.uint8], size: tuple[int, int]) -> NDArray
 def resize_frames(
     frames: NDArray[np.uint8], size: tuple[int, int], present: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
-    """Frames uint8 [T, V, 3, H, W] at another (height, width); those that are not `present` [T] stay black."""
+    """Frames uint8 [T, V, 3, H, W] at another (height, width); those not `present` [T] stay black."""
     out = np.zeros((*frames.shape[:3], *size), np.uint8)
     for t in np.flatnonzero(present):
         for v in range(frames.shape[1]):
@@ -30,5 +30,5 @@ def resize_frames(
 def resize_intrinsics(
     intrinsic: NDArray[np.float32], old: tuple[int, int], new: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """Intrinsics [..., 3, 3] of pictures brought from one (height, width) to another; pixel centres at +0.5."""
+    """Intrinsics [..., 3, 3] of pictures brought from one (height, width) to another; centres at +0.5."""
     return intrinsic * np.array([[new[1] / old[1]], [new[0] / old[0]], [1.0]], np.float32)

@@ -129,7 +129,8 @@ def _decode(path: Path, start: float, slack: float = 0.0) -> Iterator[tuple[floa
                 first = False
                 if time < start - slack:
                     continue
-                yield time, convert.reformat(frame, format="rgb24").to_ndarray()
+                picture = convert.reformat(frame, format="rgb24").to_ndarray()
+                yield time, np.asarray(picture, np.uint8)
     except (av.error.FFmpegError, OSError, IndexError) as error:
         raise EpisodeError(
             f"{path}: not a readable video ({error}); restore the file or collect its episodes again"

@@ -1,8 +1,8 @@
 """Reads any LeRobot v3.0 data set, whoever wrote it.
 
-Pictures, `action` and `observation.state` are needed; success, reward, calibration and all else are read where
-they are there (lerobot_columns.py). Files are found as LeRobot finds them: by the path templates of info.json
-and the file indices and timestamps of meta/episodes, so episodes may share files in any way.
+Pictures, `action` and `observation.state` are needed; success, reward, calibration and all else are read
+where they are there (lerobot_columns.py). Files are found as LeRobot finds them: by the path templates of
+info.json and the file indices and timestamps of meta/episodes, so episodes may share files in any way.
 """
 
 from __future__ import annotations
@@ -59,15 +59,14 @@ class LeRobotDataset:
         self.info = read_info(self.root)
         self.features: dict[str, dict[str, Any]] = self.info["features"]
         try:
-            recorded = _known_cameras(Embodiment.from_info(self.info), self.features)
-            if embodiment is not None:
-                recorded = _agreed(recorded, embodiment, self.features["action"])
+            recorded = agreed_robot(self.info, embodiment)
         except (EmbodimentError, KeyError, ValueError, TypeError) as error:
             raise EpisodeError(f"{self.root / 'meta/info.json'}: {error}") from error
         sizes = {camera.name: camera.size for camera in recorded.cameras}
         if size is None and len(set(sizes.values())) > 1:
             raise EpisodeError(
-                f"{self.root}: cameras record pictures of different sizes {sizes}; give one size to bring them to"
+                f"{self.root}: cameras record pictures of different sizes {sizes}; give one size to"
+                " bring them to"
             )
         self.recorded = recorded
         self.size: tuple[int, int] = size or next(iter(sizes.values()))
@@ -149,7 +148,7 @@ class LeRobotDataset:
         return table, path
 
     def _format(self, template: str, row: dict[str, Any], prefix: str, **keys: str) -> str:
-        path = self.info.get(template) or getattr(names, template.upper())
+        path: str = self.info.get(template) or getattr(names, template.upper())
         return str(
             path.format(
                 chunk_index=int(row[f"{prefix}/chunk_index"]),
@@ -232,8 +231,9 @@ class LeRobotDataset:
         return known
 
     def _shape(self, name: str) -> list[int]:
-        feature = self.features.get(name, {})
-        return (feature.get("info") or {}).get(INFO_KEY, {}).get("shape", [-1])
+        about: dict[str, Any] = self.features.get(name, {}).get("info") or {}
+        shape: list[int] = about.get(INFO_KEY, {}).get("shape", [-1])
+        return shape
 
     def _instruction(self, row: dict[str, Any], table: pa.Table) -> str:
         tasks = row.get("tasks")
@@ -272,9 +272,38 @@ class LeRobotDataset:
         return np.asarray(picture, np.uint8)
 
 
+def agreed_robot(info: dict[str, Any], given: Embodiment | None = None) -> Embodiment:
+    """The robot of a data set, as its info.json and the reader's own knowledge say together.
+
+    A data set with our description must agree in all that numbers mean; of another one, names that it lacks
+    and what its actions are is taken from the given robot.
+
+    Raises:
+        EmbodimentError: if they contradict each other.
+    """
+    recorded = _known_cameras(Embodiment.from_info(info), info["features"])
+    if given is None:
+        return recorded
+    known = recorded
+    if INFO_KEY not in (info["features"]["action"].get("info") or {}):
+        known = replace(recorded, action_kind=given.action_kind, delta=given.delta)
+        for field in ("action_names", "state_names"):
+            unnamed = tuple(str(k) for k in range(len(getattr(recorded, field))))
+            if getattr(recorded, field) == unnamed and len(getattr(given, field)) == len(unnamed):
+                known = replace(known, **{field: getattr(given, field)})
+    other = given.differs(known)
+    if other:
+        raise EmbodimentError(f"the data are of another robot: {other}")
+    cameras = tuple(
+        replace(mine, size=theirs.size, calibrated=mine.calibrated and theirs.calibrated)
+        for mine, theirs in zip(given.cameras, recorded.cameras, strict=True)
+    )
+    return replace(given, cameras=cameras)
+
+
 def _known_cameras(robot: Embodiment, features: dict[str, Any]) -> Embodiment:
-    """The robot whose cameras are calibrated as far as columns say: LeRobot's tools may have removed them, and
-    a data set without our description may have poses of every camera.
+    """The robot whose cameras are calibrated as far as columns say: LeRobot's tools may have removed them,
+    and a data set without our description may have poses of every camera.
     """
     if names.C2W not in features or names.INTRINSIC not in features:
         cameras = tuple(replace(camera, calibrated=False) for camera in robot.cameras)
@@ -289,29 +318,6 @@ def _known_cameras(robot: Embodiment, features: dict[str, Any]) -> Embodiment:
         f"{names.C2W} holds poses of {count} cameras, but {len(calibrated(robot))} of {list(robot.views)} are"
         " calibrated; correct features.action.info.worldloop, or remove the column"
     )
-
-
-def _agreed(recorded: Embodiment, given: Embodiment, action: dict[str, Any]) -> Embodiment:
-    """The given robot with the recorded cameras' sizes, if it fits what was recorded.
-
-    A data set with our description must agree in all that numbers mean; of another one, names that it lacks
-    and what its actions are is taken from the given robot.
-    """
-    known = recorded
-    if INFO_KEY not in (action.get("info") or {}):
-        known = replace(recorded, action_kind=given.action_kind, delta=given.delta, arms=given.arms)
-        for field in ("action_names", "state_names"):
-            unnamed = tuple(str(k) for k in range(len(getattr(recorded, field))))
-            if getattr(recorded, field) == unnamed and len(getattr(given, field)) == len(unnamed):
-                known = replace(known, **{field: getattr(given, field)})
-    other = given.differs(known)
-    if other:
-        raise EmbodimentError(f"the data are of another robot: {other}")
-    cameras = tuple(
-        replace(mine, size=theirs.size, calibrated=mine.calibrated and theirs.calibrated)
-        for mine, theirs in zip(given.cameras, recorded.cameras, strict=True)
-    )
-    return replace(given, cameras=cameras)
 
 
 def _first_command(robot: Embodiment, action: NDArray[Any], states: NDArray[Any]) -> NDArray[Any]:
@@ -370,8 +376,8 @@ def read_info(root: Path) -> dict[str, Any]:
         ) from error
     if info.get("codebase_version") != VERSION:
         raise EpisodeError(
-            f"{path}: codebase_version {info.get('codebase_version')} is not {VERSION}; convert the data set with"
-            " LeRobot's own tools first"
+            f"{path}: codebase_version {info.get('codebase_version')} is not {VERSION}; convert the data set"
+            " with LeRobot's own tools first"
         )
     missing = [key for key in ("features", "fps") if key not in info]
     if missing:

@@ -1,9 +1,9 @@
 """Which columns of a LeRobot data set hold what of an Episode.
 
-LeRobot's own: action, observation.state, observation.images.*, next.success, next.reward, next.done, timestamp
-and the indices. Ours, each of which may be missing: command, calibration.c2w, calibration.intrinsic,
-end_effector.command, present, source, seed, privileged.*. None of ours begins with "observation" or "action",
-which LeRobot would show to policies.
+LeRobot's own: action, observation.state, observation.images.*, next.success, next.reward, next.done,
+timestamp and the indices. Ours, each of which may be missing: command, calibration.c2w,
+calibration.intrinsic, end_effector.command, present, source, seed, privileged.*. None of ours begins with
+"observation" or "action", which LeRobot would show to policies.
 """
 
 from __future__ import annotations

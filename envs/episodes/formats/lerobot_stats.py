@@ -1,7 +1,7 @@
-"""Statistics of a LeRobot data set: of each episode, and of all of them together, as LeRobot's meta/stats.json.
+"""Statistics of a LeRobot data set, of each episode and of all together, as in LeRobot's meta/stats.json.
 
-Each feature has min, max, mean, std, count and the quantiles q01 q10 q50 q90 q99; pictures per channel in 0..1
-with shape [3, 1, 1].
+Each feature has min, max, mean, std, count and the quantiles q01 q10 q50 q90 q99; pictures per channel in
+0..1 with shape [3, 1, 1].
 """
 
 from __future__ import annotations

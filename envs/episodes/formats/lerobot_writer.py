@@ -1,9 +1,10 @@
 """Writes LeRobot v3.0 data sets shard by shard, so that nothing finished is lost.
 
-A shard is one data file, one video per camera and one episodes file, all with a file index that nothing in the
-data set has yet. A journal names the files of the shard that is being written; the episodes file comes last and
-by rename, so a shard without it does not exist, and its files, which are ours, are removed when writing goes
-on. No other file is touched but info.json, stats.json and tasks.parquet, which describe the whole.
+A shard is one data file, one video per camera and one episodes file, all with a file index that nothing in
+the data set has yet. A journal names the files of the shard that is being written; the episodes file comes
+last and by rename, so a shard without it does not exist, and its files, which are ours, are removed when
+writing goes on. No other file is touched but info.json, stats.json and tasks.parquet, which describe the
+whole.
 """
 
 from __future__ import annotations
@@ -19,11 +20,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from envs.embodiment import IMAGE_PREFIX, Embodiment
+from envs.embodiment import IMAGE_PREFIX, Embodiment, EmbodimentError
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.files import write_atomically
 from envs.episodes.formats import lerobot_columns as names
-from envs.episodes.formats.lerobot import open_parquet, read_episode_rows, read_info, read_tasks
+from envs.episodes.formats.lerobot import (
+    agreed_robot,
+    open_parquet,
+    read_episode_rows,
+    read_info,
+    read_tasks,
+)
 from envs.episodes.formats.lerobot_columns import (
     CHUNK_FILES,
     DATA_PATH,
@@ -60,14 +67,15 @@ class LeRobotWriter:
         if not (self.root / "meta/info.json").exists():
             return
         info = read_info(self.root)
-        other = Embodiment.from_info(info).differs(embodiment)
-        if other:
-            raise EpisodeError(f"{root} holds episodes of another robot: {other}. Choose another folder.")
+        try:
+            agreed_robot(info, embodiment)
+        except EmbodimentError as error:
+            raise EpisodeError(f"{root}: {error}. Choose another folder.") from error
         for key, kind in (("data_path", DATA_PATH), ("video_path", VIDEO_PATH)):
             if info.get(key) != kind:
                 raise EpisodeError(
-                    f"{root}: info.json says {key}={info.get(key)!r}; Worldloop writes {kind!r} and appends to"
-                    " nothing else. Choose another folder."
+                    f"{root}: info.json says {key}={info.get(key)!r}; Worldloop writes {kind!r} and"
+                    " appends to nothing else. Choose another folder."
                 )
         self._finish_journal()
         rows = read_episode_rows(self.root)
@@ -176,7 +184,7 @@ class LeRobotWriter:
         return max(used) + 1
 
     def _finish_journal(self) -> None:
-        """Remove what an interrupted shard left: files that the journal names, if their episodes file is missing."""
+        """Remove what an interrupted shard left: the journal's files, if their episodes file is missing."""
         path = self.root / _JOURNAL
         if not path.exists():
             return
@@ -187,7 +195,7 @@ class LeRobotWriter:
         path.unlink()
 
     def _like_existing(self, table: pa.Table) -> pa.Table:
-        """The table with the columns, order and types of existing episodes files, which LeRobot reads as one."""
+        """The table with columns, order and types of existing episodes files: LeRobot reads them as one."""
         paths = sorted((self.root / "meta/episodes").glob("chunk-*/file-*.parquet"))
         if not paths:
             return table
