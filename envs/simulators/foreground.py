@@ -6,7 +6,8 @@ from torch import Tensor
 
 
 def foreground_weight(frames: Tensor, gain: float) -> Tensor:
-    """Loss weights [..., 1, H, W] that lift whatever differs from the picture's median colour, most of all in hue.
+    """Loss weights [..., 1, H, W] that lift whatever differs from the picture's median colour, most of all in
+    hue.
 
     Things to be moved cover one per cent of the pixels, arms ten: unweighted losses are won by the background
     alone, and losses that ask for any difference by the arms.

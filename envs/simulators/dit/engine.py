@@ -93,8 +93,8 @@ class Denoising:
 class DiTSimulator(LatentWorld):
     """LatentWorld at a small size.
 
-    The action vector reaches every block through adaLN, as in WPE; pose map and ray map stand beside the latents
-    where the spec asks for them.
+    The action vector reaches every block through adaLN, as in WPE; pose map and ray map stand beside the
+    latents where the spec asks for them.
 
     Args:
         spec: what it shows; sizes must be multiples of 8 * patch.

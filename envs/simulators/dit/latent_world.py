@@ -1,8 +1,8 @@
 """What every latent diffusion world shares, small or 2B: GE-Sim 2.0's way from remembered frames to a chunk.
 
-Latents of sparse memory frames and of the chunk to come stand in one sequence, beside them whatever conditioning
-the robot allows: pose map and ray map as channels, the action vector through adaLN. Memory is clean, the future
-is denoised along the flow.
+Latents of sparse memory frames and of the chunk to come stand in one sequence, beside them whatever
+conditioning the robot allows: pose map and ray map as channels, the action vector through adaLN. Memory is
+clean, the future is denoised along the flow.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ class LatentWorld(Simulator):
         net: video trunk.
         codec: video autoencoder, trained apart.
         diffusion: noise levels and sampling.
-        prompt: [1, L, D], the one text embedding of a network that reads text; the task's words never reach the
-            simulator.
+        prompt: [1, L, D], the one text embedding of a network that reads text; the task's words never reach
+            the simulator.
 
     Raises:
         ValueError: if the size does not fit.
@@ -96,8 +96,8 @@ class LatentWorld(Simulator):
     # -- what a subclass gives
     # -----------------------------------------------------------------------------------
     def conditioning(self, inputs: TensorDict, latent_hw: tuple[int, int]) -> Tensor:
-        """Channels [B, V, C, M + T', h, w] beside the latents at latent_hw = (h, w): a memory mask, and the pose
-        map and ray map that the spec asks for.
+        """Channels [B, V, C, M + T', h, w] beside the latents at latent_hw = (h, w): a memory mask, and the
+        pose map and ray map that the spec asks for.
         """
         raise NotImplementedError
 
@@ -140,8 +140,8 @@ class LatentWorld(Simulator):
         return self._denoise(inputs)[1]
 
     def layers(self, inputs: TensorDict) -> list[Tensor]:
-        """Outputs of every block of the trunk at the last step, each [B * V, tokens, width], from which a state
-        expert learns its mix.
+        """Outputs of every block of the trunk at the last step, each [B * V, tokens, width], from which a
+        state expert learns its mix.
         """
         outputs: list[Tensor] = []
         self._denoise(inputs, outputs)

@@ -1,4 +1,5 @@
-"""Layers that the video trunk and the state expert share: attention, feed-forward, norms, embeddings of levels.
+"""Layers that the video trunk and the state expert share: attention, feed-forward, norms, embeddings of
+levels.
 
 Parameter names are those of the public GE-Sim 2.0 checkpoint.
 """

@@ -1,8 +1,8 @@
 """The GE-Sim 2.0 network at any size: a multi-view Cosmos-style diffusion transformer over video latents.
 
-Parameter names are those of the public checkpoint, so that its weights load strictly. Attention stays within a
-view, except in every third block, where it spans all views. The blocks' outputs, mixed by learned scalars, are
-the features that a state expert attends to (state_network.py).
+Parameter names are those of the public checkpoint, so that its weights load strictly. Attention stays within
+a view, except in every third block, where it spans all views. The blocks' outputs, mixed by learned scalars,
+are the features that a state expert attends to (state_network.py).
 """
 
 from __future__ import annotations
@@ -187,8 +187,8 @@ class _FixedLayerNorm(nn.Module):
 
 
 class _Stem(nn.Module):
-    """Two convolutions over each latent frame, whose channels stand beside it: transformers with large patches
-    learn from few pictures more quickly with one (Xiao et al. 2021)."""
+    """Two convolutions over each latent frame, whose channels stand beside it: transformers with large
+    patches learn from few pictures more quickly with one (Xiao et al. 2021)."""
 
     def __init__(self, channels: int, width: int):
         super().__init__()

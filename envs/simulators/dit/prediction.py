@@ -1,6 +1,7 @@
 """What a latent diffusion network predicts, and the loss that fits it.
 
-Noisy latents are z = (1 - s) x + s e of data x, noise e and level s in 0..1. All tensors are [B, V, C, T', h, w].
+Noisy latents are z = (1 - s) x + s e of data x, noise e and level s in 0..1. All tensors are [B, V, C, T', h,
+w].
 """
 
 from __future__ import annotations
@@ -35,9 +36,10 @@ class Velocity:
 class Clean:
     """The clean latents, as their change since the newest remembered frame.
 
-    Small transformers learn to predict clean frames where they fail to predict noise (JiT). The error is counted
-    in the latents themselves, not in velocities: weighted by 1 / s^2, levels near the data would decide, where a
-    sampler of few steps never is; counted so, its first step from pure noise weighs as much as any other.
+    Small transformers learn to predict clean frames where they fail to predict noise (JiT). The error is
+    counted in the latents themselves, not in velocities: weighted by 1 / s^2, levels near the data would
+    decide, where a sampler of few steps never is; counted so, its first step from pure noise weighs as much
+    as any other.
     """
 
     def velocity(self, output: Tensor, z: Tensor, level: float, base: Tensor) -> Tensor:

@@ -1,4 +1,5 @@
-"""The state expert's network of GE-Sim 2.0: tokens of commands and states, denoised along the trunk's features.
+"""The state expert's network of GE-Sim 2.0: tokens of commands and states, denoised along the trunk's
+features.
 
 Parameter names are those of the public checkpoint, in which both networks share one file.
 """
@@ -98,8 +99,8 @@ class StateDiT(nn.Module):
             states: [B, N, pose_in_channels] history and future tokens.
             timestep: [B, N] noise level of each.
             keys: of the features, from `feature_keys`.
-            mask: [B, N, pose_in_channels] of the numbers that the robot has, 1, and has not, 0; the latter are
-                neither seen nor moved.
+            mask: [B, N, pose_in_channels] of the numbers that the robot has, 1, and has not, 0; the latter
+                are neither seen nor moved.
 
         Returns:
             velocity [B, N, numbers of a state].

@@ -86,8 +86,8 @@ def load_released(path: Path, dtype: torch.dtype = torch.float32) -> Released:
 
 
 def load_state_network(path: Path) -> tuple[StateDiT, dict[str, Tensor]] | None:
-    """The state expert of a checkpoint, and the units "action" and "state", each mean and spread [2, 16]; None
-    of GE-Sim 1, which has none.
+    """The state expert of a checkpoint, and the units "action" and "state", each mean and spread [2, 16];
+    None of GE-Sim 1, which has none.
 
     Raises:
         CheckpointError: if parts are missing or do not fit.

@@ -1,4 +1,5 @@
-"""GE-Sim as released: its network, its autoencoder, its way of resizing conditioning, and on request its quirks.
+"""GE-Sim as released: its network, its autoencoder, its way of resizing conditioning, and on request its
+quirks.
 
 Version 2.0 (three views of 384 x 512 at 30 Hz, chunks of 25, joint commands, four distilled steps, a state
 expert) and version 1 (15 undistilled steps, no state expert) are this class with other weights; checkpoint.py
@@ -35,7 +36,8 @@ class Parity:
 
     Args:
         forgets_first: the first frame leaves the history after the first chunk.
-        shows_current: remembered frames stand with the pose of the chunk's first command, instead of their own.
+        shows_current: remembered frames stand with the pose of the chunk's first command, instead of their
+            own.
         thins_history: of commands and states the state expert's past holds each chunk's last frame only.
     """
 
@@ -143,9 +145,7 @@ class GESimulator(LatentWorld):
         else:
             net, codec = _from_nothing(spec, **scratch)
             prompt, sampler = torch.zeros(1, 1, net.shape.text_embed_dim), chosen.sampler(EDM(), True)
-        diffusion = Diffusion(
-            sampler, Velocity(), 1.0, options.shift, options.foreground, options.augment
-        )
+        diffusion = Diffusion(sampler, Velocity(), 1.0, options.shift, options.foreground, options.augment)
         super().__init__(spec, memory_frames, net, codec, diffusion, prompt)
         self.parity, net.checkpointing = PARITY[parity], options.checkpointing
 
@@ -207,9 +207,7 @@ def _check(checkpoint: str, shape: DiTShape, spec: WorldSpec) -> None:
         )
 
 
-def _from_nothing(
-    spec: WorldSpec, net: dict[str, Any], vae: dict[str, Any]
-) -> tuple[MultiViewDiT, WanCodec]:
+def _from_nothing(spec: WorldSpec, net: dict[str, Any], vae: dict[str, Any]) -> tuple[MultiViewDiT, WanCodec]:
     """Untrained networks of the given sizes."""
     sizes: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value for key, value in net.items()

@@ -13,7 +13,8 @@ from envs.simulators.state_experts.flow import FlowStateDecoder
 
 
 class GESimStateExpert(FlowStateDecoder):
-    """The released state expert, or an untrained one of its form where there are no weights (GE-Sim 1, or none).
+    """The released state expert, or an untrained one of its form where there are no weights (GE-Sim 1, or
+    none).
 
     Args:
         simulator: whose features it reads.

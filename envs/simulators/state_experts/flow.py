@@ -1,7 +1,7 @@
 """The DiT's state expert: joint states by flow matching on the frozen trunk's features (GE-Sim 2.0).
 
-Tokens are, in order, past and future commands, past states, and the noisy future states; the narrower of actions
-and states is padded with zeros.
+Tokens are, in order, past and future commands, past states, and the noisy future states; the narrower of
+actions and states is padded with zeros.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ _DISTURBANCE = 0.02  # noise on past states in training, in spreads: in rollouts
 class StateTokens(nn.Module):
     """Commands and states as tokens in units of the data.
 
-    Where commands are joint targets of just the numbers that states hold, both stand as they are, and states are
-    predicted as they are (GE-Sim 2.0). Elsewhere commands are moves from the command in force (deltas are moves
-    already), and states are predicted as changes since the last one.
+    Where commands are joint targets of just the numbers that states hold, both stand as they are, and states
+    are predicted as they are (GE-Sim 2.0). Elsewhere commands are moves from the command in force (deltas are
+    moves already), and states are predicted as changes since the last one.
 
     Args:
         embodiment: whose commands and states.
@@ -84,15 +84,16 @@ class StateTokens(nn.Module):
 
 
 class FlowStateDecoder(StateDecoder):
-    """Denoises the future states of a chunk among clean tokens of past and future commands and of past states.
+    """Denoises the future states of a chunk among clean tokens of past and future commands and of past
+    states.
 
     Args:
         simulator: whose features it reads.
         net: the network.
         sampler, time_scale, prediction: how its flow is followed, and what the network says.
         read_last: tokens of the trunk's, per view, that are read, the last ones; None reads all, as released.
-        every: of the history only every so many-th frame, counted from the end, is read; chunks that never were
-            are filled with the first command to come (how the released code keeps its history).
+        every: of the history only every so many-th frame, counted from the end, is read; chunks that never
+            were are filled with the first command to come (how the released code keeps its history).
     """
 
     def __init__(
@@ -117,13 +118,11 @@ class FlowStateDecoder(StateDecoder):
 
     @torch.no_grad()
     def look(self, simulator: Simulator, inputs: TensorDict) -> Tensor:
-        """See StateDecoder.look; outputs of every block of the trunk, [B, layers, V, tokens, width], as far as
-        they are read.
+        """See StateDecoder.look; outputs of every block of the trunk, [B, layers, V, tokens, width], as far
+        as they are read.
         """
         layers = cast(LatentWorld, simulator).layers(inputs)
-        return torch.stack(
-            [layer[:, self.read_tokens].unflatten(0, (-1, self.views)) for layer in layers], 1
-        )
+        return torch.stack([layer[:, self.read_tokens].unflatten(0, (-1, self.views)) for layer in layers], 1)
 
     def read(self, shown: Tensor) -> Tensor:
         """See StateDecoder.read; the mix of the trunk's blocks is the expert's own and is learned."""
@@ -174,9 +173,7 @@ class FlowStateDecoder(StateDecoder):
     def _cost(self, error: Tensor) -> Tensor:
         return error.square()
 
-    def _run(
-        self, z: Tensor, level: Tensor, tokens: Tensor, keys: list[tuple[Tensor, Tensor]]
-    ) -> Tensor:
+    def _run(self, z: Tensor, level: Tensor, tokens: Tensor, keys: list[tuple[Tensor, Tensor]]) -> Tensor:
         """The network's output [B, K, S] for noisy future states at noise level [B]."""
         levels = torch.zeros(len(z), tokens.shape[1] + self.chunk, device=z.device)
         levels[:, tokens.shape[1] :] = self.time_scale * level[:, None]
@@ -248,5 +245,3 @@ def disturb_history(past: Tensor, generator: torch.Generator) -> Tensor:
     smooth = F.interpolate(coarse, size=count, mode="linear", align_corners=True).transpose(1, 2)
     chosen = (torch.rand(batch, generator=generator) < 0.5).to(past.device)
     return torch.where(chosen[:, None, None], smooth, moved)
-
-
