@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from actors.policies.contract import VISUAL_FEATURES, imitation_loss, inputs_for
+from actors.policies.contract import VISUAL_FEATURES, imitation_loss, inputs_for, with_text
 from envs.episodes.clips import ClipStore
 from envs.specs import (
     C2W,
@@ -80,11 +80,12 @@ class Cloning:
             ]
         self._features = torch.cat(parts)
 
-    def observe(self, rows: Tensor) -> TensorDict:
+    def observe(self, rows: Tensor, pictures: bool = True) -> TensorDict:
         """What the policy would have observed at frames `rows` [N], under the keys of envs/specs.py."""
         store, owner = self.store, owners(self.store, rows)
-        out = TensorDict({}, [len(rows)])
-        out[IMAGE], out[STATE] = store.frames(rows), store.arrays["states"][rows]
+        out = TensorDict({STATE: store.arrays["states"][rows]}, [len(rows)])
+        if pictures:
+            out[IMAGE] = store.frames(rows)
         out[COMMAND], out[INSTRUCTION_UTF8] = store.arrays["commands"][rows], self._text[owner]
         if store.spec.embodiment.calibrated:
             out[INTRINSIC], out[C2W] = store.intrinsic[owner], store.arrays["c2w"][rows]
@@ -98,7 +99,7 @@ class Cloning:
             and generated [count // 2] observations.
         """
         pick = torch.randint(len(self.rows), (count,), generator=generator)
-        observed = self.observe(self.rows[pick])
+        observed = self.observe(self.rows[pick], pictures=self._features is None)
         if self._features is not None:
             observed[VISUAL_FEATURES] = self._features[pick]
         out = TensorDict({"observed": observed, "target": self.targets[pick]}, [])
@@ -118,12 +119,12 @@ class Cloning:
         state = observed[STATE]
         noise = torch.randn(state.shape, generator=generator) * self.state_noise
         observed[STATE] = state + noise.to(state.device)
-        total = imitation_loss(self.policy, inputs_for(observed, self.policy), data["target"])
+        total = imitation_loss(self.policy, with_text(observed, self.policy), data["target"])
         if "generated" not in data.keys():
             return total
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             wanted = self.policy(inputs_for(data["recorded"], self.policy))[CHUNK]
-        return total + imitation_loss(self.policy, inputs_for(data["generated"], self.policy), wanted)
+        return total + imitation_loss(self.policy, with_text(data["generated"], self.policy), wanted)
 
 
 def chunks_ahead(store: ClipStore, rows: Tensor, mode: ActionMode) -> Tensor:

@@ -173,11 +173,11 @@ def calibrate(judge: Judge, success: Tensor, succeeded: Tensor) -> bool:
         succeeded: bool [N], whether they did.
 
     Returns:
-        Whether it was set. It stays as it is where no episode succeeded, or none failed, or scores do not
-        rise with success.
+        Whether it was set. It stays as it is where no episode succeeded, or none failed, or scores are not
+        finite or do not rise with success.
     """
     hits = float(succeeded.sum())
-    if hits in (0.0, float(len(succeeded))):
+    if hits in (0.0, float(len(succeeded))) or not torch.isfinite(success).all():
         return False
     # An episode succeeds if its best run of `hold` frames lies above the threshold throughout.
     best = success.double().unfold(1, judge.hold, 1).amin(-1).amax(1)
@@ -193,7 +193,7 @@ def calibrate(judge: Judge, success: Tensor, succeeded: Tensor) -> bool:
         return float(value), [(gap * score).mean(), gap.mean()]
 
     slope, offset = minimize(misfit, [1.0, 0.0], jac=True).x
-    if not slope > 0:  # or NaN
+    if slope <= 0:
         return False
     judge.threshold.fill_(float(expit(-offset / slope).clip(0.02, 0.98)))
     return True

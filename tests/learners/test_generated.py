@@ -1,57 +1,40 @@
-"""Generated frames beside true ones: which are kept, and that policies learn to see both alike."""
+"""Generated frames lie beside the recorded ones that the same actions led to."""
 
 from __future__ import annotations
 
-from functools import partial
-from pathlib import Path
+from collections.abc import Callable
 
 import torch
-from tensordict import TensorDict
 
-from actors.policies.chunk_gaussian import ChunkGaussianHead
-from actors.policies.vla import ChunkPolicy
+from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
-from envs.simulators.unet.engine import UNetSimulator
 from learners.stages.generated import generated_frames
-from learners.stages.imitation import train_imitation
-from learners.training.fit import FitConfig
+from tests.embodiments import ARM_JOINTS, BIMANUAL_POSES
+from tests.learners.models import simulator_of
+
+Stores = Callable[[Embodiment], ClipStore]
 
 
-def test_frames_gone_astray_are_left_out(simulator: UNetSimulator, store: ClipStore) -> None:
-    every = torch.arange(3)
-    count = int((store.length[every] - 1).sum())
-    # nothing is known of places, nothing astray
-    assert len(generated_frames(simulator, store, every, bf16=False)) == count
-    simulator.places.taught.fill_(True)  # now it believes its untrained guesses, which are far off
-    kept = generated_frames(simulator, store, every, bf16=False)
-    assert len(kept) < count
-    assert kept["frames"].shape[1:] == (3, 3, 64, 64)
+def test_every_frame_but_the_first_has_its_recorded_one(tiny_store: Stores) -> None:
+    store = tiny_store(BIMANUAL_POSES)
+    some = torch.tensor([3, 1])
+    made = generated_frames(simulator_of("unet_small", store.spec), store, some, bf16=False)
+    count = int(store.length[3]) - 1
+    assert len(made) == count + int(store.length[1]) - 1
+    assert made["frames"].shape[1:] == (3, 3, *store.spec.size) and made["frames"].dtype == torch.uint8
+    assert torch.equal(made["row"][:count], int(store.start[3]) + torch.arange(1, count + 1))
+    assert made["episode"][:count].tolist() == [3] * count and made["episode"][count:].unique().tolist() == [
+        1
+    ]
 
 
-def test_cloning_brings_generated_and_true_pictures_together(
-    simulator: UNetSimulator, store: ClipStore, tmp_path: Path
-) -> None:
-    demos = torch.tensor([0, 4])
-    made = generated_frames(simulator, store, torch.arange(8), bf16=False)
-
-    def apart(generated: TensorDict | None) -> float:
-        """How differently a cloned policy acts on generated and on true pictures."""
-        torch.manual_seed(0)
-        policy = ChunkPolicy(3, partial(ChunkGaussianHead, chunk=4), width=32, points=4)
-        train_imitation(
-            policy,
-            store,
-            demos,
-            FitConfig(steps=60, batch=16, lr=3e-3, bf16=False),
-            tmp_path / str(generated is None),
-            generated=generated,
-        )
-        with torch.no_grad():
-            states = store.arrays["states"][made["row"]]
-            said = [
-                policy.head(policy.fusion(policy.perception(frames, made["tokens"]), states))[0]
-                for frames in (made["frames"], store.frames(made["row"]))
-            ]
-        return float((said[0] - said[1]).abs()[..., policy.head.gain > 0].mean())
-
-    assert apart(made) < 0.8 * apart(None)
+def test_frames_without_a_picture_and_no_episodes_at_all_are_left_out(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_JOINTS)
+    simulator = simulator_of("unet_small", store.spec)
+    present = store.arrays["present"].clone()
+    store.arrays["present"][int(store.start[2]) + 5] = False
+    made = generated_frames(simulator, store, torch.tensor([2]), bf16=False)
+    store.arrays["present"] = present
+    assert len(made) == int(store.length[2]) - 2 and int(store.start[2]) + 5 not in made["row"].tolist()
+    none = generated_frames(simulator, store, torch.zeros(0, dtype=torch.int64), bf16=False)
+    assert len(none) == 0 and none["frames"].shape[1:] == made["frames"].shape[1:]

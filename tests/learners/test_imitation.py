@@ -1,47 +1,128 @@
-"""Cloning: perception learns where objects are from frames without actions."""
+"""Cloning: the chunks that are imitated, any policy, and acting alike on recorded and generated pictures."""
 
 from __future__ import annotations
 
-from functools import partial
+import json
+from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from actors.policies.chunk_gaussian import ChunkGaussianHead
-from actors.policies.vla import ChunkPolicy
-from envs.encoders import Gaze
+from actors.policies.contract import inputs_for
+from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
-from envs.specs import TOKENS
-from learners.stages.imitation import Cloning, train_imitation
-from learners.stages.pictures import sights
+from envs.specs import C2W, CHUNK, IMAGE, INSTRUCTION_UTF8, ActionMode, bytes_to_text
+from learners.stages.generated import generated_frames
+from learners.stages.imitation import Cloning, chunks_ahead, train_imitation
 from learners.training.fit import FitConfig
+from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, EMBODIMENTS
+from tests.learners.models import POLICIES, policy_of, simulator_of
+from tests.moving_square import INSTRUCTION
+
+Stores = Callable[[Embodiment], ClipStore]
+QUICK = FitConfig(steps=40, batch=16, lr=3e-3, warmup=5, bf16=False)
 
 
-def test_policies_learn_where_objects_are_from_frames_without_actions(
-    store: ClipStore, tmp_path: Path
+def losses(folder: Path) -> list[float]:
+    return [json.loads(line)["imitation/loss"] for line in (folder / "metrics.jsonl").open()]
+
+
+def modes(robot: Embodiment) -> ActionMode:
+    return ActionMode.ABSOLUTE if robot.delta else ActionMode.RELATIVE
+
+
+@pytest.mark.parametrize("name", POLICIES)
+@pytest.mark.parametrize("robot", EMBODIMENTS.values(), ids=EMBODIMENTS)
+def test_every_policy_learns_to_imitate(
+    name: str, robot: Embodiment, tiny_store: Stores, tmp_path: Path
 ) -> None:
-    rows = store.rows(torch.arange(1, 8))
+    store = tiny_store(robot)
+    policy = policy_of(name, store.spec, modes(robot))
+    demos = store.select(["expert"], succeeded=True)
+    train_imitation(Cloning(policy, store, demos, modes(robot)), QUICK, tmp_path)
+    rows = losses(tmp_path)
+    assert sum(rows[-5:]) < 0.8 * sum(rows[:5])
 
-    def missed(watched: torch.Tensor | None) -> float:
-        torch.manual_seed(0)
-        policy = ChunkPolicy(3, partial(ChunkGaussianHead, chunk=4), width=32, points=4, channels=8, aims=2)
+
+def test_chunks_are_the_next_commands_and_hold_at_the_end(tiny_store: Stores) -> None:
+    store = tiny_store(BIMANUAL_POSES)
+    start, length, chunk = int(store.start[1]), int(store.length[1]), store.spec.chunk
+    rows = torch.tensor([start, start + length - 2])
+    commands = store.arrays["commands"]
+    absolute = chunks_ahead(store, rows, ActionMode.ABSOLUTE)
+    assert torch.equal(absolute[0], commands[start + 1 : start + 1 + chunk])
+    assert torch.equal(absolute[1], commands[start + length - 1].expand(chunk, -1))
+    relative = chunks_ahead(store, rows, ActionMode.RELATIVE)
+    assert torch.allclose(relative + commands[rows][:, None], absolute)
+
+
+def test_past_the_end_of_a_robot_that_takes_changes_only_grippers_go_on(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    store.arrays["commands"] = torch.ones_like(store.arrays["commands"])
+    row = torch.tensor([int(store.length[0]) - 2])
+    chunk = chunks_ahead(store, row, ActionMode.ABSOLUTE)[0]
+    assert chunk[0].tolist() == [1.0] * 4 and chunk[1:].tolist() == [[0.0, 0.0, 0.0, 1.0]] * (len(chunk) - 1)
+
+
+def test_what_is_observed(tiny_store: Stores) -> None:
+    store = tiny_store(BIMANUAL_POSES)
+    cloning = Cloning(policy_of("chunk_gaussian", store.spec), store, torch.arange(4), ActionMode.RELATIVE)
+    seen = cloning.observe(store.start[:2] + 3)
+    assert torch.equal(seen[IMAGE], store.frames(store.start[:2] + 3))
+    assert bytes_to_text(seen[INSTRUCTION_UTF8]) == [INSTRUCTION] * 2 and seen[C2W].shape == (2, 3, 4, 4)
+    draw = cloning.sample(4, torch.Generator().manual_seed(1))
+    same = cloning.sample(4, torch.Generator().manual_seed(1))
+    assert torch.equal(draw["target"], same["target"])
+    assert torch.equal(draw["observed", IMAGE], same["observed", IMAGE])
+
+
+def test_a_frozen_perception_encodes_each_frame_once(tiny_store: Stores) -> None:
+    store = tiny_store(BIMANUAL_POSES)
+    policy = policy_of("chunk_gaussian", store.spec)
+    policy.freeze_perception()
+    cloning = Cloning(policy, store, torch.arange(4), ActionMode.RELATIVE)
+    cloning.state_noise.zero_()
+    plain = cloning.sample(8, torch.Generator().manual_seed(0))
+    wanted = policy.imitation_loss(plain["observed"], plain["target"])
+    cloning.encode()
+    data = cloning.sample(8, torch.Generator().manual_seed(0))
+    assert IMAGE not in data["observed"].keys(True)
+    loss = cloning.loss(data, torch.Generator().manual_seed(0))
+    assert float(loss.detach()) == pytest.approx(float(wanted.detach()), rel=1e-4)
+
+
+def test_a_policy_without_features_cannot_keep_them(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    cloning = Cloning(policy_of("tiny_vla", store.spec), store, torch.arange(4), ActionMode.ABSOLUTE)
+    with pytest.raises(ValueError, match=r"rl\.freeze_perception=false"):
+        cloning.encode()
+
+
+def test_cloning_makes_a_policy_act_alike_on_generated_and_recorded_pictures(
+    tiny_store: Stores, tmp_path: Path
+) -> None:
+    store = tiny_store(ARM_DELTAS)
+    demos, mode = store.select(["expert"]), ActionMode.ABSOLUTE
+    made = generated_frames(simulator_of("unet_small", store.spec), store, torch.arange(8), bf16=False)
+    made["frames"] = 255 - store.frames(made["row"])  # what any simulator makes, only more so
+
+    def apart(policy: TensorDictModuleBase, generated: bool, name: str) -> float:
+        cloning = Cloning(policy, store, demos, mode, made if generated else None)
         train_imitation(
-            policy,
-            store,
-            torch.tensor([0]),
-            FitConfig(steps=60, batch=16, lr=5e-3, bf16=False),
-            tmp_path / str(watched is None),
-            watched=watched,
+            cloning, FitConfig(40, 16, lr=2e-3, warmup=1, bf16=False), tmp_path / name, fresh=False
         )
-        with torch.no_grad():
-            _, aimed = policy.perception.look(store.frames(rows), store.tokens[:1].expand(len(rows), -1))
-        return float(Gaze.missed(aimed, sights(store, store.arrays["objects"][rows], rows, 2))[1])
+        observed = cloning.observe(made["row"])
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            one = policy(inputs_for(observed, policy))[CHUNK]
+            observed[IMAGE] = made["frames"]
+            return float((policy(inputs_for(observed, policy))[CHUNK] - one).abs().mean())
 
-    assert missed(torch.arange(1, 8)) < 0.7 * missed(None)
+    def fresh() -> TensorDictModuleBase:
+        policy = policy_of("chunk_gaussian", store.spec, mode)
+        train_imitation(Cloning(policy, store, demos, mode), QUICK, tmp_path / "fresh")
+        return policy
 
-
-def test_a_policy_without_aims_watches_nothing(store: ClipStore) -> None:
-    policy = ChunkPolicy(3, partial(ChunkGaussianHead, chunk=4), width=32, points=4, channels=8)
-    cloning = Cloning(policy, store, torch.tensor([0]), watched=torch.arange(8))
-    drawn = cloning.sample(4, torch.Generator().manual_seed(0))
-    assert "shown" not in drawn.keys() and drawn[TOKENS].shape[0] == 4
+    assert apart(fresh(), True, "with") < 0.7 * apart(fresh(), False, "without")

@@ -1,158 +1,149 @@
-"""The judge's stage: what its key-points aim at, and data that do not say where things are."""
+"""The judge's stage: labels, balance, generated frames, calibration, and that it learns."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 import torch
-from envs.simulators.in_view import in_view
 from tensordict import TensorDict
 
-from envs.encoders import Gaze, to_signed
+from envs.embodiment import Embodiment
+from envs.episodes import LeRobotWriter
 from envs.episodes.clips import ClipStore
-from envs.judges import LearnedJudge
-from learners.stages.judge import close_calls, train_judge, unseen_by_judge
-from learners.stages.pictures import sights, survey
+from envs.judges import RuleJudge
+from learners.stages.judge import JudgeData, calibrate, frame_targets, judge_recordings, train_judge
+from learners.stages.pictures import augment
 from learners.training.fit import FitConfig
+from tests.embodiments import ARM_DELTAS, EMBODIMENTS, world_spec
+from tests.learners.models import judge_of
+from tests.moving_square import SIZE, moving_square
+
+Stores = Callable[[Embodiment], ClipStore]
 
 
-def test_sights_are_where_objects_are_drawn(store: ClipStore) -> None:
-    rows = store.start + 2
-    objects = store.arrays["objects"][rows]
-    where = sights(store, objects, rows, 2)
-    seen = in_view(objects[:, None], store.intrinsic, store.arrays["c2w"][rows][:, None], store.size)
-    assert torch.allclose(where, seen.where[:, 0, 0], atol=1e-5)
-    assert bool(torch.isnan(sights(store, objects * torch.nan, rows, 3)).all())
+@pytest.mark.parametrize("robot", EMBODIMENTS.values(), ids=EMBODIMENTS)
+def test_a_judge_learns_who_succeeded(robot: Embodiment, tiny_store: Stores, tmp_path: Path) -> None:
+    store = tiny_store(robot)
+    judge = judge_of(store.spec)
+    options = FitConfig(steps=60, batch=32, lr=3e-3, warmup=5, ema=0.9, bf16=False)
+    train_judge(judge, store, store.split("train"), options, tmp_path)
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").open()]
+    assert rows[-1]["judge/progress_error"] < 0.7 * rows[0]["judge/progress_error"]
+    unseen = torch.cat([store.split("calibration"), store.split("held_out")])
+    success = judge_recordings(judge, store, unseen)
+    right = judge.episode(success, store.whole(unseen)[1])
+    truth = torch.tensor([store.episodes[n]["success"] for n in unseen.tolist()])
+    assert float((right == truth).float().mean()) >= 0.8
 
 
-def test_a_surveyed_gaze_tells_gaps_in_metres(store: ClipStore) -> None:
-    gaze, rows = Gaze(4, 8, 2), torch.arange(len(store.arrays["success"]))
-    survey(gaze, store, rows)
-    objects = store.arrays["objects"][rows]
-    where = sights(store, objects, rows, 2)
-    known = torch.isfinite(where).flatten(1).all(1)
-    gaps = gaze.gaps_between(where[known]) / Gaze.GAIN * Gaze.SPAN
-    truth = objects[known, 0, :2] - objects[known, 1, :2]
-    # a few were toppled
-    assert known.sum() > 20 and float((gaps[:, :2] - truth).norm(dim=-1).median()) < 2e-3
-    assert torch.allclose(gaps[:, 2], gaps[:, :2].norm(dim=-1), atol=1e-6)
-    before = gaze.plane.clone()
-    gaze.survey(where * torch.nan, objects[:, :2, :2])  # of data that know nothing nothing is learned
-    assert torch.equal(gaze.plane, before)
-    blind = Gaze(4, 8, 2)
-    blind.survey(where * torch.nan, objects[:, :2, :2])
-    assert bool(gaze.surveyed.all()) and not bool(blind.surveyed.any())
+def test_batches_are_balanced_and_labelled_by_time_and_success(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    data = JudgeData(store, torch.arange(20), hold=2, discount=0.5)
+    batch = data.sample(30, torch.Generator().manual_seed(0))
+    assert float(batch["label"].sum()) == 10 and 0 < data.share < 0.5
+    assert bool((batch["progress"][batch["label"] > 0.5] == 1).all())
+    failed = JudgeData(store, store.select(succeeded=False), hold=2, discount=0.5)
+    assert not bool(failed.sample(30, torch.Generator().manual_seed(0))["progress"].any())
 
 
-def test_where_places_are_known_the_gap_alone_decides() -> None:
-    torch.manual_seed(0)
-    judge = LearnedJudge(hold=2, width=8, points=4).eval()
-    frames, words = torch.randint(0, 256, (8, 3, 3, 64, 64), dtype=torch.uint8), torch.randint(1, 20, (8, 12))
-
-    def success() -> torch.Tensor:
-        with torch.no_grad():
-            return judge(frames, frames, words)[0]
-
-    by_progress = success()
-    judge.main.surveyed.fill_(True)
-    by_gap = success()
-    with torch.no_grad():
-        pair = torch.cat((to_signed(frames)[:, 0], to_signed(frames)[:, 0]), 1)
-        gaps = judge.main(pair)[0][:, -1]
-    assert torch.equal(by_gap.argsort(), gaps.argsort(descending=True))
-    words = words.flip(0)  # it is as near whatever things are called
-    assert torch.equal(success(), by_gap)
-    judge.main.surveyed[1] = False  # of one of them nobody knows
-    assert not torch.equal(success(), by_progress)  # progress hears the words
-    words = words.flip(0)
-    assert torch.equal(success(), by_progress)
+def test_generated_frames_are_labelled_by_what_truly_happened(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    rows = store.rows(torch.arange(20))
+    made = TensorDict({"frames": torch.full_like(store.frames(rows), 7), "row": rows}, [len(rows)])
+    data = JudgeData(store, torch.arange(20), 2, 0.5, made)
+    batch = data.sample(20, torch.Generator().manual_seed(0))
+    generated = (batch["frames"] == 7).flatten(1).all(1)
+    assert generated.tolist() == [False] * 10 + [True] * 10
+    assert 0 < float(batch["label"][generated].sum()) < 10
+    assert not bool((batch["first"] == 7).flatten(1).all(1).any())
 
 
-def test_words_choose_the_two_things() -> None:
-    torch.manual_seed(0)
-    judge = LearnedJudge(hold=2, width=8, points=4, aims=3).eval()
-    judge.main.surveyed.fill_(True)
-    frames, words = (
-        torch.randint(0, 256, (6, 3, 3, 64, 64), dtype=torch.uint8),
-        torch.tensor([[1] * 12] * 3 + [[2] * 12] * 3),
-    )
-    with torch.no_grad():
-        heard = judge.words(words)[[0, 3]]
-        # one names the first pair, two the last
-        judge.pair.copy_(torch.linalg.pinv(heard) @ torch.tensor([[100.0, 0.0, 0.0], [0.0, 0.0, 100.0]]))
-        pictures = to_signed(frames)[:, 0]
-        gaps = judge.main(torch.cat((pictures, pictures), 1))[0][:, -3:]
-        logits = judge(frames, frames, words)[0]
-    chosen = torch.cat((gaps[:3, 0], gaps[3:, 2]))
-    assert torch.allclose(logits, judge.strictness.exp() * (1 - chosen), atol=1e-4)
+def test_episodes_that_nobody_labelled_teach_nothing(tmp_path: Path) -> None:
+    robot = ARM_DELTAS.at(SIZE)
+    spec = world_spec(robot, SIZE)
+    for name, labelled in (("mixed", True), ("bare", False)):
+        writer = LeRobotWriter(tmp_path / name, robot)
+        writer.write([moving_square(ARM_DELTAS, seed, labelled=labelled) for seed in range(3)])
+    store = ClipStore([tmp_path / "mixed", tmp_path / "bare"], spec, tmp_path / "cache")
+    labels, progress = frame_targets(store, 2, 0.9)
+    bare = store.rows(torch.tensor([3, 4, 5]))
+    assert bool(torch.isnan(labels[bare]).all()) and bool(torch.isnan(progress[bare]).all())
+    drawn = JudgeData(store, torch.arange(6), 2, 0.9).sample(64, torch.Generator().manual_seed(0))
+    assert bool(torch.isfinite(drawn["label"]).all())
+    with pytest.raises(ValueError, match=r"no episode .* succeeded \(next\.success"):
+        JudgeData(store, torch.tensor([3, 4, 5]), 2, 0.9)
+    alone = ClipStore([tmp_path / "bare"], spec, tmp_path / "cache")
+    assert bool(torch.isnan(frame_targets(alone, 2, 0.9)[0]).all())
 
 
-def test_judge_learns_to_aim(store: ClipStore, tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    judge = LearnedJudge(hold=2, width=8, points=4)
-    train_judge(
-        judge, store, torch.arange(len(store)), FitConfig(steps=60, batch=16, lr=5e-3, bf16=False), tmp_path
-    )
-    rows = [
-        json.loads(line)["judge/aim_error"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()
-    ]
-    assert sum(rows[-5:]) < 0.5 * sum(rows[:5])
-
-
-def test_close_calls_lie_around_where_successes_begin() -> None:
-    labels = torch.tensor([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0])
-    progress = torch.tensor([0.1, 0.75, 0.81, 0.99, 0.0, 0.88, 0.5, 0.83])
-    assert close_calls(labels, progress, torch.arange(8)).tolist() == [1, 2, 5, 7]
-    assert close_calls(labels, progress, torch.tensor([0, 4, 6])).tolist() == []
-
-
-def test_objects_nobody_placed_leave_the_aims_alone() -> None:
-    judge = LearnedJudge(hold=2, width=8, points=4)
-    frames = torch.randint(0, 256, (4, 3, 3, 64, 64), dtype=torch.uint8)
-    value, figures = judge.loss(batch_of(frames, torch.tensor([0.0, 1.0, 0.0, 1.0])), 0.5)
+def test_a_frame_without_label_moves_no_weight(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    judge = judge_of(store.spec)
+    batch = JudgeData(store, torch.arange(8), 2, 0.9).sample(6, torch.Generator().manual_seed(0))
+    batch["label"][:] = torch.nan
+    batch["progress"][:] = torch.nan
+    value, figures = judge.loss(batch, 0.5)
     value.backward()
-    assert float(figures["aim_error"]) == 0.0
-    assert all(bool(torch.isfinite(p.grad).all()) for p in judge.parameters() if p.grad is not None)
+    assert float(figures["success"]) == 0.0
+    assert not any(bool(p.grad.any()) for p in judge.parameters() if p.grad is not None)
 
 
-def test_what_nobody_labelled_teaches_no_verdict() -> None:
-    judge = LearnedJudge(hold=2, width=8, points=4)
-    frames = torch.randint(0, 256, (4, 3, 3, 64, 64), dtype=torch.uint8)
-    value, figures = judge.loss(
-        batch_of(frames, torch.full((4,), torch.nan), where=torch.zeros(4, 2, 2)), 0.5
-    )
-    value.backward()
-    assert float(figures["success"]) == 0.0 and float(figures["aim_error"]) > 0.0
-    assert not bool(judge.apart[-1].weight.grad.any())
+def runs(best: list[float]) -> torch.Tensor:
+    """Episodes [N, 6] whose best run of two frames is as given."""
+    out = torch.full((len(best), 6), 0.01)
+    out[:, 2:4] = torch.tensor(best)[:, None]
+    return out
 
 
-def batch_of(frames: torch.Tensor, label: torch.Tensor, where: torch.Tensor | None = None) -> TensorDict:
-    """A training batch of a judge with progress like success, in which nobody knows where things are unless
-    told.
-    """
-    unknown = torch.full((len(frames), 2, 2), torch.nan)
-    pictures = {"frames": to_signed(frames), "first": to_signed(frames), "drill": to_signed(frames[:, :2])}
-    return TensorDict(
-        {
-            **pictures,
-            "tokens": torch.zeros(len(frames), 12, dtype=torch.int64),
-            "label": label,
-            "progress": label,
-            "where": unknown if where is None else where,
-            "drilled": unknown,
-        },
-        [len(frames)],
-    )
+def test_the_threshold_lies_where_success_is_as_likely_as_not() -> None:
+    judge = RuleJudge(hold=2)
+    generator = torch.Generator().manual_seed(0)
+    logit = 6 * torch.rand(4000, generator=generator) - 3
+    succeeded = torch.rand(4000, generator=generator) < (2 * (logit - 0.8)).sigmoid()
+    assert calibrate(judge, runs(logit.sigmoid().tolist()), succeeded)
+    assert float(torch.logit(judge.threshold)) == pytest.approx(0.8, abs=0.1)
 
 
-def test_a_judge_without_aims_judges() -> None:
-    judge = LearnedJudge(hold=2, width=8, points=4, aims=0).eval()
-    frames = torch.randint(0, 256, (2, 3, 3, 3, 64, 64), dtype=torch.uint8)
-    verdict = judge.score(frames, frames[:, 0], torch.zeros(2, 12, dtype=torch.int64))
-    assert verdict.success.shape == (2, 3) and bool(torch.isfinite(verdict.success).all())
+def test_scores_that_part_the_outcomes_still_give_a_finite_threshold() -> None:
+    judge = RuleJudge(hold=2)
+    assert calibrate(judge, runs([0.1, 0.2, 0.8, 0.9]), torch.tensor([False, False, True, True]))
+    assert 0.2 < float(judge.threshold) < 0.8
 
 
-def test_no_judge_learns_from_what_it_is_calibrated_on(store: ClipStore) -> None:
-    unseen = unseen_by_judge(store)
-    assert [store.episodes[n]["seed"] for n in unseen.tolist()] == [2, 6]
+@pytest.mark.parametrize(
+    ("best", "succeeded"),
+    [
+        ([0.2, 0.8], [True, True]),
+        ([0.2, 0.8], [False, False]),
+        ([0.9, 0.1], [False, True]),
+        ([float("nan"), float("nan")], [False, True]),
+    ],
+)
+def test_scores_that_do_not_tell_set_no_threshold(best: list[float], succeeded: list[bool]) -> None:
+    judge = RuleJudge(hold=2)
+    assert not calibrate(judge, runs(best), torch.tensor(succeeded))
+    assert float(judge.threshold) == 0.5
+
+
+def test_pictures_are_disturbed_alike_in_all_views_and_by_the_generator_alone() -> None:
+    pictures = torch.randint(60, 200, (8, 1, 3, 32, 32), dtype=torch.uint8).expand(-1, 2, -1, -1, -1)
+    out = augment(pictures, torch.Generator().manual_seed(0), shift=0.1)
+    assert out.dtype == torch.uint8 and out.shape == pictures.shape
+    assert torch.equal(out[:, 0], out[:, 1]) and not torch.equal(out, pictures)
+    assert torch.equal(out, augment(pictures, torch.Generator().manual_seed(0), shift=0.1))
+    still = augment(pictures, torch.Generator().manual_seed(0), shift=0.0)
+    assert float((still.float() - pictures.float()).abs().mean()) < 20
+
+
+def test_shifts_move_by_whole_pixels_and_repeat_the_border() -> None:
+    ramp = torch.arange(32, dtype=torch.uint8).expand(64, 1, 3, 32, 32)
+    colourless = torch.Generator().manual_seed(3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("learners.stages.pictures.COLOUR", 0.0)
+        out = augment(ramp, colourless, shift=0.1)[:, 0, 0, 0].long()
+    moved = out[:, 16] - 16
+    assert moved.abs().max() == 3 and len(moved.unique()) == 7
+    assert torch.equal(out, (torch.arange(32) + moved[:, None]).clamp(0, 31))

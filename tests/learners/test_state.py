@@ -1,8 +1,9 @@
-"""The stage that teaches joint states: what it looks at, and that it learns."""
+"""The stage that teaches the robot's states: features are computed once, and it learns."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -10,49 +11,62 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
-from envs.simulators.state_experts.head import StateHead
-from envs.simulators.unet.engine import UNetSimulator
 from learners.stages.state import train_state
 from learners.training.fit import FitConfig
+from tests.embodiments import ARM_JOINTS, EMBODIMENTS
+from tests.learners.models import decoder_of, simulator_of
+
+Stores = Callable[[Embodiment], ClipStore]
 
 
-def test_a_decoder_looks_once_and_learns(
-    simulator: UNetSimulator, store: ClipStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("robot", EMBODIMENTS.values(), ids=EMBODIMENTS)
+def test_a_state_expert_learns_of_any_robot(robot: Embodiment, tiny_store: Stores, tmp_path: Path) -> None:
+    store = tiny_store(robot)
+    simulator = simulator_of("unet_small", store.spec)
+    decoder = decoder_of("unet_small", simulator)
+    options = FitConfig(steps=80, batch=16, lr=3e-3, warmup=5, bf16=False)
+    before = {name: value.clone() for name, value in simulator.state_dict().items()}
+    train_state(decoder, simulator, store, store.split("train"), options, tmp_path)
+    losses = [json.loads(line)["state/loss"] for line in (tmp_path / "metrics.jsonl").open()]
+    assert sum(losses[-5:]) < 0.5 * sum(losses[:5])
+    assert all(torch.equal(value, before[name]) for name, value in simulator.state_dict().items())
+    assert all(parameter.requires_grad for parameter in simulator.parameters())
+
+
+def test_features_are_computed_once_unless_they_are_too_large(
+    tiny_store: Stores, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shown = []
-    features = simulator.features
+    store = tiny_store(ARM_JOINTS)
+    simulator = simulator_of("unet_small", store.spec)
+    shown, features = [], simulator.features
 
     def counted(inputs: TensorDict) -> Tensor:
         shown.append(len(inputs))
         return features(inputs)
 
     monkeypatch.setattr(simulator, "features", counted)
-    torch.manual_seed(0)
-    head = StateHead(simulator.feature_shape[0], simulator.shape.chunk, simulator.shape.memory)
-    head.normalise(store.arrays["states"])
-    train_state(
-        head,
-        simulator,
-        store,
-        torch.arange(len(store)),
-        FitConfig(steps=100, batch=32, lr=3e-3, bf16=False),
-        tmp_path,
-    )
+    every, options = torch.arange(len(store)), FitConfig(steps=100, batch=32, bf16=False)
+    train_state(decoder_of("unet_small", simulator), simulator, store, every, options, tmp_path)
     assert sum(shown) == 1 + 200  # one to know its size; of the 3200 clips that were learned from
-    monkeypatch.setattr("learners.stages.state._KEPT", 1000)  # of a simulator that says more than can be kept
+    monkeypatch.setattr("learners.stages.state._KEPT", 1000)  # bytes
     shown.clear()
-    train_state(
-        head,
-        simulator,
-        store,
-        torch.arange(len(store)),
-        FitConfig(steps=3, batch=32, lr=3e-3, bf16=False),
-        tmp_path / "anew",
-    )
+    options = FitConfig(steps=3, batch=32, bf16=False)
+    train_state(decoder_of("unet_small", simulator), simulator, store, every, options, tmp_path / "anew")
     assert sum(shown) == 1 + 3 * 32
-    losses = [
-        json.loads(line)["state/loss"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()
-    ]
-    assert sum(losses[-5:]) < 0.5 * sum(losses[:5])
-    assert all(parameter.requires_grad for parameter in simulator.parameters())
+
+
+def test_only_transformers_take_adapters(tiny_store: Stores, tmp_path: Path) -> None:
+    store = tiny_store(ARM_JOINTS)
+    simulator = simulator_of("unet_small", store.spec)
+    with pytest.raises(ValueError, match=r"lora=2.*StateHead has none"):
+        train_state(
+            decoder_of("unet_small", simulator),
+            simulator,
+            store,
+            torch.arange(4),
+            FitConfig(1, 2, bf16=False),
+            tmp_path,
+            lora=2,
+        )
