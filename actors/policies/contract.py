@@ -2,12 +2,14 @@
 
 A policy is a TensorDictModule that reads observations by the keys of envs/specs.py (`in_keys`) and writes
 ("vla_action", "chunk") [B, K, A] with its log-probability [B]; `get_dist` gives the distribution that
-learners differentiate. A policy that also writes ("vla_action", "tokens") is scored on those, as TorchRL's are.
+learners differentiate. A policy that also writes ("vla_action", "tokens") is scored on those, as TorchRL's
+are.
 
 Whatever else a policy has is used if it is there:
 
 - "language_instruction" among its in_keys: it is given the instruction as text;
 - ("policy", "visual_features") among its out_keys, and `visual_dim`: critics read them instead of pictures;
+- `encoder`: the module that writes those, if it can be run alone;
 - `trained`: the part that learners train and score, if that is not all of it;
 - `freeze_perception()`: for rl.freeze_perception;
 - `normalise(chunks [N, K, A], states [N, S])`: takes units from demonstrations;
@@ -25,6 +27,7 @@ from torch import Tensor, nn
 from torchrl.data.vla import ACTION_TOKENS_KEY
 
 from envs.specs import CHUNK, INSTRUCTION, INSTRUCTION_UTF8, bytes_to_text
+from envs.targets import ConfigError
 
 VISUAL_FEATURES = ("policy", "visual_features")  # float32 [B, visual_dim]: of pictures and instruction
 POLICY_FEATURES = ("policy", "policy_features")  # float32 [B, width]: those joined with the robot's state
@@ -33,6 +36,21 @@ POLICY_FEATURES = ("policy", "policy_features")  # float32 [B, width]: those joi
 def trained_part(policy: TensorDictModuleBase) -> TensorDictModuleBase:
     """What learners train and score: `policy.trained`, or all of it."""
     return getattr(policy, "trained", policy)
+
+
+def freeze_perception(policy: TensorDictModuleBase) -> None:
+    """Leave a policy's encoder as it is, for rl.freeze_perception=true.
+
+    Raises:
+        ConfigError: if the policy cannot tell its encoder from the rest.
+    """
+    freeze = getattr(policy, "freeze_perception", None)
+    if freeze is None:
+        raise ConfigError(
+            f"rl.freeze_perception=true, but {type(policy).__name__} has no freeze_perception();"
+            " set rl.freeze_perception=false"
+        )
+    freeze()
 
 
 def action_key(policy: TensorDictModuleBase) -> NestedKey:
@@ -48,6 +66,11 @@ def input_keys(policy: TensorDictModuleBase) -> list[NestedKey]:
 def writes_features(policy: TensorDictModuleBase) -> bool:
     """Whether critics may read ("policy", "visual_features") of this policy."""
     return VISUAL_FEATURES in policy.out_keys
+
+
+def feature_part(policy: TensorDictModuleBase) -> TensorDictModuleBase:
+    """The part of a policy that writes ("policy", "visual_features"), or all of it."""
+    return getattr(policy, "encoder", policy)
 
 
 def with_text(observed: TensorDictBase, policy: TensorDictModuleBase) -> TensorDictBase:
@@ -70,8 +93,11 @@ def device_of(module: nn.Module) -> torch.device:
 
 
 def inputs_for(observed: TensorDictBase, policy: TensorDictModuleBase) -> TensorDictBase:
-    """The observations that a policy reads, on its device and with text if it asks for it."""
-    given = observed.select(*input_keys(policy), strict=False).to(device_of(policy))
+    """The observations that a policy reads, on its device and with text if it asks for it.
+
+    Visual features that are there go along, for policies whose encoder need not run again.
+    """
+    given = observed.select(*input_keys(policy), VISUAL_FEATURES, strict=False).to(device_of(policy))
     return with_text(given, policy)
 
 

@@ -131,6 +131,11 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         return self[0].module
 
     @property
+    def encoder(self) -> TensorDictModule:
+        """Perception as a module that writes ("policy", "visual_features")."""
+        return self[0]
+
+    @property
     def fusion(self) -> Fusion:
         """What joins them with the robot's state."""
         return self[1].module
@@ -172,7 +177,11 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         self.fusion.state_std.copy_(torch.where(spread > RESOLUTION, spread, 1.0))
 
     def imitation_loss(self, observed: TensorDictBase, chunks: Tensor) -> Tensor:
-        """The head's loss of imitating chunks [B, K, A] from observations [B]."""
-        seen = self.perception(observed[IMAGE], observed[INSTRUCTION_UTF8])
+        """The head's loss of imitating chunks [B, K, A] from observations [B], or from their visual features
+        if those are given.
+        """
+        seen = observed.get(VISUAL_FEATURES, None)
+        if seen is None:
+            seen = self.perception(observed[IMAGE], observed[INSTRUCTION_UTF8])
         hidden = self.fusion(seen, observed[STATE])
         return self.head.error(hidden, self.head.target(chunks))

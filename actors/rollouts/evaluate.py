@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from tqdm import tqdm
 
-from actors.policies.openpi import OpenPIPolicy
+from actors.policies.safe import SafePolicyWrapper
 from envs.specs import JUDGE_STATUS, PROGRESS, SUCCESS, Status
 
 
@@ -43,7 +43,7 @@ def evaluate(
 
     Args:
         env: any world; its batch size sets how many run side by side.
-        policy: acts by its mode, or samples if `stochastic`.
+        policy: any policy (policies/contract.py); acts by its mode, or samples if `stochastic`.
         seeds: of the episodes; padding at the end is not counted.
         sampling_seed: of a stochastic policy's draws.
 
@@ -53,6 +53,7 @@ def evaluate(
     base = getattr(env, "base_env", env)
     width = env.batch_size[0]
     steps = base.horizon // base.chunk
+    actor = SafePolicyWrapper(policy, base.spec, base.mode)
     success, progress, judged = [], [], []
     torch.manual_seed(sampling_seed)
     mode = ExplorationType.RANDOM if stochastic else ExplorationType.DETERMINISTIC
@@ -63,15 +64,12 @@ def evaluate(
             part = seeds[begin : begin + width]
             base.schedule([*part, *[part[-1]] * (width - len(part))])
             now = env.reset()
-            if isinstance(policy, OpenPIPolicy):
-                # it reads words, of which the rollout carries tokens only
-                policy.instructions = base.instructions
             over = torch.zeros(width, dtype=torch.bool)
             won = torch.zeros(width, dtype=torch.bool)
             fine = torch.ones(width, dtype=torch.bool)
             reached = torch.zeros(width)
             for _ in range(steps):
-                after = env.step(policy(now))
+                after = env.step(actor(now))
                 result = after["next"]
                 live = ~over
                 won |= live & result[SUCCESS].squeeze(-1).cpu()

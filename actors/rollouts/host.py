@@ -1,9 +1,8 @@
 """What one host of worlds does: a job in, a rollout out.
 
 A job says which episodes to run and which random numbers to draw; with the version of the weights it fixes
-the rollout,
-bit for bit. So it does not matter who runs it, in which order, or whether it is run a second time after a
-host died.
+the rollout, bit for bit. So it does not matter who runs it, in which order, or whether it is run a second time
+after a host died.
 """
 
 from __future__ import annotations
@@ -17,26 +16,34 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from actors.policies.vla import VISUAL_FEATURES, ChunkPolicy, Perception
+from actors.policies.contract import (
+    VISUAL_FEATURES,
+    action_key,
+    device_of,
+    feature_part,
+    input_keys,
+    inputs_for,
+    trained_part,
+    writes_features,
+)
+from actors.policies.safe import SafePolicyWrapper
 from actors.rollouts.meter import Meter
 from envs.specs import (
     CHUNK,
-    COMMAND,
     EPISODE,
     IMAGE,
+    INSTRUCTION_UTF8,
     INVALID_ACTION,
     JUDGE_STATUS,
     LOG_PROB,
     STATE,
     SUCCESS,
-    TOKENS,
-    ActionMode,
 )
 from envs.transforms import JudgeReward, StateExpertTransform
 
@@ -71,103 +78,57 @@ def trained_weights(policy: nn.Module) -> Weights:
     }
 
 
-class SafePolicyWrapper(TensorDictModuleBase):
-    """A policy whose numbers that are NaN or infinite never reach a world: the arms rest instead, and
-    INVALID_ACTION says so.
-
-    Args:
-        policy: acts.
-        mode: of its chunks.
-    """
-
-    def __init__(self, policy: ChunkPolicy, mode: ActionMode):
-        super().__init__()
-        self.policy, self.mode = policy, mode
-        self.in_keys, self.out_keys = [*policy.in_keys, COMMAND], [*policy.out_keys, INVALID_ACTION]
-
-    def forward(self, observed: TensorDictBase) -> TensorDictBase:
-        out = self.policy(observed)
-        bad = ~(out[CHUNK].isfinite().flatten(1).all(1) & out[LOG_PROB].isfinite())
-        if bad.any():
-            chunk = out[CHUNK]
-            rest = (
-                torch.zeros_like(chunk)
-                if self.mode is ActionMode.RELATIVE
-                else out[COMMAND].unsqueeze(1).expand_as(chunk)
-            )
-            out[CHUNK] = torch.where(bad[:, None, None], rest, chunk)
-            out[LOG_PROB] = torch.where(bad, 0.0, out[LOG_PROB])
-            out[VISUAL_FEATURES] = torch.where(bad[:, None], 0.0, out[VISUAL_FEATURES])
-        out[INVALID_ACTION] = bad.unsqueeze(-1)
-        return out
-
-
 class Host:
     """A batch of episodes with a replica of the policy.
 
-    Collects with TorchRL's Collector, which resets all slots before each job.
-
     Args:
         env: any world of this project, its transforms included.
-        policy: the replica; nobody else may change it.
-        bootstrap: also say what perception makes of each next observation, for critics.
+        policy: the replica; nobody else may change it (see policies/contract.py).
+        bootstrap: also give critics what they read of each next observation: the policy's visual features,
+            or, of a policy that writes none, the observation.
     """
 
-    def __init__(self, env: EnvBase, policy: ChunkPolicy, bootstrap: bool = True):
+    def __init__(self, env: EnvBase, policy: TensorDictModuleBase, bootstrap: bool = True):
         self.env, self.policy, self.bootstrap = env, policy, bootstrap
         self.base = getattr(env, "base_env", env)
         self.steps = self.base.horizon // self.base.chunk
         self.version = -1
-        self._job: Job | None = None
+        self.actor = SafePolicyWrapper(policy, self.base.spec, self.base.mode)
+        self._features = feature_part(policy) if bootstrap and writes_features(policy) else None
         transforms = list(getattr(env, "transform", None) or ())
         self._judging = next((t for t in transforms if isinstance(t, JudgeReward)), None)
-        self.meter = Meter()
-        self.meter.watch(policy, "forward")
-        self.meter.watch(policy.perception, "forward")  # calls within calls count once
-        for transform in transforms:  # none in physics
-            if isinstance(transform, StateExpertTransform):
-                self.meter.watch(transform.decoder, "decode")
-            if isinstance(transform, JudgeReward):
-                self.meter.watch(transform.judge, "score")
-        if self._judging is not None:
-            self.meter.watch(self.base.simulator, "predict")
-            self.meter.watch(self.base.simulator.places, "find")
-            self.meter.watch(self.base.simulator.places, "push")
-        self._collect()
-        seen = {key for key in policy.trained.in_keys if isinstance(key, tuple)}
+        self.meter = self._watch(transforms)
+        critic = [VISUAL_FEATURES] if writes_features(policy) else [IMAGE, INSTRUCTION_UTF8]
+        observed = {*input_keys(trained_part(policy)), STATE, *(critic if bootstrap else [])}
         self._keys: list[NestedKey] = [
-            *sorted(seen | {STATE, VISUAL_FEATURES}),
-            CHUNK,
-            LOG_PROB,
+            *sorted(key for key in observed if isinstance(key, tuple)),
+            *dict.fromkeys((CHUNK, action_key(policy), LOG_PROB)),
             INVALID_ACTION,
             EPISODE,
         ]
-        self._after: list[NestedKey] = ["reward", "done", "terminated", "truncated", SUCCESS, STATE]
+        self._after: list[NestedKey] = [
+            *("reward", "done", "terminated", "truncated", SUCCESS, STATE, JUDGE_STATUS),
+            *([IMAGE, INSTRUCTION_UTF8] if bootstrap and self._features is None else []),
+        ]
         # What is built by now stays; looking through it for garbage again and again took a tenth of a
         # rollout's time.
         gc.collect()
         gc.freeze()
 
-    def _collect(self) -> None:
-        self._collector = Collector(
-            self.env,
-            SafePolicyWrapper(self.policy, self.base.mode),
-            frames_per_batch=self.env.batch_size[0] * self.steps,
-            total_frames=-1,
-            reset_at_each_iter=True,
-            # Right before the reset: the collector also resets when it is set up, and would use up the first
-            # seeds.
-            pre_collect_hook=self._begin,
-            auto_register_policy_transforms=False,
-        )
-        self._stream = iter(self._collector)
-
-    def _begin(self) -> None:
-        if self._job is not None:
-            torch.manual_seed(self._job.sampling)
-            if self._judging is not None:
-                self._judging.forget()
-            self.base.schedule(self._job.seeds)
+    def _watch(self, transforms: list[Any]) -> Meter:
+        """A meter over all networks of this host; calls within calls count once."""
+        meter = Meter()
+        meter.watch(self.policy, "forward")
+        if self._features is not None and self._features is not self.policy:
+            meter.watch(self._features, "forward")
+        for transform in transforms:  # none in physics
+            if isinstance(transform, StateExpertTransform):
+                meter.watch(transform.decoder, "decode")
+            if isinstance(transform, JudgeReward):
+                meter.watch(transform.judge, "score")
+        if self._judging is not None:
+            meter.watch(self.base.simulator, "predict")
+        return meter
 
     def load(self, version: int, weights: Mapping[str, NDArray[Any]]) -> None:
         """Take over a version of what is trained.
@@ -185,53 +146,62 @@ class Host:
         """Carry out a job.
 
         Returns:
-            TensorDict [B, T] with what learners read: the trained part's inputs, chunk, log-probability,
-                episode seed,
-            version, and of each next step reward, ends, success, state and what perception makes of it.
-            Pictures
-            are among it only if perception is trained; the video itself stays here.
+            TensorDict [B, T] on the CPU with what learners read: the trained part's inputs, chunk,
+            log-probability, episode seed, version, and of each next step reward, ends, success, state and
+            visual features. Pictures are among it only if the policy's encoder is trained, or writes no
+            features; the video itself stays here.
         """
-        self._job = job
-        # in one process with the learner, its random numbers are its own
-        with torch.random.fork_rng(devices=[]):
-            try:
-                batch = next(self._stream)
-            except BaseException:
-                # What raised half-way through has ended the stream; the next job finds a new one.
-                self._collector.shutdown(close_env=False)
-                self._collect()
-                raise
+        devices = [torch.cuda.current_device()] if device_of(self.policy).type == "cuda" else []
+        # In one process with the learner, its random numbers are its own.
+        with torch.random.fork_rng(devices=devices), torch.no_grad():
+            torch.manual_seed(job.sampling)
+            if self._judging is not None:
+                self._judging.forget()
+            self.base.schedule(job.seeds)
+            with set_exploration_type(ExplorationType.RANDOM):
+                batch, ends = self._collect()
+        if self._features is not None:
+            batch["next", VISUAL_FEATURES] = self._next_features(batch, ends)
         if self._judging is not None and self._judging.later:
             self._judging.settle(batch)
-        if self.bootstrap:
-            batch["next", VISUAL_FEATURES] = seen_next(batch, self.policy.perception)
-        after = [
-            *self._after,
-            *([VISUAL_FEATURES] if self.bootstrap else []),
-            *([JUDGE_STATUS] if JUDGE_STATUS in batch["next"].keys(True, True) else []),
-        ]
-        out = batch.select(*self._keys).exclude("next").clone()
-        out["next"] = batch["next"].select(*after).clone()
-        out[VERSION] = torch.full((*batch.shape, 1), self.version)
-        return out.cpu()
+        batch[VERSION] = torch.full((*batch.shape, 1), self.version)
+        return batch.cpu()
+
+    def _collect(self) -> tuple[TensorDict, TensorDict | None]:
+        """Rollout [B, T] from fresh episodes, and the observations [N] after which another episode begins, in
+        the order of steps and slots, for those who value them.
+        """
+        now, rows, ends = self.env.reset(), [], []
+        for step in range(self.steps):
+            last, acted = step + 1 == self.steps, self.actor(now)
+            # Nobody waits for the episodes that would begin after the last step.
+            after, now = (self.env.step(acted), now) if last else self.env.step_and_maybe_reset(acted)
+            row, following = after.select(*self._keys), after["next"]
+            row["next"] = following.select(*self._after, strict=False)
+            rows.append(row)
+            if self._features is not None:
+                done = following["done"].squeeze(-1)
+                fresh = torch.ones_like(done) if last else done
+                ends.append(following.select(*input_keys(self._features))[fresh])
+        return torch.stack(rows, 1), torch.cat(ends) if ends else None
+
+    @torch.no_grad()
+    def _next_features(self, batch: TensorDict, ends: TensorDict | None) -> Tensor:
+        """Visual features [B, T, F] of each step's next observation: those of a step later, or, where the
+        rollout ends or a slot starts anew, those of `ends`.
+        """
+        assert self._features is not None and ends is not None
+        seen = batch[VISUAL_FEATURES].roll(-1, 1)
+        fresh = batch["next", "done"].squeeze(-1).clone()
+        fresh[:, -1] = True
+        features = self._features(inputs_for(ends, self._features))[VISUAL_FEATURES].to(seen.device)
+        seen.transpose(0, 1)[fresh.transpose(0, 1)] = features  # ends come step by step
+        return seen
 
     def close(self) -> None:
         """Let go of the world."""
-        self._collector.shutdown(close_env=False)
         if not self.env.is_closed:
             self.env.close()
-
-
-@torch.no_grad()
-def seen_next(batch: TensorDict, perception: Perception) -> Tensor:
-    """What perception makes of each step's next observation: what it made of it a step later, or, where the
-    rollout ends or a slot starts anew, computed here.
-    """
-    seen = batch[VISUAL_FEATURES].roll(-1, 1)
-    fresh = batch["next", "done"].squeeze(-1).clone()
-    fresh[:, -1] = True
-    seen[fresh] = perception(batch["next", IMAGE][fresh], batch["next", TOKENS][fresh])
-    return seen
 
 
 def pack(batch: TensorDict) -> Weights:

@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import torch
+
 
 class Meter:
     """Adds up the seconds of some methods; calls within calls count once."""
@@ -28,6 +30,8 @@ class Meter:
             finally:
                 self._depth -= 1
                 if not self._depth:
+                    if torch.cuda.is_initialized():
+                        torch.cuda.synchronize()  # kernels run on after their launch
                     self.seconds += time.perf_counter() - began
 
         setattr(owner, name, timed)

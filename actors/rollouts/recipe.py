@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from actors.factory import (
-    ConfigError,
     build_judge,
     build_physics,
     build_policy,
@@ -18,11 +17,12 @@ from actors.factory import (
     build_state_decoder,
     build_world,
     open_clips,
-    options,
     prepare_process,
 )
+from actors.policies.contract import freeze_perception
 from actors.rollouts.host import Host
-from envs.judges import Judge
+from envs.judges.base import Judge
+from envs.targets import ConfigError, options
 from envs.world import InitialStates
 
 
@@ -76,12 +76,13 @@ def build_host(recipe: Recipe) -> Host:
     """
     if recipe.missing():
         raise ConfigError(
-            f"{recipe.missing()} are not on this machine; on a cluster, let `runs` be a folder that all nodes share"
+            f"{recipe.missing()} are not on this machine; on a cluster, let `runs` be a folder that all nodes"
+            " share"
         )
     cfg = recipe.config
     policy = build_policy(cfg, Path(recipe.policy))
     if recipe.freeze_perception:
-        policy.freeze_perception()
+        freeze_perception(policy)
     if not recipe.simulator:
         return Host(build_physics(cfg, recipe.episodes), policy, recipe.bootstrap)
     simulator = build_simulator(cfg, Path(recipe.simulator))
@@ -90,14 +91,14 @@ def build_host(recipe: Recipe) -> Host:
         # Ray takes seconds to import, which a local run need not spend
         from actors.serving.judge_service import JudgeClient, ServiceConfig
 
-        referee: Judge = JudgeClient(
+        judge: Judge = JudgeClient(
             recipe.service, options(ServiceConfig, cfg["launch"]["service"], "launch.service")
         )
     else:
-        referee = build_judge(cfg, Path(recipe.judge))
+        judge = build_judge(cfg, Path(recipe.judge))
     starts = InitialStates.of(open_clips(cfg, [Path(folder) for folder in recipe.data]))
     return Host(
-        build_world(cfg, simulator, decoder, referee, starts, recipe.episodes, recipe.later),
+        build_world(cfg, simulator, decoder, judge, starts, recipe.episodes, recipe.later),
         policy,
         recipe.bootstrap,
     )

@@ -46,25 +46,25 @@ class RLConfig:
         seed: of start frames, exploration and minibatches.
     """
 
-    iterations: int = 40
-    envs: int = 128
-    shards: int = 1
-    schedule: str = "sync"
-    max_policy_lag: int = 2
-    queue: int = 8
-    max_dropped: float = 0.05
-    epochs: int = 3
-    minibatch: int = 256
-    microbatches: int = 1
-    lr: float = 2e-4
-    clip: float = 1.0
-    kl_stop: float = 0.15
-    anchor: float = 0.0
-    anchor_batch: int = 96
-    rewards_later: bool = False
-    freeze_perception: bool = False
-    checkpoint_every: int = 5
-    seed: int = 0
+    iterations: int
+    envs: int
+    shards: int
+    schedule: str
+    max_policy_lag: int
+    queue: int
+    max_dropped: float
+    epochs: int
+    minibatch: int
+    microbatches: int
+    lr: float
+    clip: float
+    kl_stop: float
+    anchor: float
+    anchor_batch: int
+    rewards_later: bool
+    freeze_perception: bool
+    checkpoint_every: int
+    seed: int
 
     def __post_init__(self) -> None:
         if self.schedule not in ("sync", "async"):
@@ -74,11 +74,11 @@ class RLConfig:
 
 
 class Algorithm(Protocol):
-    """What tells algorithms apart; one file each.
+    """What tells algorithms apart; one class each, built as `_target_`(policy=, spec=, **options).
 
     Attributes:
         name: in the config.
-        bootstraps: whether it values next observations, so that rollouts must say what perception makes of
+        bootstraps: whether it values next observations, so that rollouts must carry what critics read of
             them.
         supports_delayed_reward: whether it learns from whole first episodes only, so that rewards may arrive
             after them.

@@ -1,73 +1,87 @@
 """Recorded episodes as a rollout: what a critic can learn of the true world before it judges its first
 imagined one.
+
+Rewards are those that a perfect judge would have given: from the recorded success and time alone.
 """
 
 from __future__ import annotations
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor
+from tensordict.nn import TensorDictModuleBase
 
-from actors.policies.vla import VISUAL_FEATURES, Perception
+from actors.policies.contract import VISUAL_FEATURES, feature_part, inputs_for, writes_features
 from envs.episodes.clips import ClipStore
-from envs.specs import STATE, Rewards
+from envs.judges.labels import progress_to_success
+from envs.specs import IMAGE, INSTRUCTION_UTF8, STATE, Rewards, text_to_bytes
 
-
-@torch.no_grad()
-def looked_at(
-    perception: Perception, store: ClipStore, rows: Tensor, tokens: Tensor, batch: int = 512
-) -> Tensor:
-    """What perception makes of frames of a store, rows [N], with instructions tokens [N, WORDS]: float32 [N,
-    out_features].
-    """
-    return torch.cat(
-        [
-            perception(store.frames(some), words)
-            for some, words in zip(rows.split(batch), tokens.split(batch), strict=True)
-        ]
-    )
+_AT_ONCE = 512  # frames per pass
 
 
 @torch.no_grad()
 def dataset_rollout(
-    perception: Perception, store: ClipStore, episodes: Tensor, rewards: Rewards, chunk: int
+    policy: TensorDictModuleBase,
+    store: ClipStore,
+    episodes: torch.Tensor,
+    rewards: Rewards,
+    discount: float,
 ) -> TensorDict:
     """Episodes of a store, decision by decision, as a rollout that GAE reads.
 
     Args:
-        perception: of the policy, as it will stay.
-        episodes: numbers [N].
-        chunk: frames per decision, K.
+        policy: whose visual features the critic reads; of one that writes none, pictures and text are given.
+        episodes: labelled ones, int64 [N].
+        discount: per frame, of progress towards success; the judge's.
 
     Returns:
-        TensorDict [N, T] with what is seen and the joint state of each decision and of what followed, reward,
-        ends, and
+        TensorDict [N, T] with what critics read of each decision and of what followed, reward, ends, and
         `valid` bool [N, T], false past an episode's end.
+
+    Raises:
+        ValueError: if nobody said whether an episode succeeded.
     """
-    last = store.length[episodes] - 1
+    if not bool(store.labelled[episodes].all()):
+        raise ValueError("a critic learns from episodes that were labelled with success; choose those")
+    chunk, last = store.spec.chunk, store.length[episodes] - 1
     steps = int((last.max() + chunk - 1) // chunk)
-    # [N, T + 1]; past the end the last frame stays
-    at = torch.minimum(torch.arange(steps + 1) * chunk, last[:, None])
+    at = torch.minimum(torch.arange(steps + 1) * chunk, last[:, None])  # past the end the last frame stays
     rows = store.start[episodes][:, None] + at
-    seen = looked_at(
-        perception, store, rows.flatten(), store.tokens[episodes].repeat_interleave(steps + 1, 0)
-    ).unflatten(0, rows.shape)
-    states, progress, success = (
-        store.arrays[name][rows].float() for name in ("states", "progress", "success")
-    )
-    valid, over = at[:, :-1] < last[:, None], at[:, 1:] == last[:, None]
+    seen = _observed(policy, store, rows, episodes)
+    success, progress = _labels(store, episodes, discount)
+    success, progress = success.gather(1, at), progress.gather(1, at)
+    over = at[:, 1:] == last[:, None]
     won = (success[:, 1:] > 0.5) & over
-    out = TensorDict(
-        {VISUAL_FEATURES: seen[:, :-1], STATE: states[:, :-1], "valid": valid}, [len(rows), steps]
-    )
-    out["next"] = TensorDict(
-        {
-            VISUAL_FEATURES: seen[:, 1:],
-            STATE: states[:, 1:],
-            "reward": rewards(progress[:, :-1, None], progress[:, 1:, None], won[..., None]),
-            "done": over[..., None],
-            "terminated": won[..., None],
-        },
-        out.shape,
-    )
+    out = seen[:, :-1].copy()
+    out["valid"] = at[:, :-1] < last[:, None]
+    out["next"] = seen[:, 1:].copy()
+    out["next", "reward"] = rewards(progress[:, :-1, None], progress[:, 1:, None], won[..., None])
+    out["next", "done"], out["next", "terminated"] = over[..., None], won[..., None]
     return out
+
+
+def _labels(store: ClipStore, episodes: torch.Tensor, discount: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Success and progress of every frame, float32 [N, longest], the last one repeated."""
+    length = store.length[episodes]
+    frame = torch.minimum(torch.arange(int(length.max())), length[:, None] - 1)
+    success = store.arrays["success"][store.start[episodes][:, None] + frame].float()
+    return success, progress_to_success(success, discount)
+
+
+def _observed(
+    policy: TensorDictModuleBase, store: ClipStore, rows: torch.Tensor, episodes: torch.Tensor
+) -> TensorDict:
+    """What critics read of frames [N, T], as a TensorDict [N, T]."""
+    text = text_to_bytes([store.instructions[n] for n in episodes.tolist()])[:, None].expand(
+        -1, rows.shape[1], -1
+    )
+    parts = []
+    for some, words in zip(rows.flatten().split(_AT_ONCE), text.flatten(0, 1).split(_AT_ONCE), strict=True):
+        part = TensorDict({}, [len(some)])
+        part[IMAGE], part[INSTRUCTION_UTF8] = store.frames(some), words
+        part[STATE] = store.arrays["states"][some]
+        if writes_features(policy):
+            features = feature_part(policy)(inputs_for(part, policy))[VISUAL_FEATURES].cpu()
+            part = part.select(STATE)
+            part[VISUAL_FEATURES] = features
+        parts.append(part)
+    return torch.cat(parts).reshape(*rows.shape)

@@ -6,33 +6,40 @@ The simplest learner from success, and the one GE-Sim 2.0 reports; no ratios, no
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from actors.policies.vla import ChunkPolicy
-from envs.specs import CHUNK, SUCCESS
+from actors.policies.contract import (
+    action_key,
+    distribution,
+    input_keys,
+    trained_part,
+    with_fixed_spread,
+)
+from envs.specs import SUCCESS, WorldSpec
 from learners.rl.algorithm import first_episode, sound, transitions
 
 
-@dataclass(frozen=True)
-class FilteredBCConfig:
-    """Filtered behaviour cloning has no options of its own; rl.lr and rl.epochs say how hard it pulls."""
-
-
 class FilteredBC:
-    """See the module's docstring; an Algorithm of learners.rl.loop."""
+    """See the module's docstring; an Algorithm of learners.rl.algorithm. It has no options of its own: rl.lr
+    and rl.epochs say how hard it pulls.
+
+    Args:
+        policy: any policy (actors/policies/contract.py).
+        spec: of the world that it acts in.
+    """
 
     name = "filtered_bc"
     supports_delayed_reward = True
     bootstraps = False
     group_size = 1
 
-    def __init__(self, policy: ChunkPolicy, config: FilteredBCConfig):
-        self.policy, self.config = policy.trained, config
+    def __init__(self, policy: TensorDictModuleBase, spec: WorldSpec):
+        self.policy = trained_part(policy)
 
     def modules(self) -> nn.Module:
         """The policy."""
@@ -50,11 +57,10 @@ class FilteredBC:
         """The steps of this iteration's successful episodes."""
         mine = first_episode(batch["next", "done"].squeeze(-1)) & sound(batch)
         won = (batch["next", SUCCESS].squeeze(-1) & mine).any(1)
-        return transitions(batch, mine & won[:, None], self.policy.in_keys), {
-            "episodes_kept": float(won.sum())
-        }
+        keys = dict.fromkeys([*input_keys(self.policy), action_key(self.policy)])
+        return transitions(batch, mine & won[:, None], keys), {"episodes_kept": float(won.sum())}
 
     def loss(self, minibatch: TensorDict) -> tuple[Tensor, dict[str, float]]:
         """Negative log-likelihood with the exploration spread held fixed, so that only means move."""
-        dist = self.policy.get_dist(minibatch.clone(False)).held()
-        return -dist.log_prob(minibatch[CHUNK]).mean(), {}
+        dist = with_fixed_spread(distribution(self.policy, minibatch))
+        return -dist.log_prob(minibatch[action_key(self.policy)]).mean(), {}

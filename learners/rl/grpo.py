@@ -14,12 +14,14 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.distributions import kl_divergence
 from torchrl.objectives import ClipPPOLoss
 
-from actors.policies.vla import ChunkPolicy
-from envs.specs import CHUNK, EPISODE, LOG_PROB
+from actors.policies.contract import action_key, distribution, input_keys, trained_part, with_text
+from envs.specs import EPISODE, LOG_PROB, WorldSpec
+from envs.targets import options
 from learners.rl.algorithm import first_episode, sound, transitions
 
 
@@ -37,24 +39,31 @@ class GRPOConfig:
         shaped: credit each chunk with the reward that is still to come instead of the whole episode's.
     """
 
-    group: int = 8
-    normalise: bool = True
-    clip_low: float = 0.2
-    clip_high: float = 0.28
-    kl: float = 0.0
-    entropy: float = 0.0
-    shaped: bool = True
+    group: int
+    normalise: bool
+    clip_low: float
+    clip_high: float
+    kl: float
+    entropy: float
+    shaped: bool
 
 
 class GRPO:
-    """See the module's docstring; an Algorithm of learners.rl.loop."""
+    """See the module's docstring; an Algorithm of learners.rl.algorithm.
+
+    Args:
+        policy: any policy (actors/policies/contract.py).
+        spec: of the world that it acts in.
+        settings: see GRPOConfig.
+    """
 
     name = "grpo"
     supports_delayed_reward = True
     bootstraps = False
 
-    def __init__(self, policy: ChunkPolicy, config: GRPOConfig):
-        self.policy, self.config = policy.trained, config
+    def __init__(self, policy: TensorDictModuleBase, spec: WorldSpec, **settings: Any):
+        self.config = config = options(GRPOConfig, settings, "algorithm")
+        self.policy = trained_part(policy)
         self.reference = copy.deepcopy(self.policy).requires_grad_(False) if config.kl else None
         self.objective = ClipPPOLoss(
             self.policy,
@@ -64,7 +73,7 @@ class GRPO:
             entropy_coeff=config.entropy,
             functional=False,
         )
-        self.objective.set_keys(action=CHUNK, sample_log_prob=LOG_PROB)
+        self.objective.set_keys(action=action_key(self.policy), sample_log_prob=LOG_PROB)
         self.starts, self.group_size = 1, config.group
 
     def modules(self) -> nn.Module:
@@ -112,7 +121,8 @@ class GRPO:
         if not keep.any():
             # nothing to learn from, and advantages are zero: the update is a no-op that alarms report
             keep = mine
-        data = transitions(batch, keep, self.policy.in_keys, advantage=advantage.flatten(0, 1).unsqueeze(-1))
+        keys = dict.fromkeys([*input_keys(self.policy), action_key(self.policy)])
+        data = transitions(batch, keep, keys, advantage=advantage.flatten(0, 1).unsqueeze(-1))
         same = batch[EPISODE][:, 0, 0] % self.starts
         assert bool((same.unflatten(0, (-1, size)) == same.unflatten(0, (-1, size))[:, :1]).all()), (
             "a group holds different starts"
@@ -124,16 +134,16 @@ class GRPO:
 
     def loss(self, minibatch: TensorDict) -> tuple[Tensor, dict[str, float]]:
         """The clipped objective, the KL to the start policy and the entropy bonus."""
-        out = self.objective(minibatch)
+        out = self.objective(with_text(minibatch, self.policy))
         total = out["loss_objective"]
         figures = {"kl": float(out["kl_approx"]), "clip_fraction": float(out["clip_fraction"])}
         if "loss_entropy" in out.keys():
             total = total + out["loss_entropy"]
             figures["entropy"] = float(out["entropy"])
         if self.reference is not None:
-            now = self.policy.get_dist(minibatch.clone(False))
+            now = distribution(self.policy, minibatch)
             with torch.no_grad():
-                start = self.reference.get_dist(minibatch.clone(False))
+                start = distribution(self.reference, minibatch)
             distance = kl_divergence(now, start).mean()
             total = total + self.config.kl * distance
             figures["kl_start"] = float(distance.detach())

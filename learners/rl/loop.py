@@ -23,11 +23,12 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from tqdm import tqdm
 
 from actors.fleets.fleet import EpisodeLedger, Fleet
-from actors.policies.vla import ChunkPolicy
 from actors.rollouts.host import Weights, trained_weights
+from envs.rng import iteration_generator, sampling_seed, update_seed
 from learners.rl.alarms import Alarms
 from learners.rl.algorithm import Algorithm, Anchor, RLConfig
 from learners.rl.feed import AsyncFeed, Feed
@@ -39,7 +40,7 @@ from learners.training.parallel import Trainee, from_leader, leads
 
 def train_rl(
     fleet: Fleet | None,
-    policy: ChunkPolicy,
+    policy: TensorDictModuleBase,
     algorithm: Algorithm,
     config: RLConfig,
     folder: Path,
@@ -99,13 +100,11 @@ def train_rl(
 
     def seeds(iteration: int) -> list[int]:
         pool = starts or len(seed_pool or ())
-        drawn = algorithm.seeds(
-            pool, config.envs, torch.Generator().manual_seed(config.seed * 1_000_003 + iteration)
-        )
+        drawn = algorithm.seeds(pool, config.envs, iteration_generator(config.seed, iteration))
         return drawn if seed_pool is None else [seed_pool[s % pool] for s in drawn]
 
     def sampling(iteration: int, shard: int) -> int:
-        return config.seed * 7_919 + iteration + shard * 1_000_000_007
+        return sampling_seed(config.seed, iteration, shard)
 
     feed: Feed | None = None
     if fleet is not None:
@@ -149,10 +148,8 @@ def train_rl(
             began = time.perf_counter()
             batch, supply = from_leader(partial(gather, iteration, trainee(trained_weights, policy)))
             collected = time.perf_counter()
-            # Minibatches are drawn by the iteration alone, whatever collecting has used up.
-            figures = update(
-                batch, algorithm, trainee, optimiser, config, config.seed * 2_000_003 + iteration, anchor
-            )
+            seed = update_seed(config.seed, iteration)
+            figures = update(batch, algorithm, trainee, optimiser, config, seed, anchor)
             updated = time.perf_counter()
             spent["rollout"] += collected - began
             spent["update"] += updated - collected

@@ -1,9 +1,8 @@
 """PPO on chunks (Schulman et al. 2017): maximise E[min(r A, clip(r, 1-e, 1+e) A)] + c H, where A is GAE over
 chunks.
 
-One decision is one chunk, so advantages say which chunk of an episode was good. The critic is a small network
-on what
-the policy's perception made of a rollout while it acted; it costs next to nothing and cannot disturb the
+One decision is one chunk, so advantages say which chunk of an episode was good. The critic (critic.py) reads
+what the policy's encoder made of a rollout while it acted; it costs next to nothing and cannot disturb the
 policy.
 """
 
@@ -15,14 +14,16 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from actors.policies.vla import VISUAL_FEATURES, ChunkPolicy
-from envs.specs import CHUNK, LOG_PROB, STATE, STATE_DIM
+from actors.policies.contract import action_key, device_of, input_keys, trained_part, with_text
+from envs.specs import LOG_PROB, WorldSpec
+from envs.targets import options
 from learners.rl.algorithm import sound, transitions
+from learners.rl.critic import build_critic
 
 
 @dataclass(frozen=True)
@@ -39,47 +40,35 @@ class PPOConfig:
             PPO.warm_up.
     """
 
-    gamma: float = 0.97
-    lam: float = 0.9
-    clip: float = 0.2
-    entropy: float = 0.0
-    critic: float = 1.0
-    critic_width: int = 256
-    critic_lr: float = 1e-3
-    warmup_passes: int = 6
-
-
-class Value(nn.Module):
-    """V(observation) from perception's features [..., S] and the joint state [..., 16] -> [..., 1]."""
-
-    def __init__(self, seen: int, width: int):
-        super().__init__()
-        self.layers = nn.Sequential(
-            nn.LayerNorm(seen + STATE_DIM),
-            nn.Linear(seen + STATE_DIM, width),
-            nn.SiLU(),
-            nn.Linear(width, width),
-            nn.SiLU(),
-            nn.Linear(width, 1),
-        )
-
-    def forward(self, seen: Tensor, state: Tensor) -> Tensor:
-        return self.layers(torch.cat((seen.detach(), state), -1))
+    gamma: float
+    lam: float
+    clip: float
+    entropy: float
+    critic: float
+    critic_width: int
+    critic_lr: float
+    warmup_passes: int
 
 
 class PPO:
-    """See the module's docstring; an Algorithm of learners.rl.loop."""
+    """See the module's docstring; an Algorithm of learners.rl.algorithm.
+
+    Args:
+        policy: any policy (actors/policies/contract.py).
+        spec: of the world that it acts in.
+        settings: see PPOConfig.
+    """
 
     name = "ppo"
     supports_delayed_reward = False
     bootstraps = True
     group_size = 1
 
-    def __init__(self, policy: ChunkPolicy, config: PPOConfig):
-        self.policy, self.config = policy.trained, config
-        value = Value(policy.perception.out_features, config.critic_width)
-        self.critic = TensorDictModule(value, in_keys=[VISUAL_FEATURES, STATE], out_keys=["state_value"])
-        self.gae = GAE(gamma=config.gamma, lmbda=config.lam, value_network=self.critic, average_gae=False)
+    def __init__(self, policy: TensorDictModuleBase, spec: WorldSpec, **settings: Any):
+        self.config = config = options(PPOConfig, settings, "algorithm")
+        self.policy = trained_part(policy)
+        self.critic = build_critic(policy, spec, config.critic_width).to(device_of(policy))
+        self.gae = GAE(gamma=config.gamma, lmbda=config.lam, value_network=None, average_gae=False)
         self.objective = ClipPPOLoss(
             self.policy,
             self.critic,
@@ -90,7 +79,7 @@ class PPO:
             normalize_advantage=True,
             functional=False,
         )
-        self.objective.set_keys(action=CHUNK, sample_log_prob=LOG_PROB)
+        self.objective.set_keys(action=action_key(self.policy), sample_log_prob=LOG_PROB)
         # The loss registers both as functional parameters; optimising the originals needs them in one place.
         self._all = nn.ModuleList([self.policy, self.critic])
 
@@ -114,42 +103,49 @@ class PPO:
         """Advantages of all steps of the rollout, unfinished last episodes included: the critic stands in for
         their rest.
         """
-        with torch.no_grad():
-            self.gae(batch)
+        self._advantages(batch)
         value, target = batch["state_value"], batch["value_target"]
         extra = {"advantage": batch["advantage"], "value_target": target, "state_value": value}
-        data = transitions(batch, sound(batch), {*self.policy.in_keys, VISUAL_FEATURES, STATE}, **extra)
+        keys = dict.fromkeys([*input_keys(self.policy), *self.critic.in_keys, action_key(self.policy)])
+        data = transitions(batch, sound(batch), keys, **extra)
         return data, {
             "explained_variance": _explained(value, target),
             "advantage_std": float(batch["advantage"].std()),
         }
 
+    @torch.no_grad()
+    def _advantages(self, batch: TensorDict) -> None:
+        """Write values, advantages and value targets [B, T, 1] into a rollout [B, T]."""
+        for part in (batch, batch["next"]):
+            part["state_value"] = self.critic(part.select(*self.critic.in_keys))["state_value"]
+        self.gae(batch)
+
     def warm_up(self, rollout: TensorDict, seed: int, minibatch: int = 256) -> float:
-        """Let the critic learn from a rollout [N, T] of learners.rl.dataset_rollout; a critic that begins
-        from nothing spoils the first iterations.
+        """Let the critic learn from a rollout [N, T] of learners.rl.dataset_rollout; a critic that begins from
+        nothing spoils the first iterations.
 
         Returns:
             The share of the targets' variance that it explains before the last pass.
         """
+        rollout = rollout.to(device_of(self.critic))
         optimiser = torch.optim.Adam(self.critic.parameters(), lr=self.config.critic_lr)
         shuffle = torch.Generator().manual_seed(seed)
         valid, explained = rollout["valid"].flatten(), 0.0
         for _ in range(self.config.warmup_passes):
-            with torch.no_grad():
-                self.gae(rollout)
+            self._advantages(rollout)
             data = rollout.flatten(0, 1)[valid]
             explained = _explained(data["state_value"], data["value_target"])
             targets = data["value_target"].clone()
             for pick in torch.randperm(len(data), generator=shuffle).split(minibatch):
                 optimiser.zero_grad(set_to_none=True)
-                said = self.critic(data[pick].select(VISUAL_FEATURES, STATE))["state_value"]
-                F.smooth_l1_loss(said, targets[pick]).backward()
+                value = self.critic(data[pick].select(*self.critic.in_keys))["state_value"]
+                F.smooth_l1_loss(value, targets[pick]).backward()
                 optimiser.step()
         return explained
 
     def loss(self, minibatch: TensorDict) -> tuple[Tensor, dict[str, float]]:
         """The clipped objective, the value loss and the entropy bonus."""
-        out = self.objective(minibatch)
+        out = self.objective(with_text(minibatch, self.policy))
         total = out["loss_objective"] + out["loss_critic"]
         figures = {
             "kl": float(out["kl_approx"]),

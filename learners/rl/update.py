@@ -10,9 +10,11 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from actors.policies.contract import device_of
+from envs.rng import step_generator
 from envs.specs import SUCCESS
 from learners.rl.algorithm import Algorithm, Anchor, RLConfig, finite, first_episode, judged
-from learners.training.fit import TrainingDiverged, step_generator
+from learners.training.fit import TrainingDiverged
 from learners.training.parallel import Trainee, averaged, clip_gradients, my_share
 
 
@@ -32,6 +34,7 @@ def update(
         seed: of minibatches and of what the anchor draws.
     """
     figures = outcome(batch)
+    batch = batch.to(device_of(algorithm.modules()))
     data, extra = trainee(algorithm.prepare, batch)
     figures |= extra
     shuffle = torch.Generator().manual_seed(seed)
