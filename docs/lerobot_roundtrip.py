@@ -1,7 +1,7 @@
 """Data sets both ways between Worldloop and LeRobot's own software.
 
-Run it with an interpreter that has `lerobot[dataset]` (seen with 0.6.1, Python 3.12); of Worldloop it needs the
-folder, numpy, PyAV, pyarrow and OpenCV, which LeRobot brings along:
+Run it with an interpreter that has `lerobot[dataset]` (seen with 0.6.1, Python 3.12); of Worldloop it needs
+the folder, and numpy, PyAV, pyarrow and OpenCV, which LeRobot brings along:
 
     PYTHONPATH=/path/to/worldloop python docs/lerobot_roundtrip.py
 """
@@ -273,9 +273,8 @@ def lerobot_in_ours(folder: Path) -> None:
                 assert np.abs(shown.astype(int) - episode.frames[:, 0]).mean() < 6, name
             assert episode.succeeded == ((number != 1) if "next.success" in features else None)
         files = len(list((folder / name / "data").rglob("*.parquet")))
-        print(
-            f"written there, {name}: opens; {robot_seen.action_kind.value}, {robot_seen.action_names}, {files} data files"
-        )
+        kind = robot_seen.action_kind.value
+        print(f"written there, {name}: opens; {kind}, {robot_seen.action_names}, {files} data files")
 
 
 if __name__ == "__main__":

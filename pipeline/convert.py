@@ -1,8 +1,9 @@
-"""Recordings from elsewhere to LeRobot v3.0 and back, and pictures that show whether their calibration holds."""
+"""Recordings from elsewhere to LeRobot v3.0 and back, and pictures that show whether calibration holds."""
 
 from __future__ import annotations
 
-from itertools import chain
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -11,23 +12,28 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from envs.conditioning import CANVAS, PoseMapStyle
+from envs.conditioning import CANVAS, PoseMapStyle, end_effector_poses, render_pose_map
 from envs.episodes import Episode, EpisodeError, LeRobotDataset, LeRobotWriter
-from envs.episodes.clips import pose_maps_of
-from envs.episodes.formats.foreign import Cut, read_foreign, write_gesim2
+from envs.episodes.formats.foreign import read_foreign
+from envs.episodes.formats.gesim import write_bundle
+from envs.episodes.formats.recordings import Cut
+from envs.geometry.kinematics import Kinematics
 
 
-def read_any(source: Path, cut: Cut | None = None) -> chain[Episode]:
+def read_any(source: Path, cut: Cut | None = None) -> Iterator[Episode]:
     """Episodes of a LeRobot data set or of any known foreign format, so far as they are wanted."""
-    if (source / "meta/info.json").exists():
-        cut = cut or Cut()
-        return chain(cut.of(episode) for episode in LeRobotDataset(source))
-    return chain(read_foreign(source, cut))
+    cut = cut or Cut()
+    if not (source / "meta/info.json").exists():
+        return read_foreign(source, cut)
+    size = (cut.size[0], cut.size[1]) if cut.size else None
+    return (cut.of(episode) for episode in LeRobotDataset(source, size, privileged=True))
 
 
 def convert(source: Path, target: Path, cut: Cut) -> int:
-    """Write `source` as a LeRobot data set, or a LeRobot data set as GE-Sim 2.0 bundles, a folder each;
-    returns how many episodes.
+    """Write `source` as a LeRobot data set, or a LeRobot data set as GE-Sim 2.0 bundles, a folder each.
+
+    Returns:
+        How many episodes.
 
     Raises:
         EpisodeError: if the source is damaged or unknown, or the target is not empty.
@@ -39,14 +45,9 @@ def convert(source: Path, target: Path, cut: Cut) -> int:
     writer: LeRobotWriter | None = None
     for episode in tqdm(read_any(source, cut), desc="convert", unit="ep"):
         if back:
-            write_gesim2(target / f"episode_{count:06d}", episode)
+            write_bundle(target / f"episode_{count:06d}", episode)
         else:
-            size = (episode.frames.shape[-2], episode.frames.shape[-1])
-            writer = writer or LeRobotWriter(target, episode.views, size, episode.fps)
-            if (writer.views, writer.size) != (episode.views, size):
-                raise EpisodeError(
-                    f"episode {count} has views {episode.views} of {size}, those before {writer.views} of {writer.size}; convert them apart, or give size=[height,width]"
-                )
+            writer = writer or LeRobotWriter(target, episode.embodiment)
             writer.write([episode])
         count += 1
     return count
@@ -61,33 +62,34 @@ def overlay(
     return np.where(drawn, mixed, frame.transpose(1, 2, 0)).round().astype(np.uint8)
 
 
+def why_bare(episode: Episode) -> str:
+    """Why no grippers can be drawn into an episode's pictures; "" if they can."""
+    robot = episode.embodiment
+    if episode.c2w is None:
+        return f"nothing is drawn: cameras {list(robot.views)} of {robot.robot} are not calibrated"
+    if episode.poses is None and not robot.commands_poses:
+        return (
+            f"nothing is drawn: the actions of {robot.robot} ({robot.action_kind.value}, delta={robot.delta})"
+            " do not say where its flanges will be, and no flange poses were recorded"
+        )
+    return ""
+
+
 def inspect(
     source: Path, target: Path, cut: Cut, style: PoseMapStyle, rows: int = 4, episodes: int = 8
 ) -> list[Path]:
     """A picture per episode: some of its frames, a row each with all views side by side, the commanded
-    grippers drawn over them.
+    grippers drawn over them, or a word about why they are not.
     """
     target.mkdir(parents=True, exist_ok=True)
     made = []
-    for number, episode in enumerate(read_any(source, cut)):
-        if number == episodes:
-            break
-        shown = np.flatnonzero(episode.seen)
+    for number, episode in enumerate(islice(read_any(source, cut), episodes)):
+        shown = np.flatnonzero(episode.present)
         shown = shown[np.linspace(0, len(shown) - 1, min(rows, len(shown))).round().astype(int)]
-        part = Cut().of(episode)
-        for name in (
-            "frames",
-            "commands",
-            "achieved",
-            "states",
-            "c2w",
-            "success",
-            "progress",
-            "objects",
-            "seen",
-        ):
-            setattr(part, name, getattr(episode, name)[shown])
-        maps = pose_maps_of(part, torch.from_numpy(part.c2w), style).transpose(0, 1).numpy()
+        part, bare = episode.take(shown), why_bare(episode)
+        if bare:
+            tqdm.write(f"{source.name}, episode {number}: {bare}")
+        maps = np.full_like(part.frames, CANVAS) if bare else _pose_maps(part, style)
         sheet = np.concatenate(
             [
                 np.concatenate(
@@ -100,3 +102,21 @@ def inspect(
         cv2.imwrite(str(path), sheet[..., ::-1])
         made.append(path)
     return made
+
+
+def _pose_maps(episode: Episode, style: PoseMapStyle) -> NDArray[np.uint8]:
+    """Pose maps uint8 [T, V, 3, H, W]; uncalibrated cameras among others stay bare."""
+    assert episode.c2w is not None and episode.intrinsic is not None
+    if episode.poses is None:
+        robot = episode.embodiment
+        kinematics = None if robot.kinematics is None else Kinematics(robot.kinematics)
+        poses = end_effector_poses(robot, torch.from_numpy(episode.commands), kinematics)
+    else:
+        poses = torch.from_numpy(episode.poses)
+    known = [k for k, camera in enumerate(episode.embodiment.cameras) if camera.calibrated]
+    maps = np.full_like(episode.frames, CANVAS)
+    c2w = torch.from_numpy(episode.c2w[:, known]).transpose(0, 1)
+    intrinsic = torch.from_numpy(episode.intrinsic[known])
+    drawn = render_pose_map(poses, c2w, intrinsic, episode.size, style)
+    maps[:, known] = drawn.transpose(0, 1).numpy()
+    return maps

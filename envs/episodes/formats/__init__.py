@@ -1,0 +1,1 @@
+"""Formats of recorded episodes: LeRobot's, read and written, and other people's."""
