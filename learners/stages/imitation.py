@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from actors.policies.contract import VISUAL_FEATURES, imitation_loss, inputs_for, with_text
+from actors.policies.contract import VISUAL_FEATURES, feature_part, imitation_loss, inputs_for, with_text
 from envs.episodes.clips import ClipStore
 from envs.specs import (
     C2W,
@@ -73,9 +73,10 @@ class Cloning:
             raise ValueError(
                 f"{type(self.policy).__name__} writes no {VISUAL_FEATURES}; set rl.freeze_perception=false"
             )
+        encoder = feature_part(self.policy)
         with torch.no_grad():
             parts = [
-                self.policy(inputs_for(self.observe(some), self.policy))[VISUAL_FEATURES].cpu()
+                encoder(inputs_for(self.observe(some), self.policy))[VISUAL_FEATURES].cpu()
                 for some in self.rows.split(_AT_ONCE)
             ]
         self._features = torch.cat(parts)

@@ -13,14 +13,17 @@ import torch.distributed as dist
 import torch.multiprocessing as mp
 from torch import Tensor, nn
 
-from actors.factory import build_judge, build_policy, build_simulator, build_state_decoder
+from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
-from learners.stages.imitation import train_imitation
+from envs.specs import ActionMode
+from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.judge import train_judge
+from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
-from learners.stages.vision import VisionConfig, train_vision
 from learners.training.fit import FitConfig, fit
-from pipeline.config import load_config
+from tests.embodiments import ARM_DELTAS, world_spec
+from tests.learners.models import decoder_of, judge_of, policy_of, simulator_of
+from tests.moving_square import SIZE
 
 STEPS = 8
 
@@ -49,7 +52,7 @@ class Net(nn.Module):
         return self.frozen(self.leave(h) + self.twin(h)) + self.shift
 
 
-def train(folder: Path, stop_after: int | None = None) -> list[float]:
+def train(folder: Path, stop_after: int | None = None, optimiser: str = "adamw") -> list[float]:
     """Losses of all steps, then figures of the weights at the end."""
     torch.manual_seed(0)
     net = Net()
@@ -69,7 +72,16 @@ def train(folder: Path, stop_after: int | None = None) -> list[float]:
             net,
             batch,
             loss,
-            FitConfig(STEPS, 8, microbatches=2, lr=1e-3, warmup=2, bf16=False, checkpoint_every=3),
+            FitConfig(
+                STEPS,
+                8,
+                microbatches=2,
+                lr=1e-3,
+                warmup=2,
+                bf16=False,
+                checkpoint_every=3,
+                optimiser=optimiser,
+            ),
             folder,
         )
     except KeyboardInterrupt:
@@ -84,29 +96,33 @@ def train(folder: Path, stop_after: int | None = None) -> list[float]:
     return [row["toy/loss"] for row in rows] + [float(p.detach().abs().sum()) for p in net.parameters()]
 
 
-def whole_and_cut(folder: Path) -> list[float]:
+def whole_and_cut(folder: Path, optimiser: str) -> list[float]:
     """A run, and the first half of another."""
-    values = train(folder / "whole")
-    assert train(folder / "cut", 5) == []
+    values = train(folder / "whole", optimiser=optimiser)
+    assert train(folder / "cut", 5, optimiser) == []
     return values
 
 
 def stages(folder: Path, dataset: Path) -> list[float]:
-    """Losses of the first steps of every supervised stage, with the diffusion transformer as the simulator."""
-    cfg = load_config(["experiment=smoke", "simulator=dit_small", "launch.device=cpu"])
+    """Losses of the first steps of every supervised stage, in a diffusion transformer."""
     torch.set_num_threads(1)
-    torch.manual_seed(0)
-    store = ClipStore([dataset])
+    spec = world_spec(ARM_DELTAS.at(SIZE), SIZE)
+    store = ClipStore([dataset], spec)
     every, options = torch.arange(len(store)), FitConfig(3, 4, microbatches=2, lr=1e-3, warmup=1, bf16=False)
-    policy, simulator = build_policy(cfg), build_simulator(cfg)
-    decoder, judge = build_state_decoder(cfg, simulator), build_judge(cfg)
-    train_imitation(policy, store, every, options, folder / "imitation")
-    train_vision(simulator, store, every, VisionConfig(alone=1.0), options, folder / "vision")
+    policy, simulator = (
+        policy_of("chunk_gaussian", spec, ActionMode.ABSOLUTE),
+        simulator_of("dit_small", spec),
+    )
+    decoder, judge = decoder_of("dit_small", simulator), judge_of(spec)
+    clips = SimulatorFitConfig(1.0, 1, (1,), 0.0, 0)
+    cloning = Cloning(policy, store, every, ActionMode.ABSOLUTE)
+    train_imitation(cloning, options, folder / "imitation")
+    train_simulator(simulator, store, every, clips, options, folder / "simulator")
     train_state(decoder, simulator, store, every, options, folder / "state")
     train_judge(judge, store, every, options, folder / "judge")
     return [
         json.loads(line)[f"{name}/loss"]
-        for name in ("imitation", "vision", "state", "judge")
+        for name in ("imitation", "simulator", "state", "judge")
         for line in (folder / name / "metrics.jsonl").read_text().splitlines()
     ]
 
@@ -130,16 +146,23 @@ def two(work: Callable[..., list[float]], folder: Path, *given: Any) -> list[lis
     return [json.loads(path.read_text()) for path in sorted(folder.glob("values-*.json"))]
 
 
-def test_two_workers_follow_one_and_either_goes_on_from_the_others_checkpoint(tmp_path: Path) -> None:
-    alone = train(tmp_path / "alone")
-    leader, follower = two(whole_and_cut, tmp_path / "two")
-    assert leader == follower == pytest.approx(alone, rel=1e-4)
-    assert train(tmp_path / "two" / "cut") == pytest.approx(alone, rel=1e-4)
-    assert train(tmp_path / "from-one", stop_after=5) == []
-    assert two(train, tmp_path / "from-one")[1] == pytest.approx(alone, rel=1e-4)
+@pytest.mark.parametrize("optimiser", ["adamw", "muon"])
+def test_two_workers_follow_one_and_either_goes_on_from_the_others_checkpoint(
+    tmp_path: Path, optimiser: str
+) -> None:
+    close = {"adamw": 1e-4, "muon": 2e-3}[optimiser]  # Muon's iteration runs in bfloat16
+    alone = train(tmp_path / "alone", optimiser=optimiser)
+    leader, follower = two(whole_and_cut, tmp_path / "two", optimiser)
+    assert leader == follower == pytest.approx(alone, rel=close)
+    assert train(tmp_path / "two" / "cut", optimiser=optimiser) == pytest.approx(alone, rel=close)
+    assert train(tmp_path / "from-one", 5, optimiser) == []
+    assert two(train, tmp_path / "from-one", None, optimiser)[1] == pytest.approx(alone, rel=close)
 
 
-def test_two_workers_follow_one_in_every_supervised_stage(tmp_path: Path, dataset: Path) -> None:
+def test_two_workers_follow_one_in_every_supervised_stage(
+    tmp_path: Path, tiny_data: Callable[[Embodiment], Path]
+) -> None:
+    dataset = tiny_data(ARM_DELTAS)
     alone = stages(tmp_path / "alone", dataset)
     assert len(alone) == 12 and two(stages, tmp_path / "two", dataset)[0] == pytest.approx(alone, rel=1e-3)
 

@@ -1,0 +1,145 @@
+"""The training loop: exact resume with every optimiser, checkpoints without code in them, clear errors."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from learners.training.checkpoint import Checkpoints
+from learners.training.fit import FitConfig, TrainingDiverged, fit, follow
+from learners.training.optimisers import OPTIMISERS, optimiser_state
+
+
+class Net(nn.Module):
+    """A matrix, a convolution, vectors and a buffer that training moves."""
+
+    seen: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv, self.line = nn.Conv1d(1, 4, 3, padding=1), nn.Linear(24, 1)
+        self.register_buffer("seen", torch.zeros(()))
+
+    def loss(self, data: Tensor, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
+        self.seen += 1
+        noise = torch.rand(len(data), 1, generator=generator)
+        error = self.line(torch.tanh(self.conv(data)).flatten(1)) - data.sum(-1) - 0.1 * noise
+        return error.square().mean(), {}
+
+
+def train(
+    folder: Path, optimiser: str = "adamw", stop: int = -1, spoil: int = -1
+) -> tuple[Net, list[dict[str, float]]]:
+    """The trained network and its log; stops, as if killed, or meets NaN at a step."""
+    torch.manual_seed(0)
+    net = Net()
+    options = FitConfig(20, 8, lr=1e-2, warmup=3, bf16=False, checkpoint_every=6, seed=5, optimiser=optimiser)
+
+    def batch(step: int, generator: torch.Generator) -> Tensor:
+        if step == stop:
+            raise KeyboardInterrupt
+        data = torch.randn(8, 1, 6, generator=generator)
+        return data * math.nan if step == spoil else data
+
+    fit("toy", net, batch, net.loss, options, folder)
+    return net, [json.loads(line) for line in (folder / "metrics.jsonl").open()]
+
+
+@pytest.mark.parametrize("optimiser", OPTIMISERS)
+def test_a_killed_run_goes_on_bit_for_bit(tmp_path: Path, optimiser: str) -> None:
+    whole, log = train(tmp_path / "whole", optimiser)
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path / "cut", optimiser, stop=15)
+    assert [path.name for path in (tmp_path / "cut").glob("checkpoint-*")] == ["checkpoint-000000012"]
+    resumed, rest = train(tmp_path / "cut", optimiser)
+    assert rest == log
+    assert all(torch.equal(value, whole.state_dict()[name]) for name, value in resumed.state_dict().items())
+    assert not list((tmp_path / "cut").glob("*checkpoint-*"))
+
+
+def test_checkpoints_hold_numbers_and_no_code(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path, stop=15)
+    checkpoint = Checkpoints(tmp_path).newest
+    assert checkpoint is not None
+    assert {path.suffix for path in checkpoint.iterdir()} == {".safetensors", ".json"}
+    assert Checkpoints(tmp_path).facts()["step"] == 12  # type: ignore[index]
+
+
+@pytest.mark.parametrize(
+    ("other", "what"), [({"w": torch.zeros(3)}, "w is"), ({"v": torch.zeros(2)}, "v is in only one")]
+)
+def test_a_checkpoint_of_another_architecture_is_refused(
+    tmp_path: Path, other: dict[str, Tensor], what: str
+) -> None:
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, {"module": {"w": torch.ones(2)}}, {})
+    with pytest.raises(RuntimeError, match=f"another architecture: module: {what}"):
+        checkpoints.load({"module": other})
+    with pytest.raises(RuntimeError, match="another architecture: optimiser"):
+        checkpoints.load({"optimiser": {}})
+
+
+def test_a_damaged_checkpoint_is_refused_by_name(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, {"module": {"w": torch.ones(2)}}, {})
+    (tmp_path / "checkpoint-000000001/module.safetensors").write_bytes(b"\x00" * 20)
+    with pytest.raises(RuntimeError, match="checkpoint-000000001"):
+        checkpoints.load({"module": {"w": torch.zeros(2)}})
+
+
+def test_a_checkpoint_that_cannot_be_written_keeps_its_predecessor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, {"module": {"w": torch.ones(2)}}, {"step": 1})
+    with pytest.raises(TypeError):
+        checkpoints.save(2, {"module": {"w": torch.ones(2)}}, {"step": object()})
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint-000000001"]
+    value = {"w": torch.zeros(2)}
+    assert checkpoints.load({"module": value}) == {"step": 1} and value["w"].tolist() == [1.0, 1.0]
+
+
+def test_strange_tensors_come_back_as_they_were(tmp_path: Path) -> None:
+    conv = torch.randn(4, 3, 2, 2).to(memory_format=torch.channels_last)
+    shared = torch.randn(5)
+    held = {"a": {"conv": conv, "one": shared, "two": shared[1:]}, "count": torch.tensor(7), "none": {}}
+    Checkpoints(tmp_path).save(1, {"module": held}, {})
+    empty = {
+        "a": {"conv": torch.empty_like(conv), "one": torch.zeros(5), "two": torch.zeros(4)},
+        "count": torch.tensor(0),
+        "none": {},
+    }
+    Checkpoints(tmp_path).load({"module": empty})
+    assert torch.equal(empty["a"]["conv"], conv) and empty["a"]["conv"].stride() == conv.stride()
+    assert torch.equal(empty["a"]["two"], shared[1:]) and int(empty["count"]) == 7
+
+
+def test_divergence_is_said_at_once(tmp_path: Path) -> None:
+    with pytest.raises(TrainingDiverged, match=r"toy: loss nan.*at step 4; lower toy\.lr"):
+        train(tmp_path, spoil=4)
+
+
+def test_the_average_follows_the_weights() -> None:
+    average, weights = {"w": torch.tensor([1.0])}, {"w": torch.tensor([3.0])}
+    follow(average, weights, 0.75)
+    assert average["w"].tolist() == [1.5]
+
+
+def test_muon_takes_matrices_and_adamw_the_rest() -> None:
+    net = Net()
+    trained = dict(net.named_parameters())
+    state = optimiser_state(OPTIMISERS["muon"](trained, 1e-3, 0.0), trained)
+    assert set(state) == set(trained)
+    assert {name for name, held in state.items() if "momentum_buffer" in held} == {"line.weight"}
+
+
+def test_unknown_optimisers_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"optimiser=sgd must be one of \['adamw', 'muon'\]"):
+        FitConfig(1, optimiser="sgd")
