@@ -1,173 +1,174 @@
-"""The command line. Every command takes Hydra overrides: worldloop run experiment=quickstart seed=1."""
+"""The command line. Every command takes Hydra overrides: worldloop run experiment=quickstart seed=1.
+
+What a command needs is imported when it runs, so that help and mistakes answer at once.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+from envs.targets import ConfigError, nearest
 
-from actors.factory import ConfigError, build_openpi, build_physics, build_policy, prepare_process
-from actors.fleets.fleet import FleetError
-from actors.policies.openpi import PolicyServerError
-from envs.conditioning import PoseMapStyle
-from envs.episodes.episode import EpisodeError
-from envs.episodes.formats.foreign import Cut
-from envs.physics.pool import PoolError
-from envs.physics.render import MissingGL
-from envs.simulators.gesim.checkpoint import CheckpointError
-from envs.simulators.gesim.fixture import FixtureError
-from envs.simulators.remote.engine import RemoteError
-from learners.training.fit import TrainingDiverged
-from pipeline.config import load_config
-from pipeline.evaluation.statistics import rate_entry, rate_line
-from pipeline.loop import build_loop
-from pipeline.stages.given import EVALUATE, load_world, open_store, seeds_of
+Words = list[str]
 
 
-def _root(cfg: dict[str, Any]) -> Path:
-    return Path(cfg["runs"]) / cfg["name"]
-
-
-def run(words: list[str]) -> None:
+def run(words: Words) -> None:
     """run the whole loop of an experiment; finished stages are reused, interrupted ones resume"""
-    from pipeline.track import publish
+    from pipeline.loop import build_loop
+    from pipeline.track import tracking
 
-    cfg = load_config(words)
-    prepare_process(cfg["seed"])
-    root = _root(cfg)
+    cfg, root = _prepared(words)
     graph = build_loop(cfg, root)
-    print(f"{len(graph.stages)} stages in {root}; each says how long it will take after its first steps")
-    manifests = graph.run()
-    result = json.loads((root / "result.json").read_text())
-    tracked = publish(cfg, {name: graph.folder(name) for name in graph.stages}, result, root)
-    total = sum(m["seconds"] for m in manifests.values())
-    print(
-        f"\n{result['verdict']}\n{root}/report.html, {root}/result.json; {total / 60:.1f} min of work"
-        + (f"; wandb in {tracked}" if tracked else "")
-    )
+    print(f"{len(graph.nodes)} stages in {root}; each says how long it will take after its first steps")
+    with tracking(cfg, root) as tracker:
+        manifests = graph.run(tracker=tracker)
+        result = json.loads((root / "result.json").read_text())
+        tracker.summarise(result)
+    minutes = sum(manifest["seconds"] for manifest in manifests.values()) / 60
+    print(f"\n{result['verdict']}\n{root}/report.html, {root}/result.json; {minutes:.1f} min of work")
 
 
-def stage(words: list[str]) -> None:
-    """run one stage and what it needs: worldloop stage vision-1 experiment=quickstart"""
+def stage(words: Words) -> None:
+    """run one stage and what it needs: worldloop stage simulator-1 experiment=quickstart"""
     if not words or "=" in words[0]:
         raise ConfigError(
             "say which stage: worldloop stage imitation experiment=quickstart; `worldloop stages` lists them"
         )
-    cfg = load_config(words[1:])
-    prepare_process(cfg["seed"])
-    graph = build_loop(cfg, _root(cfg))
-    if words[0] not in graph.stages:
-        raise ConfigError(f"no stage {words[0]}; choose from {list(graph.stages)}")
-    graph.run(words[0])
+    _run_until(words[0], words[1:])
 
 
-def rl(words: list[str]) -> None:
+def rl(words: Words) -> None:
     """the loop up to its last policy, on any launch: worldloop rl launch=ray launch.actors=4
     experiment=quickstart
     """
-    cfg = load_config(words)
-    prepare_process(cfg["seed"])
-    graph = build_loop(cfg, _root(cfg))
-    last = f"rl-{cfg['rounds']['count']}"
-    graph.run(last)
-    print(f"\nthe policy lies in {graph.folder(last)}; worldloop evaluate policy={last} {' '.join(words)}")
+    from pipeline.config import load_config
+    from pipeline.loop import last_round
+
+    last = f"rl-{last_round(load_config(words))}"
+    folder = _run_until(last, words)
+    print(f"\nthe policy lies in {folder}; worldloop evaluate policy={last} {' '.join(words)}")
 
 
-def stages(words: list[str]) -> None:
-    """list the stages of an experiment, their folders, and which are finished"""
+def stages(words: Words) -> None:
+    """list the stages of an experiment, their folders, which are finished, and why others will run again"""
+    from pipeline.config import load_config
+    from pipeline.loop import build_loop
+
     cfg = load_config(words)
     graph = build_loop(cfg, _root(cfg))
-    for name in graph.stages:
+    for name in graph.nodes:
         folder = graph.folder(name)
-        print(f"{'done' if (folder / 'manifest.json').exists() else '    '}  {name:<18} {folder}")
+        done = (folder / "manifest.json").exists()
+        mark = "done" if done else "half" if folder.exists() else "    "
+        print(f"{mark}  {name:<18} {folder}")
+        if why := graph.why(name):
+            print(f"      {why}")
 
 
-def evaluate(words: list[str]) -> None:
-    """success of a policy: worldloop evaluate policy=<folder|stage|openpi url=ws://...>
-    world=physics|imagined experiment=...
+def evaluate(words: Words) -> None:
+    """success of a policy: worldloop evaluate policy=<stage|folder> world=physics|imagined experiment=...; one
+    that needs no weights is a choice of configs/policy: policy=openpi policy.url=ws://...
     """
-    from actors.rollouts.evaluate import evaluate as episodes
+    from pipeline.config import choices
+    from pipeline.evaluate import evaluate_policy
 
-    own = {
-        word.split("=", 1)[0]: word.split("=", 1)[1]
-        for word in words
-        if word.startswith(("policy=", "world=", "url="))
-    }
-    cfg = load_config([word for word in words if word.split("=")[0] not in own])
-    graph = build_loop(cfg, _root(cfg))
-    name = own.get("policy", "imitation")
-    folder = graph.folder(name) if name in graph.stages else Path(name)
-    policy: Any = (
-        build_openpi(cfg, own.get("url", ""))
-        if name == "openpi"
-        else build_policy(cfg, folder / "weights.safetensors")
+    own, rest = {"weights": "", "world": "physics"}, []
+    for word in words:
+        key, _, value = word.partition("=")
+        if key == "world":
+            own["world"] = value
+        elif key == "policy" and value not in choices("policy"):
+            own["weights"] = value
+        else:
+            rest.append(word)
+    cfg, root = _prepared(rest)
+    print(evaluate_policy(cfg, root, **own))
+
+
+def controls(words: Words) -> None:
+    """whose gain is it: beside a finished run the loop without RL iterations, RL in physics, filtered BC"""
+    from pipeline.controls import run_controls, table_text
+    from pipeline.track import tracking
+
+    cfg, root = _prepared(words)
+    with tracking(cfg, root) as tracker:
+        table = run_controls(cfg, root, tracker)
+    print(f"{table_text(table)}\n{root}/controls.json, {root}/report.html")
+
+
+def compare(words: Words) -> None:
+    """finished runs side by side, as a Markdown table: worldloop compare runs/quickstart
+    runs/quickstart_dit
+    """
+    from pipeline.evaluation.compare import compare as table
+
+    if not words:
+        raise ConfigError("say which runs: worldloop compare runs/quickstart runs/quickstart_dit")
+    print(table([Path(word) for word in words]))
+
+
+def finetune(words: Words) -> None:
+    """train a simulator on any LeRobot data: worldloop finetune simulator=gesim simulator.checkpoint=<folder>
+    finetune.data=[<folder>]
+    """
+    from pipeline.finetune import build_finetune
+    from pipeline.track import tracking
+
+    cfg, root = _prepared(words)
+    graph = build_finetune(cfg, root)
+    with tracking(cfg, root / "finetune") as tracker:
+        graph.run(tracker=tracker)
+    print(f"weights in {graph.folder('simulator')} and {graph.folder('state')}")
+
+
+def serve(words: Words) -> None:
+    """serve a simulator to many sessions by GE-Sim's protocol: worldloop serve simulator=gesim
+    simulator.checkpoint=<folder>
+    """
+    from actors.serving.app import serve as run_server
+    from pipeline.serving import build_session_host
+
+    cfg, root = _prepared(words)
+    host, config = build_session_host(cfg, root)
+    name = cfg["simulator"]["_target_"].rpartition(".")[2]
+    print(
+        f"{name} at http://{config.host}:{config.port}, up to {config.sessions} sessions; look at it in a"
+        " browser, end it with Ctrl-C",
+        flush=True,
     )
-    prepare_process(cfg["seed"])
-    world = own.get("world", "physics")
-    if world == "physics":
-        env: Any = build_physics(cfg, cfg["evaluate"]["envs"])
-        seeds = seeds_of(cfg, EVALUATE, cfg["evaluate"]["episodes"])
-    elif world == "imagined":
-        last = cfg["rounds"]["count"]
-        data = ("collect", *(f"deploy-{n}" for n in range(1, last + 1)))
-        found = {stage: graph.folder(stage) for stage in graph.stages}
-        store = open_store(cfg, found, data)
-        seeds = list(range(min(cfg["evaluate"]["imagined"], len(store))))
-        env = load_world(
-            cfg, found, store, f"vision-{last}", f"state-{last}", f"judge-{last}", min(64, len(seeds))
-        )
-    else:
-        raise ConfigError(f"world={world!r} must be physics or imagined")
-    try:
-        outcome = episodes(env, policy, seeds, label=world)
-    finally:
-        env.close()
-    entry = rate_entry(outcome.success[outcome.judged])
-    print(f"{folder} in {world}: {rate_line(entry)}, {int((~outcome.judged).sum())} dropped by the judge")
+    run_server(host, name, config)
 
 
-def submit(words: list[str]) -> None:
-    """run a command on a Ray cluster: worldloop submit http://head:8265 rl launch=ray launch.actors=8"""
-    from pipeline.submit import submit as send
-
-    if not words or not words[0].startswith("http"):
-        raise ConfigError(
-            "say where: worldloop submit http://head:8265 rl experiment=quickstart launch=ray launch.actors=8"
-        )
-    load_config(words[2:])  # mistakes are better found here than there
-    send(words[0], words[1:])
-
-
-def chaos(words: list[str]) -> None:
-    """kill parts of a small Ray run by a seeded schedule and check its ledger: worldloop chaos
-    chaos.seconds=60
+def convert(words: Words) -> None:
+    """GE-Sim, AgiBot or Bridge recordings to LeRobot v3.0, and LeRobot back to GE-Sim 2.0 bundles: worldloop
+    convert SRC DST [frames=N] [size=[H,W]]
     """
-    from pipeline.chaos.chaos import ChaosFailure, run_chaos
+    from pipeline.convert import convert as write
 
-    base = ["experiment=smoke", "algorithm=grpo", "launch=ray", "launch.judge_service=true", "launch.cpus=8"]
-    words = [
-        *(word for word in base if not any(own.startswith(word.split("=")[0] + "=") for own in words)),
-        *words,
-    ]
-    cfg = load_config(words)
-    try:
-        found = run_chaos(cfg, words, Path(cfg["runs"]) / f"chaos-{cfg['seed']}")
-    except ChaosFailure as error:
-        print(f"worldloop chaos: {error}", file=sys.stderr)
-        sys.exit(1)
-    print(json.dumps(found, indent=1))
+    usage = "say from where to where: worldloop convert SRC DST [frames=N] [size=[H,W]]"
+    paths, cut, _ = _source_and_cut(words, usage)
+    print(f"{write(paths[0], paths[1], cut)} episodes in {paths[1]}")
 
 
-def config(words: list[str]) -> None:
-    """print the resolved config"""
-    print(OmegaConf.to_yaml(OmegaConf.create(load_config(words))), end="")
+def inspect(words: Words) -> None:
+    """pictures of recordings with the commanded grippers drawn over them: worldloop inspect SRC DST
+    [frames=N] [tool_offset=0.15]
+    """
+    from envs.conditioning import PoseMapStyle
+    from pipeline.convert import inspect as draw
+
+    usage = "say from where to where: worldloop inspect SRC DST [frames=N] [size=[H,W]] [tool_offset=0.15]"
+    paths, cut, own = _source_and_cut(words, usage)
+    style = PoseMapStyle(tool_offset=float(own.get("tool_offset", 0.15)))
+    for path in draw(paths[0], paths[1], cut, style):
+        print(path)
 
 
-def bench(words: list[str]) -> None:
+def bench(words: Words) -> None:
     """measure performance: worldloop bench
     conditioning|physics|world|actors|learning|gesim|overfit|pretrained
     """
@@ -176,7 +177,7 @@ def bench(words: list[str]) -> None:
     run_bench(words)
 
 
-def verify(words: list[str]) -> None:
+def verify(words: Words) -> None:
     """compare our network with a public one's outputs: worldloop verify gesim FIXTURE.safetensors"""
     from envs.simulators.gesim.fixture import verify as errors_of
 
@@ -190,128 +191,110 @@ def verify(words: list[str]) -> None:
         sys.exit(1)
 
 
-def doctor(words: list[str]) -> None:
+def submit(words: Words) -> None:
+    """run a command on a Ray cluster: worldloop submit http://head:8265 rl launch=ray launch.actors=8"""
+    from pipeline.config import load_config
+    from pipeline.submit import submit as send
+
+    if not words or not words[0].startswith("http"):
+        raise ConfigError(
+            "say where: worldloop submit http://head:8265 rl experiment=quickstart launch=ray launch.actors=8"
+        )
+    load_config([word for word in words[2:] if "=" in word])  # mistakes are better found here than there
+    send(words[0], words[1:])
+
+
+def chaos(words: Words) -> None:
+    """kill parts of a small Ray run by a seeded schedule and check its ledger: worldloop chaos
+    chaos.seconds=60
+    """
+    from pipeline.chaos.chaos import ChaosFailure, run_chaos
+    from pipeline.config import load_config
+
+    base = ("experiment=smoke", "algorithm=grpo", "launch=ray", "launch.judge_service=true", "launch.cpus=8")
+    words = [*without_given(base, words), *words]
+    cfg = load_config(words)
+    try:
+        found = run_chaos(cfg, words, Path(cfg["runs"]) / f"chaos-{cfg['seed']}")
+    except ChaosFailure as error:
+        print(f"worldloop chaos: {error}", file=sys.stderr)
+        sys.exit(1)
+    print(json.dumps(found, indent=1))
+
+
+def config(words: Words) -> None:
+    """print the resolved config"""
+    from omegaconf import OmegaConf
+
+    from pipeline.config import load_config
+
+    print(OmegaConf.to_yaml(OmegaConf.create(load_config(words))), end="")
+
+
+def doctor(words: Words) -> None:
     """say what this machine has and what is missing"""
     from pipeline.doctor import examine
 
     sys.exit(examine())
 
 
-def controls(words: list[str]) -> None:
-    """the same physics budget spent without a simulator: filtered BC on the data, and RL in physics"""
-    from pipeline.evaluation.controls import run_controls
-
-    cfg = load_config(words)
-    prepare_process(cfg["seed"])
-    run_controls(cfg, _root(cfg))
-
-
-def compare(words: list[str]) -> None:
-    """finished runs side by side, as a Markdown table: worldloop compare runs/quickstart runs/quickstart_dit"""
-    from pipeline.evaluation.compare import compare as table
-
-    if not words:
-        raise ConfigError("say which runs: worldloop compare runs/quickstart runs/quickstart_dit")
-    print(table([Path(word) for word in words]))
-
-
-def finetune(words: list[str]) -> None:
-    """train a simulator on any LeRobot data: worldloop finetune simulator=gesim simulator.checkpoint=<folder>
-    finetune.data=[<folder>]
-    """
-    from pipeline.finetune import build_finetune
-
-    cfg = load_config(words)
-    prepare_process(cfg["seed"])
-    graph = build_finetune(cfg, _root(cfg))
-    graph.run()
-    print(f"weights in {graph.folder('vision')} and {graph.folder('state')}")
-
-
-def serve(words: list[str]) -> None:
-    """serve a simulator to many sessions by GE-Sim's protocol: worldloop serve simulator=gesim
-    simulator.checkpoint=<folder>
-    """
-    from actors.serving.app import serve as run_server
-    from pipeline.serving import build_session_host
-
-    cfg = load_config(words)
-    prepare_process(cfg["seed"])
-    host, config = build_session_host(cfg, _root(cfg))
-    print(
-        f"{cfg['simulator']['engine']} at http://{config.host}:{config.port}, up to {config.sessions} sessions; look at it in a browser, end it with Ctrl-C",
-        flush=True,
-    )
-    run_server(host, cfg["simulator"]["engine"], config)
-
-
-def _source_and_cut(words: list[str], count: int, usage: str) -> tuple[list[Path], Cut, dict[str, str]]:
-    paths = [Path(word) for word in words if "=" not in word]
-    own = {word.split("=", 1)[0]: word.split("=", 1)[1] for word in words if "=" in word}
-    if len(paths) != count or set(own) - {"frames", "size", "tool_offset"}:
-        raise ConfigError(usage)
-    try:
-        return (
-            paths,
-            Cut(
-                int(own.get("frames", 0)),
-                tuple(int(n) for n in own.get("size", "").strip("[]").split(",") if n),
-            ),
-            own,
-        )
-    except ValueError as error:
-        raise ConfigError(f"{usage}: {error}") from error
-
-
-def convert(words: list[str]) -> None:
-    """GE-Sim, AgiBot or Bridge recordings to LeRobot v3.0, and LeRobot back to GE-Sim 2.0 bundles: worldloop
-    convert SRC DST [frames=N] [size=[H,W]]
-    """
-    from pipeline.convert import convert as write
-
-    paths, cut, _ = _source_and_cut(
-        words, 2, "say from where to where: worldloop convert SRC DST [frames=N] [size=[H,W]]"
-    )
-    print(f"{write(paths[0], paths[1], cut)} episodes in {paths[1]}")
-
-
-def inspect(words: list[str]) -> None:
-    """pictures of recordings with the commanded grippers drawn over them: worldloop inspect SRC DST
-    [frames=N] [tool_offset=0.15]
-    """
-    from pipeline.convert import inspect as draw
-
-    paths, cut, own = _source_and_cut(
-        words,
-        2,
-        "say from where to where: worldloop inspect SRC DST [frames=N] [size=[H,W]] [tool_offset=0.15]",
-    )
-    for path in draw(paths[0], paths[1], cut, PoseMapStyle(tool_offset=float(own.get("tool_offset", 0.15)))):
-        print(path)
-
-
-COMMANDS: dict[str, Callable[[list[str]], None]] = {
-    f.__name__: f
-    for f in (
-        run,
-        rl,
-        stage,
-        stages,
-        evaluate,
-        controls,
-        compare,
-        finetune,
-        serve,
-        convert,
-        inspect,
-        bench,
-        verify,
-        submit,
-        chaos,
-        config,
-        doctor,
+COMMANDS: dict[str, Callable[[Words], None]] = {
+    command.__name__: command
+    for command in (
+        *(run, rl, stage, stages, evaluate, controls, compare, finetune, serve, convert, inspect),
+        *(bench, verify, submit, chaos, config, doctor),
     )
 }
+_ROOMS = ("envs", "actors", "learners", "pipeline")
+
+
+def without_given(base: Sequence[str], words: Sequence[str]) -> list[str]:
+    """Those overrides of `base` whose keys the words do not set themselves."""
+    given = {word.split("=")[0] for word in words}
+    return [word for word in base if word.split("=")[0] not in given]
+
+
+def _root(cfg: dict[str, Any]) -> Path:
+    return Path(cfg["runs"]) / cfg["name"]
+
+
+def _prepared(words: Words) -> tuple[dict[str, Any], Path]:
+    """The config and the run's folder, with this process made ready for work."""
+    from actors.factory import prepare_process
+    from pipeline.config import load_config
+
+    cfg = load_config(words)
+    prepare_process(cfg["seed"])
+    return cfg, _root(cfg)
+
+
+def _run_until(name: str, words: Words) -> Path:
+    """Run a stage and what it needs; returns its folder."""
+    from pipeline.loop import build_loop
+    from pipeline.track import tracking
+
+    cfg, root = _prepared(words)
+    graph = build_loop(cfg, root)
+    if name not in graph.nodes:
+        raise ConfigError(f"no stage {name}{nearest(name, graph.nodes)}")
+    with tracking(cfg, root) as tracker:
+        graph.run(name, tracker)
+    return graph.folder(name)
+
+
+def _source_and_cut(words: Words, usage: str) -> tuple[list[Path], Any, dict[str, str]]:
+    """Two paths, the Cut that frames= and size= ask for, and all options of convert and inspect."""
+    from envs.episodes.formats.foreign import Cut
+
+    paths = [Path(word) for word in words if "=" not in word]
+    own = {key: value for key, _, value in (word.partition("=") for word in words if "=" in word)}
+    if len(paths) != 2 or set(own) - {"frames", "size", "tool_offset"}:
+        raise ConfigError(usage)
+    try:
+        size = tuple(int(n) for n in own.get("size", "").strip("[]").split(",") if n)
+        return paths, Cut(int(own.get("frames", 0)), size), own
+    except ValueError as error:
+        raise ConfigError(f"{usage}: {error}") from error
 
 
 def _help() -> str:
@@ -323,6 +306,11 @@ def _help() -> str:
     )
 
 
+def _explained(error: Exception) -> bool:
+    """Whether an error's message is all that a user needs: the system's, and those that Worldloop defines."""
+    return isinstance(error, OSError) or type(error).__module__.split(".")[0] in _ROOMS
+
+
 def main() -> None:
     """Entry point of `worldloop` and `python -m pipeline`."""
     words = sys.argv[1:]
@@ -330,25 +318,15 @@ def main() -> None:
         print(_help())
         return
     if words[0] not in COMMANDS:
-        print(f"no command {words[0]!r}\n\n{_help()}", file=sys.stderr)
+        print(f"no command {words[0]!r}{nearest(words[0], COMMANDS)}\n\n{_help()}", file=sys.stderr)
         sys.exit(2)
     try:
         COMMANDS[words[0]](words[1:])
-    except (
-        CheckpointError,
-        ConfigError,
-        EpisodeError,
-        FixtureError,
-        FleetError,
-        MissingGL,
-        PolicyServerError,
-        PoolError,
-        RemoteError,
-        TrainingDiverged,
-        OSError,
-    ) as error:
-        print(f"worldloop {words[0]}: {error}", file=sys.stderr)
-        sys.exit(1)
     except KeyboardInterrupt:
         print("\ninterrupted; the same command goes on from the last checkpoint", file=sys.stderr)
         sys.exit(130)
+    except Exception as error:
+        if not _explained(error):
+            raise
+        print(f"worldloop {words[0]}: {error}", file=sys.stderr)
+        sys.exit(1)

@@ -33,7 +33,7 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
         text = str(error).split("\nSee https")[0].split("\nfull_key")[0]
         raise ConfigError(
             hint
-            or f"{text}\nGroups are {', '.join(groups())}; `worldloop config` prints every key with its value."
+            or f"{text}\nGroups are {', '.join(groups())}; `worldloop config` prints every key and its value."
         ) from error
     check(cfg)
     return cfg
@@ -42,6 +42,11 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
 def groups() -> list[str]:
     """Names of the folders of choices."""
     return sorted(p.name for p in CONFIGS.iterdir() if p.is_dir() and not p.name.startswith("_"))
+
+
+def choices(group: str) -> list[str]:
+    """What can be chosen for a group, such as policy."""
+    return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
 
 
 def check(cfg: Mapping[str, Any]) -> None:
@@ -59,8 +64,8 @@ def check(cfg: Mapping[str, Any]) -> None:
         raise ConfigError(f"task.size={task['size']} must be multiples of 16 in both directions")
     if not task.get("suite") and not task.get("data"):
         raise ConfigError(
-            "task has neither a suite (physics) nor data (recordings): task.data=[folder of a LeRobot data set],"
-            " or another task"
+            "task has neither a suite (physics) nor data (recordings): task.data=[folder of a LeRobot data"
+            " set], or another task"
         )
     if abs(sum(cfg["collect"]["mix"].values()) - 1) > 1e-6:
         raise ConfigError(f"collect.mix={cfg['collect']['mix']} must add up to 1")

@@ -21,6 +21,8 @@ _NEEDED = (
     "wandb",
     "opencv-python-headless",
     "matplotlib",
+    "scipy",
+    "jinja2",
 )
 
 
@@ -35,7 +37,8 @@ def examine() -> int:
 
     say(
         True,
-        f"{platform.system()} {platform.release()}, Python {platform.python_version()}, {os.cpu_count()} cores",
+        f"{platform.system()} {platform.release()}, Python {platform.python_version()},"
+        f" {os.cpu_count()} cores",
     )
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     say(memory >= 6, f"{memory:.0f} GiB of memory", "quickstart needs about 6 GiB")
@@ -51,12 +54,14 @@ def examine() -> int:
     else:
         print("[--] no GPU; everything runs on the CPU")
     try:
-        from envs.physics.tabletop.bench import Bench, BenchConfig
+        from envs.physics.suite import build_suite
+        from pipeline.config import load_config
 
-        bench = Bench(BenchConfig())
-        bench.reset(0)
+        task = load_config([])["task"]
+        suite = build_suite(task["suite"])
+        suite.reset(task["name"], 0)
         say(
-            int(bench.render().max()) > 0,
+            int(suite.render().max()) > 0,
             f"OpenGL renders (MUJOCO_GL={os.environ.get('MUJOCO_GL', 'egl')})",
             "the picture is black: try MUJOCO_GL=osmesa",
         )

@@ -18,7 +18,7 @@ from pipeline.code_version import code_of, digest
 from pipeline.stage import Inputs, Stage
 from pipeline.stage_workers import run_stage
 from pipeline.track import NullTracker, Tracker
-from pipeline.view import sections
+from pipeline.view import ConfigView, sections
 
 Names = Mapping[str, str | Sequence[str] | None]
 
@@ -109,6 +109,11 @@ class Graph:
             for role, names in node.inputs.items()
         }
         return Inputs(found, node.settings)
+
+    def view(self, name: str) -> ConfigView:
+        """The part of the config that a node may read."""
+        node = self.nodes[name]
+        return node.stage.view(name, self.cfg, node.settings)
 
     def result(self, name: str) -> dict[str, Any]:
         """What a finished node returned.

@@ -105,7 +105,7 @@ def _data_loop(graph: Graph, cfg: Cfg) -> None:
 def _refresh(graph: Graph, cfg: Cfg, data: list[str], before: World, number: int) -> World:
     """The stages that train the imagined world on all data so far, from its predecessor if there is one."""
     phase, warm = ("refresh", before.simulator) if before.simulator else ("first", "")
-    if not warm and "tokenizer" in cfg["simulator"]:
+    if not warm and "codec" in cfg["simulator"]:
         warm = graph.add("tokenizer", world.tokenizer, {"data": data})
     simulator = graph.add(f"simulator-{number}", world.simulator, {"data": data, "warm": warm}, phase=phase)
     inputs = {"data": data, "simulator": simulator}

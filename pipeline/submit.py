@@ -1,4 +1,4 @@
-"""worldloop submit: the same command, as a job on a Ray cluster."""
+"""worldloop submit: the same command, as a job on a Ray cluster; it tracks itself in its run's folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from ray.job_submission import JobStatus, JobSubmissionClient
 from tqdm import tqdm
 
-from actors.factory import ConfigError
+from envs.targets import ConfigError
 
 # What a job needs none of; Ray refuses packages over 500 MiB, and runs/ alone may be larger.
 EXCLUDES = [
@@ -36,7 +36,8 @@ def entrypoint(words: Sequence[str]) -> str:
     """
     if not words or "=" in words[0]:
         raise ConfigError(
-            "say what to run: worldloop submit http://head:8265 rl experiment=quickstart launch=ray launch.actors=8"
+            "say what to run: worldloop submit http://head:8265 rl experiment=quickstart launch=ray"
+            " launch.actors=8"
         )
     if not any(word.startswith("launch=ray") for word in words):
         raise ConfigError("a submitted command needs launch=ray, or it would run on the head node alone")
@@ -63,7 +64,8 @@ def submit(address: str, words: Sequence[str]) -> str:
         )
     except (ConnectionError, RuntimeError, ValueError) as error:
         raise ConfigError(
-            f"{address} takes no jobs: {str(error).splitlines()[0]}. Is the dashboard on (ray start --head --dashboard-host ...), and is ~/.ray/auth_token the head node's?"
+            f"{address} takes no jobs: {str(error).splitlines()[0]}. Is the dashboard on (ray start --head"
+            " --dashboard-host ...), and is ~/.ray/auth_token the head node's?"
         ) from error
     tqdm.write(f"job {job}: {command}\nstop it with: ray job stop {job} --address {address}")
     shown = 0
@@ -75,7 +77,8 @@ def submit(address: str, words: Sequence[str]) -> str:
         if status in (JobStatus.SUCCEEDED, JobStatus.FAILED, JobStatus.STOPPED):
             if status is not JobStatus.SUCCEEDED:
                 raise ConfigError(
-                    f"job {job} has {status.value.lower()}: {client.get_job_info(job).message}; the same command goes on from its last checkpoint if `runs` is a folder that outlives the cluster"
+                    f"job {job} has {status.value.lower()}: {client.get_job_info(job).message}; the same"
+                    " command goes on from its last checkpoint if `runs` outlives the cluster"
                 )
             break
         time.sleep(2)

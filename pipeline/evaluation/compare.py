@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from actors.factory import ConfigError
-from pipeline.evaluation.statistics import rate_line
+from envs.targets import ConfigError
+from pipeline.evaluation.statistics import rate, rate_line
 
 Result = Mapping[str, Any]
 
@@ -33,18 +33,22 @@ def compare(folders: list[Path]) -> str:
 
 
 def _percent(entry: Result) -> str:
-    return f"{100 * entry['successes'] / max(1, entry['episodes']):.1f}%"
+    return f"{100 * rate(entry):.1f}%"
 
 
 def _rate(key: str) -> Callable[[Result], str]:
-    return lambda r: rate_line(r[key])
+    return lambda r: rate_line(r[key]) if r[key] else "-"
 
 
 def _gain(result: Result) -> str:
-    before, after = (
-        result[key]["successes"] / result[key]["episodes"] for key in ("physics_before", "physics_after")
-    )
-    return f"**{100 * (after - before):+.1f}** points"
+    if not result["physics_before"]:
+        return "-"
+    return f"**{100 * (rate(result['physics_after']) - rate(result['physics_before'])):+.1f}** points"
+
+
+def _paired(result: Result) -> str:
+    paired = result["paired"]
+    return f"{paired['gained']} / {paired['lost']}, {paired['p']:.1e}" if paired else "-"
 
 
 def _minutes(*stages: str) -> Callable[[Result], str]:
@@ -52,30 +56,34 @@ def _minutes(*stages: str) -> Callable[[Result], str]:
 
 
 def _figure(form: Callable[[Result], str]) -> Callable[[Result], str]:
-    """Figures of the rollouts of each group of episodes."""
-    return lambda r: "; ".join(form(r["rollout"][group]) for group in _GROUPS)
+    """A figure of the rollouts of each group of episodes; groups differ by data."""
+
+    def cells(result: Result) -> str:
+        return "; ".join(f"{name} {form(row)}" for name, row in result["rollout"].items())
+
+    return cells
 
 
 def _error(key: str, digits: int) -> Callable[[Result], str]:
-    """Median and 90th percentile of a rollout's error."""
-    return _figure(lambda d: f"{d[key]['median']:.{digits}f} / {d[key]['p90']:.{digits}f}")
+    """Median and 90th percentile of a rollout's error, "-" where it was not measured."""
+    return _figure(
+        lambda d: f"{d[key]['median']:.{digits}f} / {d[key]['p90']:.{digits}f}" if key in d else "-"
+    )
 
 
-def _verdicts(source: str) -> Callable[[Result], str]:
-    return lambda r: "; ".join(f"{100 * r['judge'][group][source]['accuracy']:.1f}" for group in _GROUPS)
+def _verdicts(video: str) -> Callable[[Result], str]:
+    return lambda r: "; ".join(
+        f"{group} {100 * tables[video]['accuracy']:.1f}" for group, tables in r["judge"].items()
+    )
 
 
-_GROUPS = ("expert", "noisy", "on-policy")
-_OF = ", ".join(_GROUPS[:-1]) + " and " + _GROUPS[-1]
 _ROWS: tuple[tuple[str, Callable[[Result], str]], ...] = (
-    ("engine; algorithm; seed", lambda r: f"{r['engine']}; {r['algorithm']}; {r['seed']}"),
+    ("task; simulator; policy", lambda r: f"{r['task']}; {r['simulator']}; {r['policy']}"),
+    ("algorithm; seed", lambda r: f"{r['algorithm']}; {r['seed']}"),
     ("true success before", _rate("physics_before")),
     ("true success after", _rate("physics_after")),
     ("gain", _gain),
-    (
-        "gained / lost, McNemar p",
-        lambda r: f"{r['paired']['gained']} / {r['paired']['lost']}, {r['paired']['p']:.1e}",
-    ),
+    ("gained / lost, McNemar p", _paired),
     (
         "imagined before → after",
         lambda r: f"{_percent(r['imagined_before'])} → {_percent(r['imagined_after'])}",
@@ -84,27 +92,25 @@ _ROWS: tuple[tuple[str, Callable[[Result], str]], ...] = (
         "gap imagined - true, by round",
         lambda r: ", ".join(f"{100 * entry['gap']:+.1f}" for entry in r["rounds"]),
     ),
-    ("physics episodes learned from", lambda r: str(r["physics_episodes_used"])),
+    ("recorded episodes learned from", lambda r: str(r["episodes_used"])),
     (
         "imagined episodes learned from, by round",
         lambda r: ", ".join(str(n) for n in r["imagined_episodes_used"]),
     ),
     ("minutes in all", _minutes("")),
-    ("autoencoder, vision", _minutes("tokenizer", "vision")),
-    ("joint states", _minutes("state")),
+    ("tokenizer, simulator", _minutes("tokenizer", "simulator")),
+    ("state expert", _minutes("state")),
     ("judge", _minutes("judge")),
     ("RL in imagination", _minutes("rl")),
-    (f"object px, median / p90, {_OF}", _error("object_px", 2)),
-    ("object cm", _error("object_cm", 2)),
-    ("own account cm", _error("place_cm", 2)),
-    ("joint states rad", _error("state_rad", 4)),
-    ("object not found, % of frames", _figure(lambda d: f"{100 * d['object_lost']:.1f}")),
     (
         "PSNR dB, first → last frames",
         _figure(lambda d: f"{d['psnr_first_frames']:.1f} → {d['psnr_last_frames']:.1f}"),
     ),
-    ("verdicts right, %, real video", _verdicts("physics video")),
-    ("verdicts right, %, generated video", _verdicts("simulator rollouts")),
+    ("state, spreads, median / p90", _error("state", 3)),
+    ("object px", _error("object_px", 2)),
+    ("object cm", _error("object_cm", 2)),
+    ("verdicts right, %, recorded video", _verdicts("recorded")),
+    ("verdicts right, %, generated video", _verdicts("generated")),
     (
         "frames/s at batch 1, 32",
         lambda r: ", ".join(f"{speed:.0f}" for speed in r["frames_per_second"].values()),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -119,9 +118,3 @@ def _hosts(inputs: Inputs) -> list[list[str]]:
             cells.append(form.format(factor * sum(values) / len(values)) if values else "-")
         out.append(cells)
     return out
-
-
-def read_controls(root: Path) -> dict[str, Any] | None:
-    """Rows of a run's controls.json, None if the controls have not been run."""
-    path = root / "controls.json"
-    return dict(json.loads(path.read_text())) if path.is_file() else None

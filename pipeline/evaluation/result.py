@@ -23,9 +23,10 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
             physics_after.
 
     Returns:
-        name, seed, simulator, algorithm, verdict; physics_before and physics_after (rate entries) with paired
-        (McNemar), None without physics; imagined_before, imagined_after; judge, rollout, frames_per_second (see
-        the measure stage); rounds (gaps); episodes used and held out; seconds per stage; alarms.
+        name, seed, simulator, algorithm, verdict; physics_before and physics_after (rate entries) with
+        paired (McNemar), None without physics; imagined_before, imagined_after; judge, rollout,
+        frames_per_second (see the measure stage); rounds (gaps); episodes used and held out; seconds per
+        stage; alarms.
     """
     finished = manifests(inputs)
     imagined, measured = (result_of(inputs.folder(role)) for role in ("imagined", "measured"))
@@ -83,8 +84,8 @@ def verdict(result: Mapping[str, Any]) -> str:
     imagined = 100 * (rate(result["imagined_after"]) - rate(result["imagined_before"]))
     if result["physics_before"] is None:
         return (
-            f"imagined success moved by {imagined:+.1f} points; without physics nobody knows what that is worth:"
-            " try the policy on the robot"
+            f"imagined success moved by {imagined:+.1f} points; without physics nobody knows what that is"
+            " worth: try the policy on the robot"
         )
     before, after, paired = result["physics_before"], result["physics_after"], result["paired"]
     points = 100 * (rate(after) - rate(before))
@@ -107,14 +108,15 @@ def _why(result: Mapping[str, Any], points: float, imagined: float) -> str:
         )
     if imagined > 5:
         return (
-            f"imagined success rose by {imagined:.0f} points and true success did not follow: the policy exploits"
-            f" the simulator (gap in the last round {100 * gap:+.0f} points); deploy more episodes per round"
+            f"imagined success rose by {imagined:.0f} points and true success did not follow: the policy"
+            f" exploits the simulator (gap in the last round {100 * gap:+.0f} points); deploy more episodes"
+            " per round"
         )
     if imagined > -2 and result["alarms"]:
         return f"RL did not improve even imagined success; {result['alarms'][0]}"
     return (
-        f"RL moved imagined success by {imagined:+.0f} points only; give it more iterations (rounds.iterations)"
-        " or a higher rl.lr"
+        f"RL moved imagined success by {imagined:+.0f} points only; give it more iterations"
+        " (rounds.iterations) or a higher rl.lr"
     )
 
 

@@ -16,6 +16,7 @@ from actors.rollouts.evaluate import evaluate
 from envs.episodes.episode import Episode
 from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.episodes.formats.lerobot_writer import LeRobotWriter
+from envs.episodes.splits import write_splits
 from envs.episodes.write_behind import WriteBehind
 from envs.files import write_text
 from envs.physics.worker import Track
@@ -26,38 +27,36 @@ from pipeline.stage import Inputs, stage
 from pipeline.stages.given import DATASETS, PHYSICS, ROBOT, Cfg
 from pipeline.stages.seeds import Purpose, episode_seeds
 
-_SHARD = 64  # episodes of a deployment side by side, and per file
-SPLITS = ("train", "held_out", "calibration")  # in the order in which they are written
+_SIDE_BY_SIDE = 64  # deployed episodes
+SPLITS = ("train", "held_out", "calibration")  # in the order of their episodes
 
 
 @stage(reads=(*ROBOT, "collect"))
 def collect(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """Scripted episodes into a LeRobot data set, split by split; goes on after the last finished shard."""
+    """Scripted episodes into a LeRobot data set, in the order of its splits; goes on after the last shard."""
     section = cfg["collect"]
-    jobs = scripted_jobs(cfg)
-    task, robot = cfg["task"], world_spec(cfg).embodiment
+    task, robot, jobs = cfg["task"], world_spec(cfg).embodiment, scripted_jobs(cfg)
     writer = LeRobotWriter(folder / "dataset", robot)
     pool = build_pool(cfg)
     done = len(LeRobotDataset(writer.root)) if writer.shards else 0
-    total = sum(section["episodes"].values())
     try:
         with (
-            tqdm(total=total, initial=done, desc="collect", unit="ep", dynamic_ncols=True) as bar,
+            tqdm(total=len(jobs), initial=done, desc="collect", unit="ep", dynamic_ncols=True) as bar,
             WriteBehind(writer) as behind,
         ):
-            for split, batch in shards(section["episodes"], section["shard"], done):
-                mine = [jobs[number] for number in batch]
+            for begin in range(done, len(jobs), section["shard"]):
+                mine = jobs[begin : begin + section["shard"]]
                 tracks = pool.script([(seed, level) for seed, level, _ in mine], task["chunk"])
                 behind.write(
                     [
                         Episode.from_track(track, source, robot)
                         for track, (_, _, source) in zip(tracks, mine, strict=True)
-                    ],
-                    split=split,
+                    ]
                 )
-                bar.update(len(batch))
+                bar.update(len(mine))
     finally:
         pool.close()
+    write_splits(writer.root, {name: section["episodes"][name] for name in SPLITS})
     store = open_clips(cfg, [writer.root])
     return {
         "episodes": len(store),
@@ -90,24 +89,6 @@ def scripted_jobs(cfg: Cfg) -> list[tuple[int, float, str]]:
     return jobs
 
 
-def shards(splits: Mapping[str, int], size: int, done: int) -> Iterator[tuple[str, range]]:
-    """(split, episode numbers) of every file still to be written; splits follow each other, no file is mixed.
-
-    Args:
-        splits: episodes per split.
-        size: episodes per file at most.
-        done: episodes written already.
-    """
-    begin = 0
-    for split in SPLITS:
-        end = begin + splits.get(split, 0)
-        for first in range(begin, end, size):
-            numbers = range(max(first, done), min(first + size, end))
-            if len(numbers):
-                yield split, numbers
-        begin = end
-
-
 @stage(reads=(*PHYSICS, "rounds.splits"))
 def deploy(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Episodes of the current stochastic policy in physics, recorded whole.
@@ -120,24 +101,24 @@ def deploy(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     data = folder / "dataset"
     shutil.rmtree(data, ignore_errors=True)  # a deployment is short; half of one is begun anew
     won: list[bool] = []
-    tracks = (track for some in run_recorded(cfg, policy, seeds) for track in some)
     with WriteBehind(LeRobotWriter(data, robot)) as behind:
-        for split, batch in shards(split_counts(episodes, cfg["rounds"]["splits"]), _SHARD, 0):
-            mine = [next(tracks) for _ in batch]
-            behind.write([Episode.from_track(t, f"policy-{number}", robot) for t in mine], split=split)
-            won += [bool(track.rows["success"][-1]) for track in mine]
-    tracks.close()
+        for tracks in run_recorded(cfg, policy, seeds):
+            behind.write([Episode.from_track(track, f"policy-{number}", robot) for track in tracks])
+            won += [bool(track.rows["success"][-1]) for track in tracks]
+    counts = split_counts(episodes, cfg["rounds"]["splits"])
+    write_splits(data, counts)
     success = torch.tensor(won)
     return {
         "episodes": len(success),
+        "held_out": counts["held_out"],
         "true_stochastic": rate_entry(success),
         "success": float(success.float().mean()),
     }
 
 
 def split_counts(episodes: int, shares: Mapping[str, float]) -> dict[str, int]:
-    """Episodes per split; the splits named in `shares` get at least one each, train the rest."""
-    counts = {name: max(1, round(share * episodes)) for name, share in shares.items()}
+    """Episodes per split, in the order of SPLITS; those in `shares` get at least one, train gets the rest."""
+    counts = {name: max(1, round(shares[name] * episodes)) for name in SPLITS if name in shares}
     return {"train": episodes - sum(counts.values()), **counts}
 
 
@@ -145,7 +126,7 @@ def run_recorded(cfg: Cfg, policy: Any, seeds: list[int], stochastic: bool = Tru
     """Recorded episodes of a policy in physics, in the order of the seeds, as many at once as run side by
     side.
     """
-    env = build_physics(cfg, batch=min(_SHARD, len(seeds)), record=True)
+    env = build_physics(cfg, batch=min(_SIDE_BY_SIDE, len(seeds)), record=True)
     try:
         for begin in range(0, len(seeds), env.batch_size[0]):
             part = seeds[begin : begin + env.batch_size[0]]
@@ -198,8 +179,8 @@ def fingerprint(paths: list[str]) -> str:
         info = Path(path) / "meta" / "info.json"
         if not info.is_file():
             raise ConfigError(
-                f"task.data: {info} is missing; name folders of LeRobot v3.0 data sets (`worldloop convert` makes"
-                " them of other recordings)"
+                f"task.data: {info} is missing; name folders of LeRobot v3.0 data sets (`worldloop convert`"
+                " makes them of other recordings)"
             )
         texts.append(info.read_text())
     return digest(texts)

@@ -123,7 +123,7 @@ def learns(module: nn.Module) -> bool:
 
 
 def load_world(cfg: Cfg, inputs: Inputs, store: ClipStore, batch: int, episodes: Tensor | None = None) -> Any:
-    """The imagined world of the roles simulator, state and judge, starting where the store's episodes start."""
+    """The imagined world of the roles simulator, state and judge, starting where the store's episodes do."""
     simulator = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
     judge = build_judge(cfg, inputs.weights("judge"))

@@ -5,9 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from actors.factory import build_algorithm, build_policy, prepare_process
+import torch
+
+from actors.factory import build_algorithm, build_policy, prepare_process, rewards_of
 from actors.fleets.launch import build_fleet
+from actors.policies.contract import freeze_perception
 from actors.rollouts.recipe import Recipe
+from envs.episodes.clips import ClipStore
+from learners.rl.dataset_rollout import dataset_rollout
 from learners.rl.loop import train_rl
 from learners.stages.imitation import Cloning
 from learners.training.parallel import leads
@@ -18,6 +23,7 @@ from pipeline.stages.given import (
     WORLD,
     Cfg,
     datasets,
+    learning_episodes,
     mode_of,
     open_store,
     rl_options,
@@ -42,9 +48,10 @@ def rl(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     settings = rl_options(cfg, iterations=inputs.settings["iterations"], seed=cfg["seed"] * 100 + number)
     anchor = Cloning(policy, store, successful_episodes(cfg, store, deployed), mode_of(cfg))
     if settings.freeze_perception:
-        policy.freeze_perception()
+        freeze_perception(policy)
         anchor.encode()
     algorithm = build_algorithm(cfg, policy)
+    knew = _warm_up(cfg, policy, algorithm, store, settings.seed, number)
     recipe = Recipe(
         config=cfg.plain(),
         episodes=settings.envs // settings.shards,
@@ -65,30 +72,45 @@ def rl(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
             fleet.close()
     save_weights(policy, folder)
     last = {f"last_{key}": value for key, value in stats.pop("last").items()}
-    return {**stats, **last}
+    return {**knew, **stats, **last}
+
+
+def _warm_up(
+    cfg: Cfg, policy: Any, algorithm: Any, store: ClipStore, seed: int, number: int
+) -> dict[str, float]:
+    """Let a critic, if the algorithm has one, learn from the deployed policy's true episodes first; one that
+    begins from nothing spoils the first iterations.
+    """
+    past = store.select([f"policy-{number}"])
+    past = past[torch.isin(past, learning_episodes(store)) & store.arrays["labelled"][past]]
+    discount = cfg["judge"].get("discount")
+    if not hasattr(algorithm, "warm_up") or discount is None or not len(past):
+        return {}
+    rollout = dataset_rollout(policy, store, past, rewards_of(cfg), discount)
+    return {"critic_knew": algorithm.warm_up(rollout, seed)}
 
 
 @stage(reads=(*PHYSICS, *LEARNING))
 def rl_in_physics(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """The same reinforcement learning in physics, from the same policy: the control of learning in imagination.
+    """The same reinforcement learning in physics, from the first policy: a control of imagination.
 
-    Settings: iterations, envs.
+    Settings: iterations.
     """
     prepare_process(cfg["seed"])
-    envs, iterations = inputs.settings["envs"], inputs.settings["iterations"]
+    iterations = inputs.settings["iterations"]
     policy = build_policy(cfg, inputs.weights("policy"))
-    settings = rl_options(cfg, envs=envs, iterations=iterations, anchor=0.0, seed=cfg["seed"] * 100)
+    settings = rl_options(cfg, iterations=iterations, anchor=0.0, seed=cfg["seed"] * 100)
     if settings.freeze_perception:
-        policy.freeze_perception()
+        freeze_perception(policy)
     algorithm = build_algorithm(cfg, policy)
     recipe = Recipe(
         config=cfg.plain(),
-        episodes=envs // settings.shards,
+        episodes=settings.envs // settings.shards,
         policy=str(inputs.weights("policy")),
         freeze_perception=settings.freeze_perception,
         bootstrap=algorithm.bootstraps,
     )
-    pool = episode_seeds(cfg["seed"], Purpose.PRACTICE, 4 * envs * iterations)
+    pool = episode_seeds(cfg["seed"], Purpose.PRACTICE, 4 * settings.envs * iterations)
     fleet = build_fleet(recipe)
     try:
         stats = train_rl(fleet, policy, algorithm, settings, folder, name="rl", seed_pool=pool)

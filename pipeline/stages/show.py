@@ -74,8 +74,9 @@ def _paired(
 
 @stage(reads=EVERYTHING)
 def report(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """result.json and report.html of the whole run, in the run's folder."""
+    """result.json and report.html of the whole run, in the run's folder; controls of an older one go."""
     root = folder.parent.parent
+    (root / "controls.json").unlink(missing_ok=True)
     result = build_result(cfg, inputs)
     write_text(root / "result.json", json.dumps(result, indent=1, default=float))
     write_text(root / "report.html", build_report(cfg, inputs, result))

@@ -131,6 +131,6 @@ def _calibrate(model: Any, store: ClipStore) -> None:
     succeeded = episode_success(store, unseen)
     if not calibrate(model, score, succeeded):
         tqdm.write(
-            f"judge: {int(succeeded.sum())} of {len(succeeded)} calibration episodes succeeded, and its scores"
-            f" do not tell which; threshold left at {float(model.threshold):.3f}"
+            f"judge: {int(succeeded.sum())} of {len(succeeded)} calibration episodes succeeded, and its"
+            f" scores do not tell which; threshold left at {float(model.threshold):.3f}"
         )

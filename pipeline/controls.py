@@ -1,0 +1,139 @@
+"""worldloop controls: whose gain is it? What the same physics episodes bring without RL in imagination.
+
+Beside a finished run stand, on the same evaluation seeds:
+
+- the loop without its RL iterations: deploy, refresh the world, clone what worked, as many physics episodes;
+- RL in physics with as many episodes as the loop deployed;
+- RL in physics with as many environment steps as the loop imagined;
+- filtered BC on everything that the loop recorded.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from envs.files import write_text
+from envs.targets import ConfigError
+from pipeline.evaluation.report import build_report
+from pipeline.evaluation.result import outcomes
+from pipeline.evaluation.statistics import mcnemar, rate, rate_entry, rate_line
+from pipeline.graph import Graph
+from pipeline.loop import build_loop, has_physics, last_round, of_round
+from pipeline.stages import controls as only_here
+from pipeline.stages import prove, rl
+from pipeline.track import Tracker
+
+Cfg = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table.
+
+    Args:
+        title: what it is.
+        graph: the graph that holds its stages.
+        node: the evaluation in physics that it shows.
+        learned: stages that spent physics episodes, by their results' "episodes".
+    """
+
+    title: str
+    graph: Graph
+    node: str
+    learned: tuple[str, ...]
+
+
+def run_controls(cfg: Cfg, root: Path, tracker: Tracker | None = None) -> dict[str, Any]:
+    """Run the controls of a finished run; writes controls.json and renders its report anew.
+
+    Returns:
+        Rows by title: a rate entry, gain in points, paired (McNemar against the policy before), and
+        physics_episodes.
+
+    Raises:
+        ConfigError: if the run is not finished, or has no physics.
+    """
+    if not has_physics(cfg):
+        raise ConfigError("the controls are tried in physics, which this task has not (task.suite is empty)")
+    loop = build_loop(cfg, root)
+    if not (loop.folder("report") / "manifest.json").exists():
+        raise ConfigError(
+            f"{root} holds no finished run of this config (`worldloop stages` says what differs); the"
+            " controls stand beside one: first `worldloop run` with the same options"
+        )
+    rows = control_rows(cfg, root, loop)
+    for row in rows:
+        row.graph.run(row.node, tracker)
+    table = control_table(loop, rows)
+    write_text(root / "controls.json", json.dumps(table, indent=1, default=float))
+    result = json.loads((root / "result.json").read_text())
+    page = build_report(loop.view("report"), loop.inputs("report"), result, table)
+    write_text(root / "report.html", page)
+    return table
+
+
+def control_rows(cfg: Cfg, root: Path, loop: Graph) -> list[Row]:
+    """The run itself and its controls, whose stages are added to the run's graph or have one of their own."""
+    rounds = range(1, last_round(cfg) + 1)
+    deploys = tuple(f"deploy-{n}" for n in rounds)
+    deployed = sum(of_round(cfg["rounds"]["deploy"], n) for n in rounds)
+    iterations = sum(of_round(cfg["rounds"]["iterations"], n) for n in rounds)
+    envs = cfg["rl"]["envs"]
+    few = max(1, round(deployed / envs))
+    # Imagined and physical episodes have the same length, so equal iterations of equal size are equal steps.
+    learned = {
+        "RL in physics, equal episodes": _rl_in_physics(loop, "equal-episodes", few),
+        "RL in physics, equal steps": _rl_in_physics(loop, "equal-steps", iterations),
+    }
+    loop.add("filtered-bc", only_here.filtered_bc, {"data": ["collect", *deploys]})
+    loop.add("evaluate-filtered-bc", prove.evaluate_physics, {"policy": "filtered-bc"})
+    without = build_loop(cfg, root, with_rl=False)
+    return [
+        Row("loop", loop, "evaluate-after", deploys),
+        Row("loop without RL iterations", without, "evaluate-after", deploys),
+        *(Row(title, loop, f"evaluate-{name}", (name,)) for title, name in learned.items()),
+        Row("filtered BC", loop, "evaluate-filtered-bc", deploys),
+    ]
+
+
+def control_table(loop: Graph, rows: list[Row]) -> dict[str, Any]:
+    """Rows of controls.json by title, the policy before first."""
+    before = outcomes(loop.folder("evaluate-before"))
+    start = rate_entry(before)
+    table: dict[str, Any] = {"before": {**start, "physics_episodes": 0, "paired": None}}
+    for row in rows:
+        success = outcomes(row.graph.folder(row.node))
+        entry = rate_entry(success)
+        table[row.title] = {
+            **entry,
+            "gain": 100 * (rate(entry) - rate(start)),
+            "paired": mcnemar(before, success),
+            "physics_episodes": sum(row.graph.result(name)["episodes"] for name in row.learned),
+        }
+    return table
+
+
+def table_text(table: Mapping[str, Any]) -> str:
+    """The table for a terminal."""
+    lines = []
+    for title, row in table.items():
+        paired = row["paired"]
+        gain = ""
+        if paired:
+            flips = f"gained {paired['gained']} lost {paired['lost']} p {paired['p']:.2g}"
+            gain = f", {row['gain']:+.1f} points, {flips}"
+        lines.append(f"{title:<30} {rate_line(row)}{gain}")
+    return "\n".join(lines)
+
+
+def _rl_in_physics(loop: Graph, name: str, iterations: int) -> str:
+    """Add RL in physics from the first policy and its evaluation; returns the former's name."""
+    learned = loop.add(
+        f"rl-in-physics-{name}", rl.rl_in_physics, {"policy": "imitation"}, iterations=iterations
+    )
+    loop.add(f"evaluate-{learned}", prove.evaluate_physics, {"policy": learned})
+    return learned
