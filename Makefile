@@ -14,9 +14,9 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 10) else "Worldloop needs Python 3.10 or newer: make PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV) || { echo "python venv is missing: sudo apt-get install -y python3-venv"; exit 1; }
 	$(BIN)/python -m pip install --upgrade pip --quiet
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[dev]"
-	# openpi's client asks for an old numpy, which nothing in it needs; its real needs are ours.
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps openpi-client==0.1.2
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[dev,metaworld]"
+	# These two ask for an old numpy and an old mujoco, which nothing in them needs; their real needs are ours.
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps openpi-client==0.1.2 metaworld==3.1.1
 	touch $@
 
 # OpenGL in software, for rendering without a screen. Installed where we may, else the line to type is printed.

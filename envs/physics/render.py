@@ -85,3 +85,21 @@ def offscreen_for(assets: str, model: mujoco.MjModel, size: tuple[int, int]) -> 
     if (assets, size) not in _CONTEXTS:
         _CONTEXTS[assets, size] = Offscreen(model, size)
     return _CONTEXTS[assets, size]
+
+
+def calibration(
+    model: mujoco.MjModel, data: mujoco.MjData, views: tuple[str, ...], size: tuple[int, int]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pinhole intrinsics [V, 3, 3] in pixels for pictures of `size` = (height, width), and camera poses
+    [V, 4, 4] (camera to world, OpenCV convention) of the named cameras.
+    """
+    height, width = size
+    intrinsic = np.zeros((len(views), 3, 3))
+    c2w = np.tile(np.eye(4), (len(views), 1, 1))
+    for k, view in enumerate(views):
+        camera = model.camera(view).id
+        focal = 0.5 * height / np.tan(np.deg2rad(model.cam_fovy[camera]) / 2)
+        intrinsic[k] = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
+        c2w[k, :3, :3] = data.cam_xmat[camera].reshape(3, 3) @ np.diag([1.0, -1.0, -1.0])
+        c2w[k, :3, 3] = data.cam_xpos[camera]
+    return intrinsic, c2w

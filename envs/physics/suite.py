@@ -12,7 +12,7 @@ import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +64,7 @@ class TaskSuite(ABC):
         embodiment: the robot; camera sizes are those that `render` returns.
     """
 
-    tasks: ClassVar[tuple[str, ...]]
+    tasks: tuple[str, ...]
     embodiment: Embodiment
 
     @abstractmethod

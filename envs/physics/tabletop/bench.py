@@ -47,7 +47,6 @@ class Bench:
         self.glides = max(1, round(1.0 / (control_hz * GLIDE)))
         self.substeps = max(1, round(1.0 / (control_hz * self.glides * self.model.opt.timestep)))
         self._slides = np.array([[self.model.joint(f"{s}_slide_{t}").qposadr[0] for t in "ab"] for s in ARMS])
-        self._cams = [self.model.camera(name).id for name in cameras]
         self.start: Start
         self.target: Target
 
@@ -101,20 +100,6 @@ class Bench:
     def flanges(self) -> Array:
         """Flange poses [2, 6] that the arms really have, in metres and radians."""
         return self.arms.read(self.data)
-
-    def calibration(self, size: tuple[int, int]) -> tuple[Array, Array]:
-        """Pinhole intrinsics [V, 3, 3] for pictures of `size` = (height, width), and camera-to-world
-        [V, 4, 4] in the OpenCV convention.
-        """
-        height, width = size
-        intrinsic = np.zeros((len(self._cams), 3, 3))
-        c2w = np.tile(np.eye(4), (len(self._cams), 1, 1))
-        for k, cam in enumerate(self._cams):
-            focal = 0.5 * height / np.tan(np.deg2rad(self.model.cam_fovy[cam]) / 2)
-            intrinsic[k] = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
-            c2w[k, :3, :3] = self.data.cam_xmat[cam].reshape(3, 3) @ np.diag([1.0, -1.0, -1.0])
-            c2w[k, :3, 3] = self.data.cam_xpos[cam]
-        return intrinsic, c2w
 
     def render(self, size: tuple[int, int], shadows: bool) -> NDArray[np.uint8]:
         """Pictures uint8 [V, 3, H, W]."""

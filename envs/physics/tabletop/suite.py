@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.embodiment import Camera, Embodiment
+from envs.physics.render import calibration
 from envs.physics.suite import (
     Array,
     Expert,
@@ -90,7 +91,7 @@ class Tabletop(TaskSuite):
     def observe(self) -> Observation:
         """Joint state, calibration, and how the task stands."""
         bench = self._bench
-        intrinsic, c2w = bench.calibration(self.size)
+        intrinsic, c2w = calibration(bench.model, bench.data, bench.cameras, self.size)
         return Observation(
             state=bench.state(),
             command=bench.actions.command.copy(),
