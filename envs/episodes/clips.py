@@ -32,12 +32,14 @@ class ClipSpec:
         chunk: frames a chunk adds, K.
         chunks: consecutive chunks per clip, L.
         stride: frames between two frames of the clip.
+        history: consecutive frames of commands and states up to now; 0 is as many as `memory`.
     """
 
     memory: int = 4
     chunk: int = 8
     chunks: int = 1
     stride: int = 1
+    history: int = 0
 
 
 class ClipStore:
@@ -201,10 +203,10 @@ class ClipStore:
         Returns:
             TensorDict [B] with memory (index [L, M], frames uint8 [L, M, V, 3, H, W], commands [L, M, A]),
             future (frames uint8 [L*K, V, 3, H, W], commands [L*K, A], states [L*K, S], valid bool [L*K]), now
-            (command [A], state [S]), history (commands, states [M, ...]), begin []; memory and future have
-            c2w [..., V, 4, 4] too, and the clip intrinsic [V, 3, 3], if the robot is calibrated, and pose_map
-            uint8 [..., V, 3, H, W] if the spec asks for it. Frames past the episode's end repeat its last;
-            they and frames without a picture are not valid.
+            (command [A], state [S]), history (commands, states [spec.history, ...]), begin []; memory and
+            future have c2w [..., V, 4, 4] too, and the clip intrinsic [V, 3, 3], if the robot is calibrated,
+            and pose_map uint8 [..., V, 3, H, W] if the spec asks for it. Frames past the episode's end repeat
+            its last; they and frames without a picture are not valid.
         """
         total = spec.chunks * spec.chunk
         last, base, size = self.length[episode] - 1, self.start[episode], episode.shape
@@ -215,7 +217,7 @@ class ClipStore:
         index = memory_indices(past + 1, spec.memory)  # [B, L, M], in strides from `begin % stride`
         at = (begin % spec.stride)[:, None, None] + index * spec.stride
         memory = base[:, None, None] + torch.minimum(at, last[:, None, None])
-        recent = begin[:, None] - spec.stride * torch.arange(spec.memory - 1, -1, -1)
+        recent = begin[:, None] - spec.stride * torch.arange((spec.history or spec.memory) - 1, -1, -1)
         before, now = base[:, None] + recent.clamp(min=0), base + begin
         commands, states = self.arrays["commands"], self.arrays["states"]
         remembered = {

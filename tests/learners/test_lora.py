@@ -24,10 +24,12 @@ def test_adapters_learn_and_are_folded_in(tiny_store: Stores, tmp_path: Path) ->
     store = tiny_store(ARM_DELTAS)
     world = simulator_of("dit_small", store.spec)
     before = {name: value.clone() for name, value in world.state_dict().items()}
+    learning = {name: p.requires_grad for name, p in world.named_parameters()}
     options = FitConfig(4, 2, 1e-2, warmup=1, bf16=False)
     train_simulator(world, store, torch.arange(4), ADAPTERS, options, tmp_path, fresh=False)
     after = world.state_dict()
-    assert list(after) == list(before) and all(p.requires_grad for p in world.parameters())
+    assert list(after) == list(before)
+    assert {name: p.requires_grad for name, p in world.named_parameters()} == learning
     changed = {name for name in after if not torch.equal(after[name], before[name])}
     assert changed and all(name.removesuffix(".weight").endswith(TARGETS) for name in changed)
     name = sorted(changed)[0]
