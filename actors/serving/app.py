@@ -12,15 +12,18 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import re
+import zlib
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
 import cv2
 import numpy as np
 from aiohttp import web
+from aiohttp.http_exceptions import HttpProcessingError
 from numpy.typing import NDArray
 
-from actors.serving.page import PAGE
+from actors.serving.page import PAGE, joint_table
 from actors.serving.sessions import NoPlace, ServeConfig, Session, SessionHost, UnknownSession
 from envs.simulators.remote.protocol import (
     ProtocolError,
@@ -120,9 +123,13 @@ class Server:
             raise web.HTTPRequestEntityTooLarge(
                 max_size=self.limit,
                 actual_size=request.content_length or 0,
-                reason=f"the body has {request.content_length} bytes, serve.body_mb={self.host.config.body_mb:g} allows {self.limit}",
+                reason=f"the body has {request.content_length} bytes,"
+                f" serve.body_mb={self.host.config.body_mb:g} allows {self.limit}",
             )
-        return await request.read()
+        try:
+            return await request.read()
+        except (web.RequestPayloadError, HttpProcessingError, zlib.error) as error:
+            raise ProtocolError(f"the body cannot be read: {error or type(error).__name__}") from error
 
     # -- JSON endpoints
     # --------------------------------------------------------------------------------------------
@@ -149,9 +156,9 @@ class Server:
         return _json(200, {"success": True})
 
     async def set_camera_params(self, request: web.Request) -> web.Response:
-        """Intrinsics in pixels of the simulator's pictures, and cameras at the start if they are known."""
+        """Intrinsics in pixels of the client's pictures, and cameras at the start if they are known."""
         body = parse(await self._body(request))
-        session, views = self.host.get(body.get("client_id")), self.host.simulator.shape.views
+        session, views = self.host.get(body.get("client_id")), self.host.spec.views
         if "intrinsic" not in body:
             raise ProtocolError("intrinsic is missing")
         intrinsic = numbers(body["intrinsic"], (views, 3, 3), "intrinsic")
@@ -178,16 +185,24 @@ class Server:
         picture, said = unpack(await self._body(request), 2)
         meta = parse(said)
         session = self.host.get(meta.get("client_id"))
-        _, views, height, width = shape_in(meta, "frame_shape", f"3,{self.host.simulator.shape.views},H,W")
+        _, views, height, width = shape_in(meta, "frame_shape", f"3,{self.host.spec.views},H,W")
         frame = await asyncio.to_thread(
             lambda: self._sized(decode_frame(picture, views, height, width)[None])[0]
         )
-        joints = None if meta.get("state") is None else numbers(meta["state"], (16,), "state")
+        robot = self.host.robot
+        sizes = {"state": robot.state_dim, "command": robot.action_dim}
+        known = {
+            name: numbers(meta[name], (size,), name)
+            for name, size in sizes.items()
+            if meta.get(name) is not None
+        }
         async with session.lock:
             # the released order of calls is data, then trajectory; either order works
             traj, c2w = session.traj, session.c2w
             session.restart()
-            session.first, session.joints, session.traj, session.c2w = frame, joints, traj, c2w
+            session.first, session.frame_size = frame, (height, width)
+            session.joints, session.command = known.get("state"), known.get("command")
+            session.traj, session.c2w = traj, c2w
         return _json(200, {"success": True})
 
     async def set_episode_traj(self, request: web.Request) -> web.Response:
@@ -195,9 +210,7 @@ class Server:
         pictures, poses, said = unpack(await self._body(request), 3)
         meta = parse(said)
         session = self.host.get(meta.get("client_id"))
-        _, views, count, height, width = shape_in(
-            meta, "traj_shape", f"3,{self.host.simulator.shape.views},T,H,W"
-        )
+        _, views, count, height, width = shape_in(meta, "traj_shape", f"3,{self.host.spec.views},T,H,W")
         shape_in(meta, "c2w_shape", f"{views},{count},4,4")
         c2w = floats(poses, (views, count, 4, 4), "c2w").transpose(1, 0, 2, 3)
 
@@ -216,7 +229,7 @@ class Server:
 
     def _sized(self, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Frames [T, V, 3, H, W] at the simulator's size."""
-        size = self.host.simulator.shape.size
+        size = self.host.spec.size
         if frames.shape[-2:] == size:
             return frames
         small = [
@@ -269,29 +282,35 @@ class Server:
         return web.Response(text=PAGE, content_type="text/html")
 
     def _chosen(self, request: web.Request) -> Session | None:
+        """The session whose number is asked for; without a number the one that stepped last."""
         number = request.query.get("session")
         known = list(self.host.sessions.values())
-        if number is not None and number.isdigit() and int(number) < len(known):
-            return known[int(number)]
-        return self.host.latest if self.host.latest in known else (known[-1] if known else None)
+        if number is None:
+            return self.host.latest if self.host.latest in known else (known[-1] if known else None)
+        if not re.fullmatch("[0-9]{1,12}", number):
+            raise ProtocolError(f"session must be the number of a session, got {number[:40]!r}")
+        return next((session for session in known if session.number == int(number)), None)
 
     async def status(self, request: web.Request) -> web.Response:
         """What the page shows: of one session what the released server says, and a line for each."""
-        session = self._chosen(request)
+        session, robot = self._chosen(request), self.host.robot
+        action, state = (session.last_action, session.last_state) if session else (None, None)
         one = {
             "model": self.name,
             "phase": "running" if any(s.lock.locked() for s in self.host.sessions.values()) else "idle",
-            "chunk_size": self.host.simulator.shape.chunk,
+            "chunk_size": self.host.spec.chunk,
+            "session": session.number if session else None,
             "step_count": session.chunk if session else 0,
             "frames_generated": session.frames if session else 0,
             "has_preview": bool(session and session.preview),
-            "state": session.last_state if session else None,
-            "action": session.last_action if session else None,
+            "state": state,
+            "action": action,
+            "joints": joint_table(robot.action_names, action, robot.state_names, state),
             "task": session.task if session else "",
         }
         # no client_id: who knows one may drive it
         rows = [
-            {"user": s.user, "task": s.task, "steps": s.chunk, "frames": s.frames}
+            {"number": s.number, "user": s.user, "task": s.task, "steps": s.chunk, "frames": s.frames}
             for s in self.host.sessions.values()
         ]
         return _json(200, {**one, "sessions": rows, "passes": self.host.passes, "steps": self.host.steps})

@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.geometry.kinematics import Kinematics
-from envs.layouts import CommandLayout, JointLayout, Joints
+from actors.serving.batching import Company
+from envs.conditioning.joint_commands import JointCommands
+from envs.embodiment import ActionKind
+from envs.geometry.cameras import resize_intrinsics
 from envs.precision import mixed_precision
+from envs.simulators import memory
 from envs.simulators.base import Simulator
 from envs.simulators.remote.protocol import ProtocolError
 from envs.simulators.state_experts.base import StateDecoder
-from envs.specs import STATE_DIM
 
 
 class UnknownSession(PermissionError):
@@ -39,29 +41,39 @@ class ServeConfig:
         host, port: to listen on; loopback, for whoever reaches the port drives the simulator.
         sessions: held at once; /init beyond that is refused.
         batch: sessions that share a forward pass.
-        linger_ms: that a step waits for company.
+        linger_ms: longest that a step waits for others that usually come soon; never longer than a pass
+            takes.
         idle_s: after which an unused session ends.
         body_mb: largest request body.
         seed: of sessions that name none.
+        fixed_seed: every such session has that very seed, so that the same client gets the same frames
+            whenever it runs; else they count up from it.
     """
 
-    host: str = "127.0.0.1"
-    port: int = 9000
-    sessions: int = 32
-    batch: int = 8
-    linger_ms: float = 5.0
-    idle_s: float = 900.0
-    body_mb: float = 512.0
-    seed: int = 0
+    host: str
+    port: int
+    sessions: int
+    batch: int
+    linger_ms: float
+    idle_s: float
+    body_mb: float
+    seed: int
+    fixed_seed: bool
 
 
 @dataclass
 class Session:
     """One client's episode. Pictures are uint8 at the simulator's size; `state` is its row of the simulator's
     state once it has stepped.
+
+    Attributes:
+        number: counts sessions as they were opened; the page names it, the client_id is a secret.
+        intrinsic: in pixels of the client's pictures, whose size is `frame_size`.
+        reply: chunk number, request and answer of the last step, for a client that asks again.
     """
 
     client_id: str
+    number: int
     user: str
     seed: int
     touched: float
@@ -69,30 +81,31 @@ class Session:
     intrinsic: NDArray[np.float32] | None = None
     extrinsic: NDArray[np.float32] | None = None
     first: NDArray[np.uint8] | None = None
+    frame_size: tuple[int, int] = (0, 0)
     joints: NDArray[np.float32] | None = None
+    command: NDArray[np.float32] | None = None
     traj: NDArray[np.uint8] | None = None
     c2w: NDArray[np.float32] | None = None
     state: TensorDict | None = None
     chunk: int = 0
     frames: int = 0
-    seconds: float = 0.0
     last_action: list[float] | None = None
     last_state: list[float] | None = None
     preview: bytes = b""
-    # chunk number, request and answer of the last step, for a client that asks again
     reply: tuple[int, bytes, bytes] | None = None
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def restart(self) -> None:
         """Forget the episode; cameras stay."""
-        self.first = self.joints = self.traj = self.c2w = self.state = self.reply = None
+        self.first = self.joints = self.command = self.traj = self.c2w = self.state = self.reply = None
+        self.last_action = self.last_state = None
         self.chunk = self.frames = 0
 
 
 @dataclass
 class _Job:
     session: Session
-    actions: NDArray[np.float32]
+    commands: Tensor  # [L, A]
     done: asyncio.Future
 
 
@@ -102,7 +115,7 @@ class SessionHost:
     Args:
         simulator, decoder: the world; the decoder's joint states go into its memory and to the client.
         config: limits.
-        kinematics: turns joint commands into end-effector poses, for a world that takes those.
+        joints: turns joint commands into the robot's own, for a robot that takes end-effector poses.
         bf16: as in the config of the simulator.
     """
 
@@ -111,19 +124,18 @@ class SessionHost:
         simulator: Simulator,
         decoder: StateDecoder | None,
         config: ServeConfig,
-        kinematics: Kinematics | None = None,
+        joints: JointCommands | None = None,
         bf16: bool = True,
     ):
-        self.simulator, self.decoder, self.config, self.kinematics, self.bf16 = (
-            simulator.eval(),
-            decoder,
-            config,
-            kinematics,
-            bf16,
-        )
+        self.simulator, self.decoder, self.config, self.joints = simulator.eval(), decoder, config, joints
+        self.bf16, self.spec, self.robot = bf16, simulator.spec, simulator.spec.embodiment
+        joint_targets = self.robot.action_kind is ActionKind.JOINTS and not self.robot.delta
+        self.needs_cameras = self.spec.pose_map or self.spec.ray_map
+        self.commands_are_states = joint_targets and self.robot.action_dim == self.robot.state_dim
         self.sessions: dict[str, Session] = {}
         self.latest: Session | None = None
         self.passes = self.steps = self.opened = 0
+        self.company = Company(config.linger_ms / 1e3)
         self._jobs: asyncio.Queue[_Job] = asyncio.Queue()
         self._worker: asyncio.Task[None] | None = None
         self._busy = threading.Lock()  # one forward pass at a time, whichever event loop asks
@@ -139,11 +151,12 @@ class SessionHost:
         self.expire()
         if len(self.sessions) >= self.config.sessions:
             raise NoPlace(
-                f"all serve.sessions={self.config.sessions} are in use; close one, or wait until one was idle for serve.idle_s={self.config.idle_s:g} seconds"
+                f"all serve.sessions={self.config.sessions} are in use; close one, or wait until one was"
+                f" idle for serve.idle_s={self.config.idle_s:g} seconds"
             )
-        session = Session(
-            uuid.uuid4().hex, user, self.config.seed + self.opened if seed is None else seed, time.monotonic()
-        )
+        if seed is None:
+            seed = self.config.seed + (0 if self.config.fixed_seed else self.opened)
+        session = Session(uuid.uuid4().hex, self.opened, user, seed, time.monotonic())
         self.opened += 1
         self.sessions[session.client_id] = session
         self.latest = session
@@ -174,6 +187,7 @@ class SessionHost:
     def close(self, client_id: str) -> None:
         """End a session and let its memory go."""
         session = self.sessions.pop(client_id)
+        self.company.left(client_id)
         if session.state is not None:
             self.simulator.release(session.state, torch.ones(1, dtype=torch.bool))
 
@@ -182,7 +196,7 @@ class SessionHost:
     async def step(
         self, session: Session, actions: NDArray[np.float32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None]:
-        """Frames uint8 [L, V, 3, H, W] and joint states [L, 16] or None of a session under actions [L, A], L
+        """Frames uint8 [L, V, 3, H, W] and joint states [L, S] or None of a session under actions [L, A], L
         at most a chunk.
 
         Raises:
@@ -191,46 +205,42 @@ class SessionHost:
         self._check(session, actions)
         if self._worker is None or self._worker.done():
             self._worker = asyncio.create_task(self._work())
-        job = _Job(session, actions, asyncio.get_running_loop().create_future())
+        values = torch.from_numpy(actions)
+        own = actions.shape[1] == self.robot.action_dim
+        commands = values if own or self.joints is None else self.joints(values)
+        job = _Job(session, commands, asyncio.get_running_loop().create_future())
+        self.company.arrived(session.client_id, time.monotonic())
         await self._jobs.put(job)
         return await job.done
 
     def _check(self, session: Session, actions: NDArray[np.float32]) -> None:
-        chunk, layout = self.simulator.shape.chunk, self.simulator.shape.layout
-        if len(actions) > chunk:
-            raise ProtocolError(f"an action chunk of {len(actions)} rows exceeds this world's {chunk}")
-        missing = [
-            path
-            for path, value in (
-                ("/set_camera_params", session.intrinsic),
-                ("/set_episode_data", session.first),
-                ("/set_episode_traj", session.traj),
+        if len(actions) > self.spec.chunk:
+            raise ProtocolError(
+                f"an action chunk of {len(actions)} rows exceeds this world's {self.spec.chunk}"
             )
-            if value is None
-        ]
+        wanted: list[tuple[str, object]] = [("/set_episode_data", session.first)]
+        if self.needs_cameras:
+            wanted = [
+                ("/set_camera_params", session.intrinsic),
+                *wanted,
+                ("/set_episode_traj", session.traj),
+            ]
+        missing = [path for path, value in wanted if value is None]
         if missing:
             raise ProtocolError(f"{missing} must be called before /step")
-        if actions.shape[1] != layout.size and not (
-            layout is CommandLayout.EEF and actions.shape[1] == STATE_DIM and self.kinematics is not None
-        ):
-            also = " (or 16 joints, with simulator.kinematics)" if layout is CommandLayout.EEF else ""
+        sizes = [self.robot.action_dim, *([self.joints.size] if self.joints else [])]
+        if actions.shape[1] not in sizes:
+            also = f" (or {self.joints.size} joints)" if self.joints else ""
             raise ProtocolError(
-                f"this world takes {layout.size} numbers an action, layout {layout.value}{also}; got {actions.shape[1]}"
+                f"this world takes {self.robot.action_dim} numbers an action{also}:"
+                f" {list(self.robot.action_names)}; got {actions.shape[1]}"
             )
 
     async def _work(self) -> None:
-        """Take jobs, wait a moment for company, advance them together; runs as long as the server does."""
+        """Take jobs, wait for expected company, advance them together; runs as long as the server does."""
         while True:
-            jobs = [await self._jobs.get()]
-            deadline = time.monotonic() + self.config.linger_ms / 1e3
-            most = min(self.config.batch, len(self.sessions))
-            while len(jobs) < most:
-                try:
-                    jobs.append(
-                        await asyncio.wait_for(self._jobs.get(), max(0.0, deadline - time.monotonic()))
-                    )
-                except asyncio.TimeoutError:
-                    break
+            jobs = await self._gather()
+            began = time.monotonic()
             try:
                 made = await asyncio.to_thread(self._advance, jobs)
             except Exception as error:  # every client of this pass hears of it; sessions stay as they were
@@ -238,87 +248,97 @@ class SessionHost:
                     if not job.done.done():
                         job.done.set_exception(RuntimeError(f"{type(error).__name__}: {error}"))
                 continue
+            ended = time.monotonic()
+            self.company.answered([job.session.client_id for job in jobs], ended, ended - began)
             for job, answer in zip(jobs, made, strict=True):
                 if not job.done.done():
                     job.done.set_result(answer)
 
+    async def _gather(self) -> list[_Job]:
+        """The jobs of the next pass."""
+        jobs = [await self._jobs.get()]
+        began = time.monotonic()
+        most = min(self.config.batch, len(self.sessions))
+        while len(jobs) < most:
+            if not self._jobs.empty():
+                jobs.append(self._jobs.get_nowait())
+                continue
+            left = self.company.wait_until(began) - time.monotonic()
+            if left <= 0:
+                break
+            try:
+                jobs.append(await asyncio.wait_for(self._jobs.get(), left))
+            except asyncio.TimeoutError:
+                break
+        return jobs
+
     @torch.no_grad()
     def _advance(self, jobs: list[_Job]) -> list[tuple[NDArray[np.uint8], NDArray[np.float32] | None]]:
         with self._busy:
-            chunk = self.simulator.shape.chunk
-            device = next(self.simulator.parameters()).device
-            commands = torch.stack([self._commands(job.actions) for job in jobs])
-            windows = [self._window(job.session, len(job.actions)) for job in jobs]
-            maps = torch.from_numpy(np.stack([maps for maps, _ in windows]))
-            c2w = torch.from_numpy(np.stack([c2w for _, c2w in windows]))
+            device, chunk = self.simulator.device, self.spec.chunk
+            future = torch.cat([self._future(job) for job in jobs]).to(device)
             states = [
                 job.session.state
                 if job.session.state is not None
-                else self._begin(job.session, commands[row], maps[row], c2w[row])
+                else self._begin(job.session, future[row : row + 1]).to(device)
                 for row, job in enumerate(jobs)
             ]
-            state = self.simulator.stack(states).to(device)
-            commands = commands.to(device)
+            state = memory.stack(states)
             with mixed_precision(device, self.bf16):
-                frames, features, state = self.simulator.step(
-                    state, commands, maps.to(device), c2w.to(device)
-                )
-            decoded = None if self.decoder is None else self.decoder.follow(self.simulator, state, features)
+                frames, features, state = self.simulator.step(state, future)
+            decoded = None if self.decoder is None else self.decoder.follow(state, chunk, features)
             self.passes, self.steps = self.passes + 1, self.steps + len(jobs)
             out = []
             for row, job in enumerate(jobs):
-                asked = len(job.actions)
+                asked = len(job.commands)
                 mine = state[row : row + 1].clone()
                 # what was generated beyond the actions did not happen
                 mine["length"] = mine["length"] - (chunk - asked)
                 job.session.state = mine
                 job.session.chunk += 1
                 job.session.frames += asked
-                out.append(
-                    (
-                        frames[row, :asked].cpu().numpy(),
-                        None if decoded is None else decoded[row, :asked].float().cpu().numpy(),
-                    )
-                )
+                shown = frames[row, :asked].cpu().numpy()
+                out.append((shown, None if decoded is None else decoded[row, :asked].float().cpu().numpy()))
             return out
 
-    def _commands(self, actions: NDArray[np.float32]) -> Tensor:
-        """Commands [K, A] in the world's layout, the last repeated up to a chunk."""
-        values = torch.from_numpy(actions)
-        if values.shape[1] != self.simulator.shape.layout.size:
-            assert self.kinematics is not None
-            values = self.kinematics.flanges(Joints(values, JointLayout.PER_ARM))
-        return torch.cat([values, values[-1:].expand(self.simulator.shape.chunk - len(values), -1)])
-
-    def _window(self, session: Session, asked: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Pose maps [K, V, 3, H, W] and c2w [K, V, 4, 4] of the chunk: its part of a whole recording, or all
-        of what was sent for this step.
+    def _future(self, job: _Job) -> TensorDict:
+        """What Simulator.step takes of one session, [1]: the last command repeated up to a chunk, and that
+        part of the trajectory.
         """
-        assert session.traj is not None and session.c2w is not None
-        chunk, total = self.simulator.shape.chunk, len(session.traj)
-        begin = session.chunk * chunk if total >= 2 * chunk else 0
-        rows = np.minimum(np.minimum(np.arange(begin, begin + chunk), begin + asked - 1), total - 1)
-        return session.traj[rows], session.c2w[rows]
+        session, asked, chunk = job.session, len(job.commands), self.spec.chunk
+        last = job.commands[-1:].expand(chunk - asked, -1)
+        future = {"commands": torch.cat([job.commands, last])[None]}
+        if self.needs_cameras:
+            assert session.traj is not None and session.c2w is not None
+            # a whole recording, or all of what was sent for this step
+            total = len(session.traj)
+            begin = session.chunk * chunk if total >= 2 * chunk else 0
+            rows = np.minimum(np.minimum(np.arange(begin, begin + chunk), begin + asked - 1), total - 1)
+            future["c2w"] = torch.from_numpy(session.c2w[rows])[None]
+            if self.spec.pose_map:
+                future["pose_map"] = torch.from_numpy(session.traj[rows])[None]
+        return TensorDict(future, [1])
 
-    def _begin(self, session: Session, commands: Tensor, maps: Tensor, c2w: Tensor) -> TensorDict:
-        """The first state of a session; its history begins with the first command, as released."""
-        assert session.first is not None and session.intrinsic is not None
-        device = next(self.simulator.parameters()).device
-        joints = (
-            session.joints
-            if session.joints is not None
-            else commands[0].numpy()
-            if commands.shape[1] == STATE_DIM
-            else np.zeros(STATE_DIM, np.float32)
-        )
-        where = c2w[0] if session.extrinsic is None else torch.from_numpy(session.extrinsic)
-        rows = [
-            torch.from_numpy(session.first),
-            torch.from_numpy(session.intrinsic),
-            where,
-            commands[0],
-            torch.from_numpy(joints),
-            maps[0],
-            torch.tensor(session.seed),
-        ]
-        return self.simulator.reset(*(row[None].to(device) for row in rows))
+    def _begin(self, session: Session, future: TensorDict) -> TensorDict:
+        """The first state of a session. What a client of the released server does not say begins with its
+        first command, as released.
+        """
+        assert session.first is not None
+        command = future["commands"][:, 0]
+        if session.command is not None:
+            command = torch.from_numpy(session.command)[None].to(command.device)
+        if session.joints is not None:
+            joints = torch.from_numpy(session.joints)[None]
+        else:
+            joints = command if self.commands_are_states else torch.zeros(1, self.robot.state_dim)
+        first = {"frames": torch.from_numpy(session.first)[None], "command": command, "state": joints}
+        if self.needs_cameras:
+            assert session.intrinsic is not None
+            intrinsic = torch.from_numpy(session.intrinsic)
+            first["intrinsic"] = resize_intrinsics(intrinsic, session.frame_size, self.spec.size)[None]
+            own = session.extrinsic
+            first["c2w"] = future["c2w"][:, 0] if own is None else torch.from_numpy(own)[None]
+        if self.spec.pose_map:
+            first["pose_map"] = future["pose_map"][:, 0]
+        rows = TensorDict(first, [1]).to(self.simulator.device)
+        return self.simulator.reset(rows, torch.tensor([session.seed]))

@@ -13,11 +13,49 @@ from typing import Any
 
 import numpy as np
 import requests
+import torch
 from aiohttp import web
 from PIL import Image
 
 from actors.serving.app import Server
-from actors.serving.sessions import SessionHost
+from actors.serving.sessions import ServeConfig, SessionHost
+from envs.simulators.dit.engine import DiTSimulator
+from envs.simulators.state_experts.flow import StateExpert
+from tests.embodiments import EMBODIMENTS, world_spec
+
+SERVE: dict[str, Any] = {
+    "host": "127.0.0.1",
+    "port": 0,
+    "sessions": 12,
+    "batch": 8,
+    "linger_ms": 500.0,
+    "idle_s": 900.0,
+    "body_mb": 8.0,
+    "seed": 0,
+    "fixed_seed": False,
+}
+
+
+def serve_config(**options: Any) -> ServeConfig:
+    return ServeConfig(**(SERVE | options))
+
+
+def tiny_world(robot: str = "two_arms_poses") -> DiTSimulator:
+    """An untrained world whose frames depend on seed, commands and history."""
+    torch.manual_seed(0)
+    net = {"layers": 3, "heads": 2, "head_dim": 24, "adaln_rank": 8, "patch": 2, "stem": 0}
+    denoising = {"prediction": "clean", "steps": 2, "shift": 2.0, "foreground": 0.0, "augment": 0.0}
+    spec = world_spec(EMBODIMENTS[robot])
+    world = DiTSimulator(spec, 3, net, {"channels": 8, "width": 16}, denoising)
+    with torch.no_grad():
+        world.net.proj_out.weight.mul_(40)
+        world.codec.decoder[-1].weight.mul_(3)
+    return world.eval()
+
+
+def tiny_expert(world: DiTSimulator) -> StateExpert:
+    torch.manual_seed(1)
+    return StateExpert(world, layers=1, heads=2, head_dim=16, steps=2).eval()
 
 
 def free_port() -> int:
@@ -103,11 +141,11 @@ class Stranger:
         return block(actions.astype("<f4").tobytes()) + block(json.dumps(meta).encode())
 
     def prepare(
-        self, views: int = 3, size: tuple[int, int] = (64, 64), frames: int = 4, seed: int = 0
+        self, views: int = 3, size: tuple[int, int] = (32, 32), frames: int = 4, seed: int = 0
     ) -> None:
         """Cameras, a first frame and a trajectory of random pictures."""
         rng = np.random.default_rng(seed)
-        k = [[60.0, 0, 32], [0, 60, 32], [0, 0, 1]]
+        k = [[60.0, 0, size[1] / 2], [0, 60, size[0] / 2], [0, 0, 1]]
         assert self.post("/set_camera_params", intrinsic=[k] * views).status_code == 200
         smooth = np.repeat(
             np.repeat(rng.random((3, views, size[0] // 8, size[1] // 8), np.float32), 8, -1), 8, -2

@@ -1,108 +1,185 @@
-"""simulator=remote: a served world is an ordinary WorldEnv, and what goes wrong on the other side has a name."""
+"""simulator=remote: a served world is an ordinary Simulator, and what goes wrong on the other side has a
+name.
+"""
 
 from __future__ import annotations
 
+import gc
 import json
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import requests
 import torch
-from torchrl.envs import TransformedEnv
-from torchrl.envs.utils import check_env_specs
+from tensordict import TensorDict
+from torch import Tensor
 
-from actors.serving.sessions import ServeConfig, SessionHost
-from envs.episodes.clips import ClipStore
-from envs.judges import LearnedJudge
-from envs.simulators.base import WorldShape
-from envs.simulators.remote.engine import GivenStates, RemoteConfig, RemoteError, RemoteSimulator
-from envs.simulators.state_experts.head import StateHead
-from envs.simulators.unet.engine import UNetSimulator
-from envs.specs import CHUNK, EPISODE, IMAGE, STATE, Rewards
-from envs.transforms import world_transforms
-from envs.world import InitialStates, WorldEnv
-from tests.actors.serving import Running
+from actors.serving.sessions import SessionHost
+from envs.simulators import memory
+from envs.simulators.base import Simulator
+from envs.simulators.dit.engine import DiTSimulator
+from envs.simulators.remote.engine import GivenStates, RemoteError, RemoteSimulator
+from envs.simulators.remote.protocol import decode_frame, encode_frame
+from envs.simulators.state_experts.base import StateDecoder
+from tests.actors.serving import Running, serve_config, tiny_expert, tiny_world
+from tests.embodiments import ARM_DELTAS, BIMANUAL_JOINTS, world_spec
+from tests.envs.clips_of import first_of, future_of
 
-SHAPE = WorldShape(chunk=4, sides=())
+CONNECTION: dict[str, Any] = {"connect_s": 10.0, "deadline_s": 60.0, "retries": 1, "user": "test"}
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def near() -> DiTSimulator:
+    return tiny_world()
 
 
 @pytest.fixture
-def decoder(simulator: UNetSimulator) -> StateHead:
-    torch.manual_seed(1)
-    return StateHead(simulator.feature_shape[0], 4, 4).eval()
-
-
-@pytest.fixture
-def server(simulator: UNetSimulator, decoder: StateHead) -> Iterator[Running]:
-    running = Running(SessionHost(simulator, decoder, ServeConfig(sessions=3, linger_ms=100.0), bf16=False))
+def server(near: DiTSimulator) -> Iterator[Running]:
+    running = Running(SessionHost(near, tiny_expert(near), serve_config(sessions=3), bf16=False))
     yield running
     running.stop()
 
 
-def world(simulator: object, decoder: object, store: ClipStore, batch: int) -> TransformedEnv:
-    torch.manual_seed(2)
-    # type: ignore[arg-type]
-    base = WorldEnv(simulator, InitialStates.of(store), batch, horizon=8, bf16=False)
-    # type: ignore[arg-type]
-    return TransformedEnv(base, world_transforms(decoder, LearnedJudge(3, 4), Rewards(), store.views))
+def remote(*urls: str, of: Simulator, **options: Any) -> RemoteSimulator:
+    return RemoteSimulator(of.spec, of.memory_frames, urls, CONNECTION | options)
 
 
-def test_a_served_world_is_the_world_up_to_jpeg(
-    server: Running, simulator: UNetSimulator, decoder: StateHead, store: ClipStore
-) -> None:
-    far, near = (
-        world(RemoteSimulator(SHAPE, RemoteConfig((server.url,))), GivenStates(4), store, 2),
-        world(simulator, decoder, store, 2),
-    )
-    torch.manual_seed(3)
-    actions = 0.05 * torch.randn(2, 2, 4, 14)
-    last = []
-    for env in (far, near):
-        env.base_env.schedule([1, 2])
-        now = env.reset()
-        for chunk in actions:
-            now[CHUNK] = chunk
-            now = env.step(now)["next"]
-        last.append(now)
-    assert torch.equal(last[0][EPISODE], last[1][EPISODE])
-    assert (last[0][IMAGE].float() - last[1][IMAGE].float()).abs().mean() < 6
-    assert (last[0][STATE] - last[1][STATE]).abs().mean() < 0.1
-    assert server.host.steps == 4 and server.host.passes <= 3
+def through_jpeg(values: Tensor) -> Tensor:
+    """Pictures [..., V, 3, H, W] as the other side sees them."""
+    views, _, height, width = values.shape[-4:]
+    rows = [decode_frame(encode_frame(row.numpy()), views, height, width) for row in values.flatten(0, -5)]
+    return torch.from_numpy(np.stack(rows)).reshape(values.shape)
 
 
-def test_specs_and_partial_resets(server: Running, store: ClipStore) -> None:
-    env = world(RemoteSimulator(SHAPE, RemoteConfig((server.url,))), GivenStates(4), store, 2)
-    check_env_specs(env)
-    env.base_env.schedule([1, 2, 3])
-    now = env.reset()
+def run(
+    world: Simulator, decoder: StateDecoder, batch: int, steps: int = 2
+) -> tuple[list[Tensor], list[Tensor]]:
+    first = first_of(world.spec, batch)
+    state, frames, states = world.reset(first, torch.arange(batch) + 3), [], []
+    for step in range(steps):
+        made, features, state = world.step(state, future_of(world.spec, batch, step))
+        frames.append(made)
+        states.append(decoder.follow(state, world.spec.chunk, features))
+    return frames, states
+
+
+@pytest.mark.parametrize("robot", ["two_arms_poses", "one_arm_deltas"])
+def test_a_served_world_is_the_world_but_for_jpegs(robot: str) -> None:
+    world = tiny_world(robot)
+    expert = tiny_expert(world)
+    server = Running(SessionHost(world, expert, serve_config(), bf16=False))
+    try:
+        far = remote(server.url, of=world)
+        assert list(far.parameters()) == [] and far.device == torch.device("cpu")
+        frames, states = run(far, GivenStates(far), 2)
+        assert server.host.steps == 4 and server.host.passes <= 4
+        # The same session by hand, from the pictures that the server was sent.
+        spec, first = world.spec, first_of(world.spec, 2)
+        first["frames"] = through_jpeg(first["frames"])
+        maps = [future_of(spec, 2, step) for step in range(2)]
+        for future in maps:
+            if spec.pose_map:
+                future["pose_map"] = through_jpeg(future["pose_map"])
+        if spec.pose_map:  # what a session begins with is not sent; as released, it is the first command's
+            first["pose_map"] = maps[0]["pose_map"][:, 0]
+        alone = world.reset(first[1:], torch.tensor([4]))
+        for step, future in enumerate(maps):
+            made, features, alone = world.step(alone, future[1:])
+            wanted = expert.follow(alone, spec.chunk, features)
+            assert (through_jpeg(made)[0].int() - frames[step][1].int()).abs().max() <= 12
+            assert (through_jpeg(made)[0].float() - frames[step][1].float()).abs().mean() < 0.1
+            assert torch.allclose(wanted[0], states[step][1], atol=1e-3)
+    finally:
+        server.stop()
+
+
+def test_the_same_client_gets_the_same_bits_alone_and_in_company(server: Running, near: DiTSimulator) -> None:
+    far = remote(server.url, of=near)
+    one, _ = run(far, GivenStates(far), 1)
+    far.close()
+    two, _ = run(far, GivenStates(far), 1)
+    far.close()
+    assert all(torch.equal(*pair) for pair in zip(one, two, strict=True))
+    three, _ = run(far, GivenStates(far), 3)
+    alike = [(a[0].int() - b[0].int()).abs().float().mean() for a, b in zip(one, three, strict=True)]
+    assert max(alike) < 0.1
+
+
+def test_partial_resets_end_the_sessions_they_replace(server: Running, near: DiTSimulator) -> None:
+    far = remote(server.url, of=near)
+    state = far.reset(first_of(far.spec, 2), torch.tensor([1, 2]))
     kept = set(server.host.sessions)
     assert len(kept) == 2
-    now["_reset"] = torch.tensor([[True], [False]])
-    env.reset(now)
+    mask = torch.tensor([True, False])
+    far.release(state, mask)
+    state = memory.replace(state, mask, far.reset(first_of(far.spec, 1), torch.tensor([3])))
     assert len(server.host.sessions) == 2 and len(kept & set(server.host.sessions)) == 1
+    assert far.step(state, future_of(far.spec, 2))[0].shape[0] == 2
 
 
-def test_more_rows_than_places_and_many_urls(
-    server: Running, simulator: UNetSimulator, decoder: StateHead, store: ClipStore
-) -> None:
-    with pytest.raises(
-        RemoteError, match=r"4 sessions are wanted, the servers at simulator\.model\.urls hold 3"
-    ):
-        world(RemoteSimulator(SHAPE, RemoteConfig((server.url,))), GivenStates(4), store, 4).reset()
-    second = Running(SessionHost(simulator, decoder, ServeConfig(sessions=1), bf16=False))
+def test_more_rows_than_places_and_many_urls(server: Running, near: DiTSimulator) -> None:
+    first, seeds = first_of(near.spec, 4), torch.arange(4)
+    with pytest.raises(RemoteError, match=r"4 sessions are wanted, the servers at simulator\.urls hold 3"):
+        remote(server.url, of=near).reset(first, seeds)
+    second = Running(SessionHost(near, None, serve_config(sessions=1), bf16=False))
     try:
-        env = world(RemoteSimulator(SHAPE, RemoteConfig((server.url, second.url))), GivenStates(4), store, 4)
-        now = env.reset()
-        now[CHUNK] = torch.zeros(4, 4, 14)
-        assert env.step(now)["next", IMAGE].shape[0] == 4 and len(second.host.sessions) == 1
+        far = remote(server.url, second.url, of=near)
+        state = far.reset(first, seeds)
+        frames, features, _ = far.step(state, future_of(far.spec, 4))
+        assert frames.shape[0] == 4 and len(second.host.sessions) == 1
+        assert torch.isfinite(features[:3]).all() and features[3].isnan().all()  # the second has no decoder
     finally:
         second.stop()
-    with pytest.raises(ValueError, match=r"simulator\.model\.urls"):
-        RemoteConfig(())
+    with pytest.raises(ValueError, match=r"simulator\.urls"):
+        remote(of=near)
+
+
+def test_a_reset_that_fails_leaves_nothing_behind(server: Running, near: DiTSimulator) -> None:
+    url, httpd = strange_server(lambda *_: (503, b'{"error": "all places are taken"}'))
+    try:
+        far = remote(server.url, url, of=near)
+        with pytest.raises(RemoteError, match="/init answered 503: all places are taken"):
+            far.reset(first_of(far.spec, 4), torch.arange(4))
+        assert server.host.sessions == {}
+        state = far.reset(first_of(far.spec, 3), torch.arange(3))  # the three places that do work
+        assert far.step(state, future_of(far.spec, 3))[0].shape[0] == 3
+        # A server that is not there yet when it is first asked is there later.
+        late = remote("http://127.0.0.1:9", server.url, of=near)
+        for _ in range(2):
+            with pytest.raises(RemoteError, match="no connection"):
+                late.reset(first_of(far.spec, 1), torch.arange(1))
+        assert late._places == []
+    finally:
+        httpd.shutdown()
+
+
+def test_sessions_end_with_their_simulator_and_its_process(server: Running, near: DiTSimulator) -> None:
+    far = remote(server.url, of=near)
+    far.reset(first_of(far.spec, 1), torch.arange(1))
+    far.close()
+    assert server.host.sessions == {}
+    far.reset(first_of(far.spec, 1), torch.arange(1))
+    del far
+    gc.collect()
+    assert server.host.sessions == {}
+    code = (
+        "import torch; from tests.actors.test_remote import *; spec = world_spec(BIMANUAL_POSES);"
+        f"far = RemoteSimulator(spec, 3, ('{server.url}',), CONNECTION);"
+        "far.reset(first_of(spec, 2), torch.arange(2)); print('open', flush=True)"
+    ).replace("BIMANUAL_POSES", "__import__('tests.embodiments').embodiments.BIMANUAL_POSES")
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.stdout == "open\n", done.stderr
+    assert server.host.opened == 4 and server.host.sessions == {}
 
 
 def strange_server(answer: Callable[[str, bytes], tuple[int, bytes]]) -> tuple[str, ThreadingHTTPServer]:
@@ -142,61 +219,60 @@ def strange_server(answer: Callable[[str, bytes], tuple[int, bytes]]) -> tuple[s
             "/step",
             200,
             b'\0\0\0\x3f{"frame_shape": [25, 3, 3, 384, 512], "state_shape": [25, 16]} ',
-            "task.chunk",
+            r"announced, -1 pictures|task\.chunk",
         ),
     ],
 )
-def test_servers_that_answer_nonsense(
-    path: str, status: int, body: bytes, message: str, store: ClipStore
-) -> None:
+def test_servers_that_answer_nonsense(path: str, status: int, body: bytes, message: str) -> None:
     def answer(asked: str, _: bytes) -> tuple[int, bytes]:
         return (status, body) if asked == path else (200, json.dumps({"client_id": "x"}).encode())
 
     url, httpd = strange_server(answer)
     try:
-        env = world(RemoteSimulator(SHAPE, RemoteConfig((url,), retries=1)), GivenStates(4), store, 1)
+        far = RemoteSimulator(world_spec(ARM_DELTAS), 3, (url,), CONNECTION)
         with pytest.raises(RemoteError, match=message):
-            now = env.reset()
-            now[CHUNK] = torch.zeros(1, 4, 14)
-            env.step(now)
+            state = far.reset(first_of(far.spec, 1), torch.zeros(1, dtype=torch.int64))
+            far.step(state, future_of(far.spec, 1))
     finally:
         httpd.shutdown()
 
 
-def test_servers_that_never_answer_and_that_are_not_there(store: ClipStore) -> None:
+def test_servers_that_never_answer_and_that_are_not_there(near: DiTSimulator) -> None:
     # type: ignore[func-returns-value]
     url, httpd = strange_server(lambda *_: (time.sleep(3), (200, b"{}"))[1])
+    first, seed = first_of(near.spec, 1), torch.zeros(1, dtype=torch.int64)
     try:
         began = time.monotonic()
         with pytest.raises(RemoteError, match=r"deadline_s=0\.3 after 2 tries"):
-            world(
-                RemoteSimulator(SHAPE, RemoteConfig((url,), deadline_s=0.3, retries=1)),
-                GivenStates(4),
-                store,
-                1,
-            ).reset()
+            remote(url, of=near, deadline_s=0.3).reset(first, seed)
         assert time.monotonic() - began < 2.5
     finally:
         httpd.shutdown()
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         port = s.getsockname()[1]
-    with pytest.raises(RemoteError, match="no answer"):
-        world(
-            RemoteSimulator(SHAPE, RemoteConfig((f"http://127.0.0.1:{port}",), retries=0)),
-            GivenStates(4),
-            store,
-            1,
-        ).reset()
+    began = time.monotonic()
+    with pytest.raises(RemoteError, match="no connection") as refused:
+        remote(f"http://127.0.0.1:{port}", of=near, retries=5).reset(first, seed)
+    assert time.monotonic() - began < 1.0 and "deadline" not in str(refused.value)
+
+
+def test_a_refusal_is_told_at_once_in_the_servers_words(near: DiTSimulator) -> None:
+    server = Running(SessionHost(near, None, serve_config(body_mb=0.002), bf16=False))
+    try:
+        began = time.monotonic()
+        with pytest.raises(RemoteError, match=r"413.*serve\.body_mb=0\.002"):
+            remote(server.url, of=near, retries=5).reset(first_of(near.spec, 1), torch.zeros(1).long())
+        assert time.monotonic() - began < 1.0 and server.host.sessions == {}
+    finally:
+        server.stop()
 
 
 def test_a_lost_answer_is_asked_for_again_where_that_is_safe(
-    server: Running, store: ClipStore, monkeypatch: pytest.MonkeyPatch
+    server: Running, near: DiTSimulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import requests
-
-    env = world(RemoteSimulator(SHAPE, RemoteConfig((server.url,), retries=1)), GivenStates(4), store, 1)
-    now = env.reset()
+    far = remote(server.url, of=near)
+    state = far.reset(first_of(far.spec, 1), torch.arange(1))
     post, lost = requests.Session.post, []
 
     def flaky(self: requests.Session, url: str, **more: object) -> requests.Response:
@@ -207,17 +283,15 @@ def test_a_lost_answer_is_asked_for_again_where_that_is_safe(
         return answer
 
     monkeypatch.setattr(requests.Session, "post", flaky)
-    now[CHUNK] = torch.zeros(1, 4, 14)
-    env.step(now)
+    far.step(state, future_of(far.spec, 1))
     (session,) = server.host.sessions.values()
     assert lost and session.chunk == 1
 
 
-def test_given_states_need_states_or_joints() -> None:
-    nothing = torch.full((1, 4, 16), torch.nan)
-    joints = torch.randn(1, 4, 16)
-    zero = torch.zeros(1, dtype=torch.int64)
-    assert torch.equal(GivenStates(4).decode(nothing, joints, joints, joints, zero, zero), joints)
+def test_given_states_need_states_or_joints(near: DiTSimulator) -> None:
+    nothing, commands = torch.full((1, 4, 16), torch.nan), torch.randn(1, 4, 16)
+    zero, none = torch.zeros(1, dtype=torch.int64), TensorDict({}, [1])
+    joints = RemoteSimulator(world_spec(BIMANUAL_JOINTS), 3, ("http://127.0.0.1:9",), CONNECTION)
+    assert torch.equal(GivenStates(joints).decode(nothing, commands, none, zero, zero), commands)
     with pytest.raises(RemoteError, match="no joint states"):
-        GivenStates(4).decode(nothing, torch.zeros(1, 4, 14), joints, joints, zero, zero)
-    assert np.isfinite(joints).all()
+        GivenStates(near).decode(nothing[..., :14], commands[..., :14], none, zero, zero)

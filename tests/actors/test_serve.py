@@ -4,37 +4,70 @@ nobody.
 
 from __future__ import annotations
 
+import gzip
 import json
 import random
 import socket
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import requests
 import torch
 
-from actors.serving.sessions import ServeConfig, SessionHost
+from actors.serving.batching import Company
+from actors.serving.page import joint_table
+from actors.serving.sessions import SessionHost
+from envs.conditioning.joint_commands import JointCommands
+from envs.embodiment import EmbodimentError, Robot
 from envs.geometry.kinematics import Kinematics
-from envs.simulators.state_experts.head import StateHead
-from envs.simulators.unet.engine import UNetSimulator
-from tests.actors.serving import Running, Stranger, block, jpeg
+from envs.simulators.dit.engine import DiTSimulator
+from tests.actors.serving import Running, Stranger, block, jpeg, serve_config, tiny_expert, tiny_world
+from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES
 
-REST = np.tile(np.array([0, -0.35, 0, 2.1, 0, 1.39, 0, 0.2] * 2, np.float32), (4, 1))
+POSES = np.tile(np.array([0.3, 0.2, 0.4, 0, 0, 0, 0.5, 0.3, -0.2, 0.4, 0, 0, 0, 0.5], np.float32), (4, 1))
+JOINTS = np.zeros((4, 16), np.float32)
 
 
-def make(simulator: UNetSimulator, **config: object) -> Running:
-    torch.manual_seed(1)
-    decoder = StateHead(simulator.feature_shape[0], simulator.shape.chunk, simulator.shape.memory).eval()
-    # type: ignore[arg-type]
-    return Running(SessionHost(simulator, decoder, ServeConfig(**config), Kinematics(), bf16=False))
+def two_arms(folder: Path) -> Robot:
+    """A robot description of two arms of seven hinges."""
+
+    def arm(side: str) -> str:
+        links = "".join(
+            f'<body name="{side}{k}" pos="0 0 .1"><joint name="{side}_j{k}" axis="0 {k % 2} {1 - k % 2}"/>'
+            '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+            for k in range(7)
+        )
+        return f'{links}<site name="{side}_flange"/>' + "</body>" * 7
+
+    path = folder / "arms.xml"
+    path.write_text(f"<mujoco><worldbody>{arm('left')}{arm('right')}</worldbody></mujoco>")
+    joints = tuple(tuple(f"{side}_j{k}" for k in range(7)) for side in ("left", "right"))
+    return Robot(str(path), joints, ("left_flange", "right_flange"))
+
+
+@pytest.fixture(scope="module")
+def world() -> DiTSimulator:
+    return tiny_world()
+
+
+@pytest.fixture(scope="module")
+def joints(tmp_path_factory: pytest.TempPathFactory) -> JointCommands:
+    robot = two_arms(tmp_path_factory.mktemp("robot"))
+    return JointCommands(BIMANUAL_POSES, Kinematics(robot))
+
+
+def make(world: DiTSimulator, joints: JointCommands | None = None, **config: Any) -> Running:
+    return Running(SessionHost(world, tiny_expert(world), serve_config(**config), joints, bf16=False))
 
 
 @pytest.fixture
-def server(simulator: UNetSimulator) -> Iterator[Running]:
-    running = make(simulator, sessions=12, body_mb=8.0)
+def server(world: DiTSimulator, joints: JointCommands) -> Iterator[Running]:
+    running = make(world, joints)
     yield running
     running.stop()
 
@@ -44,9 +77,9 @@ def test_a_strangers_client_works_unchanged(server: Running) -> None:
     client = Stranger(server.url)
     assert client.post("/set_task", task="push it").json() == {"success": True}
     client.prepare(frames=12)
-    frames, state = client.step(REST)
-    assert frames.shape == (4, 3, 3, 64, 64) and state is not None and state.shape == (4, 16)
-    frames, state = client.step(REST[:3])  # fewer actions than a chunk: fewer frames, and no more happened
+    frames, state = client.step(POSES)
+    assert frames.shape == (4, 3, 3, 32, 32) and state is not None and state.shape == (4, 14)
+    frames, state = client.step(POSES[:3])  # fewer actions than a chunk: fewer frames, and no more happened
     assert frames.shape[0] == 3 and state is not None and len(state) == 3
     (session,) = server.host.sessions.values()
     assert session.frames == 7 and int(session.state["length"]) == 8
@@ -55,7 +88,7 @@ def test_a_strangers_client_works_unchanged(server: Running) -> None:
         said["step_count"] == 2
         and said["frames_generated"] == 7
         and said["has_preview"]
-        and len(said["state"]) == 16
+        and len(said["state"]) == 14
         and said["task"] == "push it"
     )
     assert client.id not in json.dumps(said)
@@ -63,19 +96,145 @@ def test_a_strangers_client_works_unchanged(server: Running) -> None:
     assert preview.headers["Content-Type"] == "image/jpeg" and preview.content[:2] == b"\xff\xd8"
     assert "world model" in requests.get(server.url, timeout=5).text
     assert client.post("/reset").status_code == 200
-    refused = client.send("/step", client.actions(REST))
+    refused = client.send("/step", client.actions(POSES))
     assert refused.status_code == 400 and "/set_episode_data" in refused.json()["error"]
     assert client.post("/close").status_code == 200 and client.post("/reset").status_code == 403
 
 
-def test_pictures_of_another_size_are_resized(server: Running) -> None:
+def test_pictures_of_another_size_are_resized_and_their_intrinsics_with_them(server: Running) -> None:
     client = Stranger(server.url)
-    client.prepare(size=(96, 128))
-    assert client.step(REST)[0].shape[-2:] == (64, 64)
+    client.prepare(size=(64, 96))
+    assert client.step(POSES)[0].shape[-2:] == (32, 32)
+    (session,) = server.host.sessions.values()
+    assert session.state is not None
+    expected = torch.tensor([[20.0, 0, 16], [0, 30, 16], [0, 0, 1]])
+    assert torch.allclose(session.state["intrinsic"][0], expected.expand(3, 3, 3))
 
 
-def test_sessions_share_forward_passes_and_nothing_else(simulator: UNetSimulator) -> None:
-    server = make(simulator, linger_ms=300.0, batch=4)
+def test_joints_go_through_the_kinematics(server: Running, joints: JointCommands) -> None:
+    client = Stranger(server.url)
+    client.prepare()
+    assert client.step(JOINTS)[0].shape[0] == 4
+    (session,) = server.host.sessions.values()
+    assert session.state is not None
+    command = session.state["history", "commands"][0, 1]
+    assert torch.allclose(command, joints(torch.zeros(16)), atol=1e-6)
+    assert float(command[2]) == pytest.approx(0.7, abs=1e-4)  # seven links of 0.1 m
+    assert joints.grippers == (7, 15)
+    with pytest.raises(EmbodimentError, match="absolute end-effector"):
+        JointCommands(ARM_DELTAS, joints.kinematics)
+
+
+@pytest.mark.parametrize("robot", ["one_arm_deltas", "one_arm_joints"])
+def test_worlds_without_calibration_ask_for_neither_cameras_nor_pose_maps(robot: str) -> None:
+    world = tiny_world(robot)
+    server = make(world)
+    try:
+        client, spec = Stranger(server.url), world.spec
+        refused = client.send("/step", client.actions(np.zeros((4, spec.action_dim))))
+        assert refused.status_code == 400 and "['/set_episode_data']" in refused.json()["error"]
+        frame = np.zeros((3, spec.views, *spec.size), np.float32)
+        assert client.send("/set_episode_data", client.first_frame(frame)).status_code == 200
+        frames, state = client.step(np.zeros((4, spec.action_dim), np.float32))
+        assert frames.shape == (4, 3, spec.views, *spec.size)
+        assert state is not None and state.shape == (4, spec.state_dim)
+    finally:
+        server.stop()
+
+
+def test_the_same_client_run_twice(world: DiTSimulator) -> None:
+    for fixed in (True, False):
+        server = make(world, fixed_seed=fixed)
+        try:
+            made = []
+            for _ in range(2):
+                client = Stranger(server.url)
+                client.prepare()
+                made.append(client.step(POSES)[0])
+            assert np.array_equal(*made) == fixed
+        finally:
+            server.stop()
+
+
+def test_the_page_names_joints_and_keeps_watching_whom_it_watched(server: Running) -> None:
+    first, second = Stranger(server.url, "first"), Stranger(server.url, "second")
+    second.prepare()
+    second.step(POSES)
+    number = list(server.host.sessions.values())[1].number
+    first.post("/close")
+
+    def status(query: str) -> requests.Response:
+        return requests.get(f"{server.url}/api/status?session={query}", timeout=5)
+
+    said = status(str(number)).json()
+    assert said["session"] == number and said["sessions"] == [
+        {"number": number, "user": "second", "task": "", "steps": 1, "frames": 4}
+    ]
+    row = next(row for row in said["joints"] if row["name"] == "right_gripper")
+    assert row["action"] == 0.5 and row["difference"] == pytest.approx(row["state"] - 0.5)
+    assert status("0").json()["session"] is None  # closed: nobody else is shown in its stead
+    for query in ("\u00b2", "9" * 5000, "-1", "x"):
+        assert status(query).status_code == 400 and "session" in status(query).json()["error"]
+    assert joint_table(("a", "b"), [1.0, 2.0], ("b", "c"), [2.5, 3.0]) == [
+        {"name": "b", "action": 2.0, "state": 2.5, "difference": 0.5},
+        {"name": "c", "action": None, "state": 3.0, "difference": None},
+        {"name": "a", "action": 1.0, "state": None, "difference": None},
+    ]
+
+
+def test_free_running_clients_share_passes(world: DiTSimulator) -> None:
+    server = make(world)
+    try:
+        clients = [Stranger(server.url, seed=n) for n in range(3)]
+        for client in clients:
+            client.prepare()
+        steps = 6
+
+        def run(client: Stranger) -> None:
+            for _ in range(steps):
+                client.step(POSES)
+
+        threads = [threading.Thread(target=run, args=[client]) for client in clients]
+        [thread.start() for thread in threads]
+        [thread.join() for thread in threads]
+        assert server.host.steps == 3 * steps and server.host.passes <= steps + 4
+    finally:
+        server.stop()
+
+
+def test_nobody_waits_for_those_who_do_not_come() -> None:
+    company = Company(10.0)
+    assert company.wait_until(5.0) == 5.0
+    company.answered(["slow", "quick"], 100.0, pass_s=1.0)
+    assert company.wait_until(100.1) == 101.0  # for as long as a pass takes, while pauses are unknown
+    company.arrived("quick", 100.2)
+    company.arrived("slow", 130.0)
+    company.answered(["slow", "quick"], 131.0, pass_s=1.0)
+    assert company.wait_until(131.0) == pytest.approx(131.3)  # for the quick one, half again its usual pause
+    assert company.wait_until(132.0) == 132.0
+    company.left("quick")
+    assert company.wait_until(131.0) == 131.0
+
+
+def test_broken_compression_is_bad_input(server: Running) -> None:
+    good = gzip.compress(b'{"user_name": "zip"}' * 1)
+    for body, status in (
+        (good, 200),
+        (good[:-12], 400),
+        (b"no gzip at all", 400),
+        (b"\x1f\x8b" + b"x" * 50, 400),
+    ):
+        for kind in ("gzip", "deflate"):
+            if kind == "deflate" and status == 200:
+                continue
+            said = requests.post(
+                f"{server.url}/init", data=body, headers={"Content-Encoding": kind}, timeout=10
+            )
+            assert said.status_code == status and ("error" in said.json() or status == 200), (body, said.text)
+
+
+def test_sessions_share_forward_passes_and_nothing_else(world: DiTSimulator) -> None:
+    server = make(world, batch=4)
     try:
         clients = [Stranger(server.url, seed=n) for n in range(4)]
         for n, client in enumerate(clients):
@@ -83,16 +242,16 @@ def test_sessions_share_forward_passes_and_nothing_else(simulator: UNetSimulator
         made: dict[int, list[np.ndarray]] = {n: [] for n in range(4)}
         for _ in range(2):
             threads = [
-                threading.Thread(target=lambda n=n: made[n].append(clients[n].step(REST)[0]))
+                threading.Thread(target=lambda n=n: made[n].append(clients[n].step(POSES)[0]))
                 for n in range(4)
             ]
             [thread.start() for thread in threads]
             [thread.join() for thread in threads]
-        assert server.host.steps == 8 and server.host.passes <= 4
+        assert server.host.steps == 8 and server.host.passes <= 5
         alone = Stranger(server.url, seed=2)
         alone.prepare(seed=2)
         for step in range(2):
-            assert np.abs(alone.step(REST)[0].astype(int) - made[2][step].astype(int)).mean() < 0.5
+            assert np.abs(alone.step(POSES)[0].astype(int) - made[2][step].astype(int)).mean() < 0.5
         assert np.abs(made[1][1].astype(int) - made[2][1].astype(int)).mean() > 2
     finally:
         server.stop()
@@ -117,11 +276,11 @@ def test_bad_input_is_refused_by_name(server: Running) -> None:
     refused(client.post("/set_camera_params", intrinsic=[[1, 2], [3]]), 400, "intrinsic")
     refused(client.post("/set_camera_params", intrinsic=np.zeros((3, 3, 3)).tolist()), 400, "invertible")
     refused(client.post("/set_camera_params"), 400, "intrinsic is missing")
-    frame = np.zeros((3, 3, 64, 64), np.float32)
+    frame = np.zeros((3, 3, 32, 32), np.float32)
     refused(client.send("/set_episode_data", client.first_frame(frame)[:-9]), 400, "announces")
-    meta = json.dumps({"client_id": client.id, "frame_shape": [3, 3, 64, 64]}).encode()
+    meta = json.dumps({"client_id": client.id, "frame_shape": [3, 3, 32, 32]}).encode()
     refused(client.send("/set_episode_data", block(jpeg(frame)[:-200]) + block(meta)), 400, "picture")
-    refused(client.send("/set_episode_data", block(jpeg(frame[:, :, :32])) + block(meta)), 400, "32 x 192")
+    refused(client.send("/set_episode_data", block(jpeg(frame[:, :, :16])) + block(meta)), 400, "16 x 96")
     refused(
         client.send(
             "/set_episode_data",
@@ -132,11 +291,11 @@ def test_bad_input_is_refused_by_name(server: Running) -> None:
         "larger",
     )
     refused(client.send("/set_episode_data", block(jpeg(frame)) + block(b"[" * 100_000)), 400, "JSON")
-    refused(client.send("/step", client.actions(np.full((4, 16), np.nan))), 400, "NaN")
+    refused(client.send("/step", client.actions(np.full((4, 14), np.nan))), 400, "NaN")
     refused(client.send("/step", client.actions(np.zeros((4, 7)))), 400, "14 numbers")
-    refused(client.send("/step", client.actions(np.zeros((5, 16)))), 400, "exceeds")
-    refused(client.send("/step", client.actions(REST)[:-5] + b"extra"), 400, "")
-    assert client.step(REST)[0].shape[0] == 4
+    refused(client.send("/step", client.actions(np.zeros((5, 14)))), 400, "exceeds")
+    refused(client.send("/step", client.actions(POSES)[:-5] + b"extra"), 400, "")
+    assert client.step(POSES)[0].shape[0] == 4
 
 
 def test_an_enormous_body_is_refused_before_it_is_read(server: Running) -> None:
@@ -155,32 +314,32 @@ def test_an_enormous_body_is_refused_before_it_is_read(server: Running) -> None:
 def test_a_client_that_vanishes_harms_nobody(server: Running) -> None:
     bystander, gone = Stranger(server.url, seed=5), Stranger(server.url)
     bystander.prepare(), gone.prepare()
-    body = gone.actions(REST)
+    body = gone.actions(POSES)
     for sent in (len(body) // 2, len(body)):
         with socket.create_connection(("127.0.0.1", server.port)) as s:
             s.sendall(
                 f"POST /step HTTP/1.1\r\nHost: x\r\nContent-Length: {len(body)}\r\n\r\n".encode()
                 + body[:sent]
             )
-    assert bystander.step(REST)[0].shape[0] == 4
+    assert bystander.step(POSES)[0].shape[0] == 4
     until = time.monotonic() + 10
     while server.host.sessions[gone.id].chunk < 1 and time.monotonic() < until:
         time.sleep(0.05)  # the whole request was taken, its step is made although nobody waits
-    assert gone.step(REST)[0].shape[0] == 4
+    assert gone.step(POSES)[0].shape[0] == 4
 
 
 def test_a_repeated_step_is_answered_again_and_not_made_again(server: Running) -> None:
     client = Stranger(server.url, seed=1)
     client.prepare()
-    body = client.actions(REST, chunk=0)
+    body = client.actions(POSES, chunk=0)
     first, again = client.send("/step", body), client.send("/step", body)
     assert first.content == again.content and server.host.sessions[client.id].chunk == 1
-    assert client.send("/step", client.actions(REST, chunk=7)).status_code == 400
-    assert client.send("/step", client.actions(REST, chunk=1)).status_code == 200
+    assert client.send("/step", client.actions(POSES, chunk=7)).status_code == 400
+    assert client.send("/step", client.actions(POSES, chunk=1)).status_code == 200
 
 
-def test_full_servers_say_so_and_idle_sessions_make_room(simulator: UNetSimulator) -> None:
-    server = make(simulator, sessions=2, idle_s=0.5)
+def test_full_servers_say_so_and_idle_sessions_make_room(world: DiTSimulator) -> None:
+    server = make(world, sessions=2, idle_s=0.5)
     try:
         clients = [Stranger(server.url) for _ in range(2)]
         full = requests.post(f"{server.url}/init", json={}, timeout=5)
@@ -202,23 +361,23 @@ def test_a_failing_model_is_a_500_and_the_session_goes_on(
     client.prepare()
     step = server.host.simulator.step
     monkeypatch.setattr(server.host.simulator, "step", lambda *_: 1 / 0)
-    failed = client.send("/step", client.actions(REST))
+    failed = client.send("/step", client.actions(POSES))
     assert failed.status_code == 500 and "ZeroDivisionError" in failed.json()["error"]
     monkeypatch.setattr(server.host.simulator, "step", step)
-    assert client.step(REST)[0].shape[0] == 4
+    assert client.step(POSES)[0].shape[0] == 4
 
 
 def test_six_hundred_mutated_bodies(server: Running) -> None:
     bystander, twin, victim = Stranger(server.url, seed=9), Stranger(server.url, seed=9), Stranger(server.url)
     for client in (bystander, twin, victim):
         client.prepare()
-    before = bystander.step(REST)[0]
+    before = bystander.step(POSES)[0]
     rng = random.Random(0)
     c2w = np.tile(np.eye(4, dtype=np.float32), (3, 4, 1, 1))
     bodies = {
-        "/set_episode_data": victim.first_frame(np.zeros((3, 3, 64, 64), np.float32)),
-        "/set_episode_traj": victim.trajectory(np.zeros((3, 3, 4, 64, 64), np.float32), c2w),
-        "/step": victim.actions(REST),
+        "/set_episode_data": victim.first_frame(np.zeros((3, 3, 32, 32), np.float32)),
+        "/set_episode_traj": victim.trajectory(np.zeros((3, 3, 4, 32, 32), np.float32), c2w),
+        "/step": victim.actions(POSES),
         "/init": b'{"user_name": "fuzz", "seed": 3}',
         "/set_camera_params": json.dumps({"client_id": victim.id, "intrinsic": np.eye(3).tolist()}).encode(),
         "/set_task": json.dumps({"client_id": victim.id, "task": "x"}).encode(),
@@ -244,5 +403,5 @@ def test_six_hundred_mutated_bodies(server: Running) -> None:
         status = victim.send(path, bytes(body)).status_code
         seen[status] = seen.get(status, 0) + 1
     assert set(seen) <= {200, 400, 403, 413, 503} and seen[400] > 200, seen
-    assert np.array_equal(twin.step(REST)[0], before)
-    assert bystander.step(REST)[0].shape[0] == 4
+    assert np.array_equal(twin.step(POSES)[0], before)
+    assert bystander.step(POSES)[0].shape[0] == 4

@@ -53,7 +53,7 @@ def build(checkpoint: Path | None, spec: WorldSpec = SPEC, **options: Any) -> GE
 
 
 def write_checkpoint(folder: Path, expert: bool = True) -> Path:
-    """A folder like the released one, or a file with its companions like GE-Sim 1; returns the path to load."""
+    """A folder like the released one, or a file with companions like GE-Sim 1; returns the path to load."""
     torch.manual_seed(0)
     folder.mkdir(parents=True, exist_ok=True)
     shape = DiTShape(**NET, pose_expert=expert)

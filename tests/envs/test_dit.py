@@ -1,4 +1,4 @@
-"""The DiT engine for every robot: determinism in any batch slot, partial resets, learning, no unused weights."""
+"""The DiT for every robot: determinism in any batch slot, partial resets, no unused weights, learning."""
 
 from __future__ import annotations
 

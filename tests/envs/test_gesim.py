@@ -1,4 +1,4 @@
-"""GE-Sim's released form: checkpoints load strictly, sessions are independent rows, quirks only on request."""
+"""GE-Sim's released form: checkpoints load strictly, sessions are independent, quirks only on request."""
 
 from __future__ import annotations
 

@@ -240,7 +240,7 @@ class LatentWorld(Simulator):
         return self.diffusion.sampler(velocity, noise), kept[0]
 
     def _noise(self, seed: Tensor, chunk_index: Tensor, like: Tensor) -> Tensor:
-        """Noise [B, V, C, T', h, w], row by row from its own generator, so that it is the same in any batch."""
+        """Noise [B, V, C, T', h, w], row by row from its own generator, the same in any batch."""
         _, views, channels, _, height, width = like.shape
         rows = []
         for s, c in zip(seed.tolist(), chunk_index.tolist(), strict=True):

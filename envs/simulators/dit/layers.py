@@ -24,7 +24,7 @@ def sinusoid(values: Tensor, size: int) -> Tensor:
 
 
 def rotate(x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
-    """Apply rotary positions to x [..., L, head_dim], pairing the first half of the channels with the second."""
+    """Apply rotary positions to x [..., L, head_dim], pairing the two halves of the channels."""
     first, second = x.float().chunk(2, -1)
     (cos, other_cos), (sin, other_sin) = (part.chunk(2, -1) for part in rope)
     return torch.cat((first * cos - second * sin, second * other_cos + first * other_sin), -1).to(x.dtype)

@@ -102,7 +102,7 @@ def video_rope(
 
 
 class VisionBlock(nn.Module):
-    """Self-attention, attention to the text if there is one, feed-forward, each modulated by the time step."""
+    """Self-attention, attention to a text, if any, and feed-forward, each modulated by the time step."""
 
     def __init__(self, shape: DiTShape):
         super().__init__()

@@ -71,8 +71,8 @@ class Sampling:
             raise ValueError(f"simulator.sampling.kind={self.kind!r} must be distilled or edm")
         if self.kind != "edm" and self.steps > len(DISTILLED):
             raise ValueError(
-                f"simulator.sampling.steps={self.steps}, but the distilled sampler has {len(DISTILLED)} levels;"
-                " use simulator.sampling.kind=edm for more"
+                f"simulator.sampling.steps={self.steps}, but the distilled sampler has {len(DISTILLED)}"
+                " levels; use simulator.sampling.kind=edm for more"
             )
 
     def sampler(self, edm: EDM, distilled: bool) -> Sampler:
@@ -130,8 +130,8 @@ class GESimulator(LatentWorld):
     ):
         if not (spec.pose_map and spec.ray_map):
             raise ValueError(
-                f"simulator=gesim is conditioned on pose and ray maps, and {spec.embodiment.robot} comes without;"
-                " it needs calibrated cameras, simulator.kinematics for joint commands, and"
+                f"simulator=gesim is conditioned on pose and ray maps, and {spec.embodiment.robot} comes"
+                " without; it needs calibrated cameras, simulator.kinematics for joint commands, and"
                 " simulator.pose_map=true simulator.ray_map=true"
             )
         if parity not in PARITY:
@@ -202,8 +202,8 @@ def _check(checkpoint: str, shape: DiTShape, spec: WorldSpec) -> None:
         )
     if shape.in_channels != shape.out_channels + _CONDITIONING:
         raise CheckpointError(
-            f"simulator.checkpoint={checkpoint} takes {shape.in_channels} channels, GE-Sim's conditioning makes"
-            f" {shape.out_channels + _CONDITIONING}"
+            f"simulator.checkpoint={checkpoint} takes {shape.in_channels} channels, GE-Sim's conditioning"
+            f" makes {shape.out_channels + _CONDITIONING}"
         )
 
 

@@ -33,8 +33,8 @@ class GESimStateExpert(FlowStateDecoder):
         ):
             raise CheckpointError(
                 f"the state expert of simulator.checkpoint={checkpoint} knows {JOINTS} joints, but"
-                f" {robot.robot} has actions of {robot.action_dim} and states of {robot.state_dim}; train one with"
-                " simulator.state_expert._target_=envs.simulators.state_experts.flow.StateExpert"
+                f" {robot.robot} has actions of {robot.action_dim} and states of {robot.state_dim}; train one"
+                " with simulator.state_expert._target_=envs.simulators.state_experts.flow.StateExpert"
             )
         untrained = replace(simulator.net.shape, pose_in_channels=width, pose_out_channels=robot.state_dim)
         every = simulator.spec.chunk if simulator.parity.thins_history else 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from dataclasses import dataclass
@@ -62,8 +63,8 @@ class Made:
         """
         if self.frames.shape != shape:
             raise RemoteError(
-                f"{self.url}/step answered frames {list(self.frames.shape)} [T,V,3,H,W], wanted {list(shape)};"
-                " set task.chunk, task.size and the robot's cameras as the server's are"
+                f"{self.url}/step answered frames {list(self.frames.shape)} [T,V,3,H,W], wanted"
+                f" {list(shape)}; set task.chunk, task.size and the robot's cameras as the server's are"
             )
         return self.frames
 
@@ -221,10 +222,8 @@ class Connection:
         """End the session; a server that is gone has ended it already."""
         if self.client_id:
             client, self.client_id = self.client_id, ""
-            try:
+            with contextlib.suppress(requests.RequestException):
                 self.http.post(f"{self.url}/close", json={"client_id": client}, timeout=(1.0, 5.0))
-            except requests.RequestException:
-                pass
         self.http.close()
 
 

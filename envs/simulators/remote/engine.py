@@ -79,8 +79,8 @@ class RemoteSimulator(Simulator):
         places, free = self._free()
         if len(free) < len(first):
             raise RemoteError(
-                f"{len(first)} sessions are wanted, the servers at simulator.urls hold {len(free)} more; add urls,"
-                " or run fewer episodes side by side"
+                f"{len(first)} sessions are wanted, the servers at simulator.urls hold {len(free)} more; add"
+                " urls, or run fewer episodes side by side"
             )
         mine = {number: Connection(places[number].url, self.options) for number in free[: len(first)]}
         jobs = [
@@ -195,7 +195,7 @@ class GivenStates(StateDecoder):
             return features
         if not self.commands_are_states:
             raise RemoteError(
-                "the server decodes no joint states, and this robot's commands do not say them; serve a world with"
-                " a state decoder"
+                "the server decodes no joint states, and this robot's commands do not say them; serve a world"
+                " with a state decoder"
             )
         return torch.where(known, features, commands)

@@ -76,7 +76,8 @@ def decode_frame(data: bytes, views: int, height: int, width: int) -> NDArray[np
         with Image.open(io.BytesIO(data), formats=["JPEG"]) as picture:
             if picture.size != (views * width, height):  # known from the header, before anything is decoded
                 raise ProtocolError(
-                    f"a picture is {picture.size[1]} x {picture.size[0]} pixels, announced were {views} views of {height} x {width}"
+                    f"a picture is {picture.size[1]} x {picture.size[0]} pixels, announced were {views}"
+                    f" views of {height} x {width}"
                 )
             tiled = np.asarray(picture.convert("RGB"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:

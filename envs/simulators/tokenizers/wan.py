@@ -31,7 +31,8 @@ class WanCodec(Codec):
         self.channels, self.period = int(vae.config.z_dim), int(vae.config.scale_factor_temporal)
         if int(vae.config.scale_factor_spatial) != STRIDE:
             raise ValueError(
-                f"the VAE has a spatial stride of {vae.config.scale_factor_spatial}, latent worlds need {STRIDE}"
+                f"the VAE has a spatial stride of {vae.config.scale_factor_spatial}, latent worlds need"
+                f" {STRIDE}"
             )
         for name, values in (
             ("latent_mean", vae.config.latents_mean),
