@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.suite import plain_section
 from envs.physics.worker import Track, Worker, WorkerSpec
+from envs.targets import ConfigError, to_plain
 
 log = logging.getLogger(__name__)
 RETRIES = 3  # replacements of one worker that may die in a row before the pool gives up
@@ -149,6 +149,8 @@ class _Remote:
             status, value = self.pipe.recv()
         except (EOFError, OSError) as error:
             raise _Died from error
+        if status == "config":
+            raise ConfigError(value)
         if status == "error":
             raise PoolError(f"physics worker {self.index} failed:\n{value}")
         return value
@@ -165,12 +167,12 @@ class TaskPool:
         workers: processes; 0 means one per core, 1 runs in this process.
 
     Raises:
-        PoolError: if a worker does not start, with its traceback.
-        SuiteError: the same, if the worker is this process.
+        ConfigError: if there is no such suite or task.
+        PoolError: if a worker does not start.
     """
 
     def __init__(self, suite: Mapping[str, Any], task: str, slots: int, horizon: int, workers: int):
-        spec = WorkerSpec(plain_section(suite), task, horizon)
+        spec = WorkerSpec(to_plain(suite), task, horizon)
         count = min(workers or available_cores(), slots)
         self.owner = [slot % count for slot in range(slots)]
         self.local = [slot // count for slot in range(slots)]

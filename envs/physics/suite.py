@@ -8,9 +8,8 @@ nothing here imports torch.
 from __future__ import annotations
 
 import difflib
-import importlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.embodiment import Embodiment
+from envs.targets import ConfigError, build
 
 Array = NDArray[Any]
 Expert = Callable[[], Array]  # () -> the next action [A]
 
 
-class SuiteError(ValueError):
+class SuiteError(ConfigError):
     """A task suite cannot be built from its config; the message names the key and the fix."""
 
 
@@ -164,42 +164,16 @@ def check_noise_level(noise_level: float) -> None:
         raise ValueError(f"noise_level={noise_level} must lie in [0, 1]: 0 is the expert, 1 is random")
 
 
-def plain_section(section: Mapping[str, Any]) -> dict[str, Any]:
-    """A config section as plain dictionaries and tuples, fit for another process."""
-    return {str(key): _plain(value) for key, value in section.items()}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return plain_section(value)
-    if isinstance(value, Sequence) and not isinstance(value, (str, bytes)):
-        return tuple(_plain(part) for part in value)
-    return value
-
-
 def build_suite(section: Mapping[str, Any]) -> TaskSuite:
     """Build a task suite from its config section, `_target_: package.module.Class` and the class's options.
 
     Raises:
-        SuiteError: if `_target_` does not import, is no TaskSuite or refuses the options.
+        ConfigError: if `_target_` does not import, is no TaskSuite or refuses the options.
     """
-    options = plain_section(section)
-    target = str(options.pop("_target_", ""))
-    module, _, name = target.rpartition(".")
-    if not module:
+    suite = build(section, "task.suite")
+    if not isinstance(suite, TaskSuite):
         raise SuiteError(
-            f"task.suite._target_={target!r} must name a class with its module, such as"
-            " envs.physics.tabletop.suite.Tabletop"
+            f"task.suite._target_={section['_target_']} makes a {type(suite).__name__}, which is no"
+            " envs.physics.suite.TaskSuite"
         )
-    try:
-        factory = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise SuiteError(
-            f"task.suite._target_={target} does not import ({error}); install its package or correct the name"
-        ) from error
-    if not (isinstance(factory, type) and issubclass(factory, TaskSuite)):
-        raise SuiteError(f"task.suite._target_={target} is no envs.physics.suite.TaskSuite")
-    try:
-        return factory(**options)
-    except TypeError as error:
-        raise SuiteError(f"task.suite: {target} does not take these options: {error}") from error
+    return suite

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.suite import Array, Observation, TaskSuite, build_suite
+from envs.physics.suite import Array, Observation, TaskSuite, build_suite, check_task
+from envs.targets import ConfigError
 
 
 @dataclass
@@ -93,11 +94,15 @@ class Worker:
     Args:
         spec: of the suite and its task.
         slots: episodes side by side.
+
+    Raises:
+        ConfigError: if there is no such suite or task.
     """
 
     def __init__(self, spec: WorkerSpec, slots: int):
         self.spec = spec
         self.slots = [Slot(build_suite(spec.suite)) for _ in range(slots)]
+        check_task(spec.task, self.slots[0].suite.tasks)
 
     def reset(self, seeds: dict[int, int], record: bool) -> dict[int, dict[str, Any]]:
         """Start episodes {slot: seed}; returns an observation per slot."""
@@ -184,6 +189,9 @@ def serve(pipe: Connection) -> None:
         worker = Worker(*pipe.recv())
         pipe.send(("ok", None))
     except EOFError:
+        return
+    except ConfigError as error:
+        pipe.send(("config", str(error)))
         return
     except Exception:
         pipe.send(("error", traceback.format_exc()))

@@ -1,0 +1,246 @@
+"""Clips and their sampling, splits, caches, and what learners never see."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from envs.conditioning import PoseMapStyle, end_effector_poses, render_pose_map
+from envs.embodiment import Embodiment
+from envs.episodes import Episode, EpisodeError, LeRobotWriter
+from envs.episodes.clips import ClipSpec, ClipStore
+from envs.episodes.privileged import read_privileged
+from envs.episodes.splits import write_splits
+from envs.geometry.cameras import follow_wrists
+from envs.simulators.inputs import build_inputs
+from envs.specs import WorldSpec
+from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_POSES, EMBODIMENTS, world_spec
+from tests.moving_square import SIZE, moving_square
+
+SPEC = world_spec(BIMANUAL_POSES.at(SIZE), SIZE)
+
+
+@pytest.mark.parametrize("robot", EMBODIMENTS.values(), ids=list(EMBODIMENTS))
+def test_a_store_shows_what_the_robot_allows(
+    robot: Embodiment, tiny_store: Callable[[Embodiment], ClipStore]
+) -> None:
+    store = tiny_store(robot)
+    clip = store.sample(torch.arange(20), 3, ClipSpec(4, 4, 2), torch.Generator().manual_seed(0))
+    calibrated, drawn = robot.calibrated, robot.calibrated and robot.commands_poses
+    for part in ("memory", "future"):
+        assert ("c2w" in clip[part].keys()) == calibrated and ("pose_map" in clip[part].keys()) == drawn
+    assert ("intrinsic" in clip.keys()) == calibrated
+    assert clip["future", "commands"].shape == (3, 8, robot.action_dim)
+    assert clip["history", "states"].shape == (3, 4, robot.state_dim)
+    inputs = build_inputs(store.spec, clip, 1)
+    assert inputs["memory", "commands"].shape == (3, 4, robot.action_dim)
+    first = store.first(torch.tensor([4, 5]))
+    assert torch.equal(first["frames"], store.frames(store.start[[4, 5]]))
+    assert ("pose_map" in first.keys(), "intrinsic" in first.keys()) == (drawn, calibrated)
+    later = store.at(torch.tensor([4, 5]), torch.tensor([3, 99]))
+    assert torch.equal(later["state"][0], store.arrays["states"][store.start[4] + 3])
+    assert torch.equal(later["state"][1], store.arrays["states"][store.start[5] + store.length[5] - 1])
+
+
+def test_clips_line_up(store: ClipStore) -> None:
+    clip = store.clips(torch.tensor([0, 3]), torch.tensor([0, 3]), ClipSpec(4, 4, 2))
+    rows = store.start[3] + 3 + torch.arange(1, 9)
+    assert torch.equal(clip["future", "frames"][1], store.frames(rows))
+    assert torch.equal(clip["now", "command"][1], store.arrays["commands"][store.start[3] + 3])
+    assert clip["memory", "index"].tolist() == [[[0, 0, 0, 0], [0, 1, 3, 4]], [[0, 1, 2, 3], [0, 2, 5, 7]]]
+    assert torch.equal(clip["memory", "frames"][1, 1, 1], store.frames(store.start[3] + 2))
+
+
+def test_stride_skips_frames(store: ClipStore) -> None:
+    clip = store.clips(torch.tensor([3]), torch.tensor([5]), ClipSpec(4, 2, 1, stride=3))
+    ahead = store.start[3] + torch.tensor([8, 11])
+    assert torch.equal(clip["future", "commands"][0], store.arrays["commands"][ahead])
+    assert int(clip["begin"]) == 1  # one stride of past: frames 2 and 5
+
+
+def test_frames_past_the_end_are_not_valid(store: ClipStore) -> None:
+    end = int(store.length[0]) - 2
+    clip = store.clips(torch.tensor([0]), torch.tensor([end]), ClipSpec(4, 4))
+    assert clip["future", "valid"].tolist() == [[True, False, False, False]]
+    rows, real = store.whole(torch.tensor([0, 1]))
+    assert rows.shape == real.shape == (2, 12) and bool(real.all())
+
+
+def test_sampling_is_a_function_of_the_generator(store: ClipStore) -> None:
+    a, b = (store.sample(torch.arange(8), 16, ClipSpec(), torch.Generator().manual_seed(3)) for _ in range(2))
+    assert bool((a == b).all())
+    with pytest.raises(EpisodeError, match="no episode is left"):
+        store.sample(torch.arange(0), 16, ClipSpec(), torch.Generator())
+
+
+def test_selecting_by_source_and_outcome(store: ClipStore) -> None:
+    assert store.select(["random"]).tolist() == list(range(1, 20, 2))
+    assert store.select(["exp*"], succeeded=True).tolist() == list(range(0, 20, 2))
+    assert store.select(succeeded=False).tolist() == list(range(1, 20, 2))
+    assert store.instructions[0] == store.episodes[0]["instruction"] and store.episodes[3]["seed"] == 3
+
+
+def test_pose_maps_are_those_of_the_commands(store: ClipStore, episodes: list[Episode]) -> None:
+    """Wrist cameras stand where the commands lead them, as they will in imagination."""
+    episode, rows = episodes[4], store.rows(torch.tensor([4]))
+    assert episode.c2w is not None and episode.intrinsic is not None
+    poses = end_effector_poses(BIMANUAL_POSES, torch.from_numpy(episode.commands))
+    c2w = follow_wrists(torch.from_numpy(episode.c2w[0]), poses[0], poses, BIMANUAL_POSES.wrists)
+    assert torch.equal(store.arrays["c2w"][rows], c2w)
+    assert not torch.allclose(c2w[-1, 1], c2w[0, 1]) and torch.equal(c2w[-1, 0], c2w[0, 0])
+    intrinsic = torch.from_numpy(episode.intrinsic)
+    maps = render_pose_map(poses, c2w.transpose(0, 1), intrinsic, SIZE, PoseMapStyle())
+    assert torch.equal(store.pose_maps(rows), maps.transpose(0, 1))
+
+
+def test_unlabelled_sets_have_no_success(tmp_path: Path) -> None:
+    spec = world_spec(ARM_DELTAS.at(SIZE), SIZE)
+    for name, labelled in (("told", True), ("untold", False)):
+        made = [moving_square(ARM_DELTAS, seed, labelled=labelled) for seed in range(2)]
+        LeRobotWriter(tmp_path / name, ARM_DELTAS.at(SIZE)).write(made)
+    assert "success" not in ClipStore([tmp_path / "untold"], spec).arrays
+    both = ClipStore([tmp_path / "told", tmp_path / "untold"], spec)
+    assert both.arrays["labelled"].tolist() == [True, True, False, False]
+    assert both.select(succeeded=False).tolist() == [] and both.select(succeeded=True).tolist() == [0, 1]
+    assert torch.equal(
+        both.frames(both.rows(torch.tensor([3])))[:2], both.frames(both.start[3] + torch.arange(2))
+    )
+    assert both.episodes[2]["dataset"] == 1
+
+
+def test_pictures_are_brought_to_the_spec_and_intrinsics_with_them(dataset: Path, tmp_path: Path) -> None:
+    large = ClipStore([dataset], SPEC, tmp_path)
+    small = ClipStore([dataset], replace(SPEC, size=(16, 24)), tmp_path)
+    assert small.frames(torch.arange(2)).shape[-2:] == (16, 24)
+    scale = torch.tensor([[24 / 32], [16 / 32], [1.0]])
+    assert torch.allclose(small.intrinsic, large.intrinsic * scale)
+
+
+def test_data_of_another_robot_are_refused(dataset: Path) -> None:
+    with pytest.raises(EpisodeError, match=r"another robot: action_names"):
+        ClipStore([dataset], world_spec(ARM_JOINTS.at(SIZE), SIZE))
+    with pytest.raises(EpisodeError, match="no data set is given"):
+        ClipStore([], SPEC)
+    with pytest.raises(EpisodeError, match=r"not a LeRobot data set.*info\.json is missing"):
+        ClipStore([dataset / "meta"], SPEC)
+
+
+def test_missing_calibration_is_named(tmp_path: Path) -> None:
+    LeRobotWriter(tmp_path / "set", ARM_DELTAS.at(SIZE)).write([moving_square(ARM_DELTAS, 0)])
+    cameras = tuple(replace(camera, calibrated=True) for camera in ARM_DELTAS.at(SIZE).cameras)
+    spec = WorldSpec(replace(ARM_DELTAS, cameras=cameras), SIZE, 4, ray_map=True)
+    with pytest.raises(EpisodeError, match=r"no calibration.*calibrated=false"):
+        ClipStore([tmp_path / "set"], spec)
+
+
+# -- splits
+def test_splits_of_a_set_that_names_none_go_by_number(store: ClipStore) -> None:
+    parts = {name: store.split(name).tolist() for name in ("train", "held_out", "calibration")}
+    assert parts["held_out"] == [7, 15] and parts["calibration"] == [2, 6, 10, 14, 18]
+    assert sorted(number for part in parts.values() for number in part) == list(range(20))
+
+
+def test_splits_are_those_of_each_data_set(dataset: Path, tmp_path: Path) -> None:
+    root = tmp_path / "set"
+    shutil.copytree(dataset, root)
+    write_splits(root, {"train": 12, "held_out": 5, "calibration": 3})
+    store = ClipStore([dataset, root], SPEC)
+    assert store.split("held_out").tolist() == [7, 15, *range(32, 37)]
+    with pytest.raises(EpisodeError, match=r"'test' must be among them"):
+        store.split("test")
+
+
+# -- caches
+def test_a_cache_is_made_once_and_again_when_the_data_change(dataset: Path, tmp_path: Path) -> None:
+    root, cache = tmp_path / "set", tmp_path / "cache"
+    shutil.copytree(dataset, root)
+    ClipStore([root], SPEC, cache)
+    (made,) = cache.glob("*/*/frames.npy")
+    before = made.stat().st_mtime_ns, made.stat().st_ino
+    assert made.stat().st_blocks * 512 >= made.stat().st_size  # reserved, not sparse
+    ClipStore([root], replace(SPEC, chunk=7), cache)  # the length of a chunk changes nothing
+    assert (made.stat().st_mtime_ns, made.stat().st_ino) == before
+    held = ClipStore([root], SPEC, cache)
+    LeRobotWriter(root, BIMANUAL_POSES.at(SIZE)).write([moving_square(BIMANUAL_POSES, 20)])
+    assert len(ClipStore([root], SPEC, cache)) == 21
+    assert held.frames(torch.tensor([0])).any()  # whoever had the old one open keeps it
+    assert len(list(cache.glob("*/*"))) == 1 and not list(cache.glob("*/.*"))
+
+
+def test_a_half_made_cache_is_not_used(dataset: Path, tmp_path: Path) -> None:
+    ClipStore([dataset], SPEC, tmp_path)
+    (marker,) = tmp_path.glob("*/*/info.json")
+    marker.write_text(marker.read_text()[:40])
+    assert len(ClipStore([dataset], SPEC, tmp_path)) == 20
+    assert json.loads(marker.read_text())["episodes"]
+
+
+def test_data_in_a_folder_that_cannot_be_written(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "read_only" / "set"
+    shutil.copytree(dataset, root)
+    (tmp_path / "read_only" / ".cache-set").write_text("here no folder can be made")
+    monkeypatch.delenv("WORLDLOOP_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    before = sorted((tmp_path / "read_only").rglob("*"))
+    assert len(ClipStore([root], SPEC)) == 20
+    assert (
+        list((tmp_path / "home").rglob("frames.npy"))
+        and sorted((tmp_path / "read_only").rglob("*")) == before
+    )
+    monkeypatch.setenv("WORLDLOOP_CACHE", str(tmp_path / "said"))
+    ClipStore([root], SPEC)
+    assert list((tmp_path / "said").rglob("frames.npy"))
+
+
+def test_a_full_disk_is_said_before_anything_is_mapped(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(OSError, match=r"a cache of 0\.00 GB does not fit.*WORLDLOOP_CACHE"):
+        ClipStore([dataset], SPEC, tmp_path)
+    assert not list(tmp_path.rglob("*.npy"))
+
+
+# -- what only physics knows
+def test_privileged_columns_are_read_apart(dataset: Path, episodes: list[Episode], tmp_path: Path) -> None:
+    store = ClipStore([dataset, dataset], SPEC, tmp_path)
+    truth = np.concatenate([episode.privileged["object_pose"] for episode in episodes])
+    assert np.array_equal(read_privileged(store, "object_pose").numpy(), np.concatenate([truth, truth]))
+    with pytest.raises(EpisodeError, match=r"no column privileged\.centimetres"):
+        read_privileged(store, "centimetres")
+    assert not any("object" in path.name for path in tmp_path.rglob("*"))
+
+
+def test_noise_in_privileged_columns_changes_nothing_that_is_learned_from(
+    dataset: Path, tmp_path: Path
+) -> None:
+    root = tmp_path / "set"
+    shutil.copytree(dataset, root)
+    for path in (root / "data").rglob("*.parquet"):
+        table = pq.read_table(path)
+        at = table.column_names.index("privileged.object_pose")
+        noise = pa.array(np.random.default_rng(0).normal(size=2 * len(table)).astype(np.float32))
+        noisy = pa.FixedSizeListArray.from_arrays(noise, 2)
+        pq.write_table(table.set_column(at, "privileged.object_pose", noisy), path)
+    a, b = ClipStore([dataset], SPEC, tmp_path / "a"), ClipStore([root], SPEC, tmp_path / "b")
+    assert a.arrays.keys() == b.arrays.keys() and a.episodes == b.episodes
+    assert all(torch.equal(a.arrays[name], b.arrays[name]) for name in a.arrays)
+    rows = torch.arange(len(a.arrays["commands"]))
+    assert torch.equal(a.frames(rows), b.frames(rows)) and torch.equal(a.pose_maps(rows), b.pose_maps(rows))
+    assert not torch.equal(read_privileged(a, "object_pose"), read_privileged(b, "object_pose"))

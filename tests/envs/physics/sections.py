@@ -1,0 +1,76 @@
+"""Task sections of configs/ for tests, small, and a suite of somebody else that misbehaves."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from envs.embodiment import ActionKind, Camera, Embodiment
+from envs.physics.suite import Array, Expert, Observation, TaskSuite
+from tests.sections import CONFIGS, offered
+
+
+def task_section(choice: str, **changes: Any) -> dict[str, Any]:
+    """A task of configs/task, with small pictures and with options of its suite changed."""
+    cfg = OmegaConf.load(CONFIGS / "task" / f"{choice}.yaml")
+    cfg.size = [24, 32]
+    cfg.suite = {**cfg.suite, **changes}
+    return OmegaConf.to_container(cfg, resolve=True)  # type: ignore[return-value]
+
+
+def physical_tasks() -> dict[str, dict[str, Any]]:
+    """Every task of configs/task that has a suite, and our bench commanded by joints, by name."""
+    out = {name: task_section(name) for name in offered("task") if "suite:" in _text(name)}
+    return {**out, "push-joints": task_section("push", actions="joints")}
+
+
+def _text(choice: str) -> str:
+    return (CONFIGS / "task" / f"{choice}.yaml").read_text()
+
+
+class Counting(TaskSuite):
+    """A suite that counts, and does what `fault` says when an action is above 1.
+
+    Args:
+        fault: "raise", or "exit" to end the process, or "" for none.
+        at_start: the same, when the suite is made.
+    """
+
+    tasks = ("count",)
+
+    def __init__(self, fault: str, at_start: str = ""):
+        self.fault = fault
+        self.embodiment = Embodiment(
+            "counter", ("a",), ActionKind.OTHER, False, (), ("n",), (Camera("eye", (4, 4)),), 10.0
+        )
+        _misbehave(at_start)
+
+    def reset(self, task: str, seed: int) -> None:
+        self.count = float(seed)
+
+    def step(self, action: Array) -> None:
+        if action[0] > 1:
+            _misbehave(self.fault)
+        self.count += 1
+
+    def render(self) -> Any:
+        return np.full((1, 3, 4, 4), int(self.count) % 256, np.uint8)
+
+    def observe(self) -> Observation:
+        return Observation(np.array([self.count]), np.zeros(1), "count", False, 0.0)
+
+    def privileged(self) -> dict[str, Array]:
+        return {"count": np.array(self.count)}
+
+    def expert(self, noise_level: float, rng: np.random.Generator) -> Expert:
+        return lambda: np.array([noise_level * 2])
+
+
+def _misbehave(how: str) -> None:
+    if how == "exit":
+        os._exit(3)
+    if how == "raise":
+        raise RuntimeError("the bench is on fire")

@@ -1,0 +1,95 @@
+"""Meta-World: words for its tasks, experts on several, what the robot may not know, missing packages."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs.physics.metaworld import MetaWorld, instruction_of
+from envs.physics.suite import build_suite
+from envs.targets import ConfigError
+from tests.envs.physics.sections import task_section
+
+
+@pytest.fixture(scope="module")
+def suite() -> MetaWorld:
+    made = build_suite(task_section("metaworld")["suite"])
+    assert isinstance(made, MetaWorld)
+    return made
+
+
+def built(**changes: Any) -> Any:
+    return build_suite(task_section("metaworld", **changes)["suite"])
+
+
+def test_every_task_has_words_and_an_expert(suite: MetaWorld) -> None:
+    words = [instruction_of(task) for task in suite.tasks]
+    assert len(set(words)) == len(words) == 50
+    assert instruction_of("drawer-open-v3") == "open the drawer"
+    assert all(len(text.split()) >= 3 and "-" not in text for text in words)
+
+
+@pytest.mark.parametrize("task", ["reach-v3", "push-v3", "button-press-topdown-v3", "window-open-v3"])
+def test_experts_succeed(suite: MetaWorld, task: str) -> None:
+    won = 0
+    for seed in range(4):
+        suite.reset(task, 300 + seed)
+        expert = suite.expert(0.0, np.random.default_rng(seed))
+        for _ in range(60):
+            if not suite.observe().success:
+                suite.step(expert())
+        won += suite.observe().success
+    assert won >= 3
+
+
+def test_success_is_held_for_a_while(suite: MetaWorld) -> None:
+    suite.reset("reach-v3", 1)
+    expert, met = suite.expert(0.0, np.random.default_rng(1)), 0
+    while not suite.observe().success:
+        assert met < 3
+        suite.step(expert())
+        met = met + 1 if suite.observe().progress == 1.0 else 0
+    assert met == 3  # 0.3 s at 10 Hz
+
+
+def test_the_state_says_nothing_of_objects(suite: MetaWorld) -> None:
+    suite.reset("push-v3", 1)
+    states, objects = [], []
+    for seed in (1, 2):
+        suite.reset("push-v3", seed)
+        states.append(suite.observe().state)
+        objects.append(suite.privileged()["object_poses"])
+    assert np.array_equal(*states) and not np.array_equal(*objects)
+    assert states[0].shape == (4,)
+
+
+def test_actions_move_the_hand(suite: MetaWorld) -> None:
+    suite.reset("reach-v3", 1)
+    before = suite.observe().state
+    for _ in range(3):
+        suite.step(np.array([2.0, 0.0, 0.0, -1.0]))
+    seen = suite.observe()
+    assert 0.1 < seen.state[0] - before[0] < 0.26 and abs(seen.state[1] - before[1]) < 0.02
+    assert seen.command.tolist() == [1.0, 0.0, 0.0, -1.0]
+
+
+def test_cameras_may_be_calibrated() -> None:
+    suite = built(calibrated=True, cameras=["scene"])
+    suite.reset("reach-v3", 1)
+    seen = suite.observe()
+    assert suite.embodiment.calibrated and seen.c2w.shape == (1, 4, 4)
+    assert seen.c2w[0, 2, 1] < 0  # the picture's down is the world's down
+
+
+def test_rates_must_divide_that_of_the_simulation() -> None:
+    with pytest.raises(ConfigError, match=r"task\.suite\.control_hz=30.0 must divide"):
+        built(control_hz=30.0)
+
+
+def test_a_missing_package_is_named_with_the_line_to_type(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "metaworld", None)
+    with pytest.raises(ConfigError, match=r"pip install --no-deps metaworld==3\.1\.1"):
+        built()

@@ -1,0 +1,76 @@
+"""Workers that die or fail, and suites that cannot be built."""
+
+from __future__ import annotations
+
+import os
+import signal
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs.physics.pool import PoolError, TaskPool
+from envs.physics.suite import build_suite
+from envs.targets import ConfigError
+from tests.envs.physics.sections import task_section
+
+COUNTING = {"_target_": "tests.envs.physics.sections.Counting", "fault": ""}
+
+
+def pool_of(slots: int, workers: int, **changes: Any) -> TaskPool:
+    return TaskPool({**COUNTING, **changes}, "count", slots, 8, workers)
+
+
+def test_a_killed_worker_is_replaced_and_its_episodes_go_on() -> None:
+    task = task_section("push")
+    chunks, ends = {}, []
+    for kill in (False, True):
+        pool = TaskPool(task["suite"], task["name"], 2, 8, 2)
+        first = pool.reset({0: 1, 1: 2}, True)
+        chunks = {slot: np.stack([row["command"] + 0.02] * 4) for slot, row in first.items()}
+        pool.step(chunks)
+        if kill:
+            os.kill(pool.processes()[1], signal.SIGKILL)
+        ends.append(pool.step(chunks))
+        pool.close()
+    whole, mended = ends
+    for slot in (0, 1):
+        one, two = whole[slot].pop("track"), mended[slot].pop("track")
+        assert len(one) == len(two) == 9
+        assert all(np.array_equal(rows, two.stack()[name]) for name, rows in one.stack().items())
+        assert all(np.array_equal(value, mended[slot][name]) for name, value in whole[slot].items())
+
+
+def test_scripts_of_a_killed_worker_run_again() -> None:
+    pool = pool_of(2, 2)
+    os.kill(pool.processes()[0], signal.SIGKILL)
+    tracks = pool.script([(seed, 0.0) for seed in range(6)], 1)
+    pool.close()
+    assert [track.seed for track in tracks] == list(range(6))
+    assert [track.privileged["count"][-1] for track in tracks] == [seed + 8.0 for seed in range(6)]
+
+
+def test_a_worker_that_keeps_dying_is_reported() -> None:
+    with pytest.raises(PoolError, match="died 4 times in a row"):
+        pool_of(2, 2, at_start="exit")
+
+
+def test_an_exception_in_a_worker_arrives_with_its_traceback() -> None:
+    pool = pool_of(2, 2, fault="raise")
+    pool.reset({0: 0, 1: 1}, False)
+    with pytest.raises(PoolError, match="on fire"):
+        pool.step({0: np.full((2, 1), 2.0), 1: np.zeros((2, 1))})
+    pool.close()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_what_cannot_be_built_is_a_config_error(workers: int) -> None:
+    with pytest.raises(ConfigError, match=r"task\.name='cuont' is unknown; the nearest .*'count'"):
+        TaskPool(COUNTING, "cuont", 2, 8, workers)
+    with pytest.raises(ConfigError, match=r"task\.suite\._target_=no_such_package\.Suite does not import"):
+        TaskPool({"_target_": "no_such_package.Suite"}, "count", 2, 8, workers)
+
+
+def test_other_classes_are_no_suites() -> None:
+    with pytest.raises(ConfigError, match="TaskSuite"):
+        build_suite({"_target_": "fractions.Fraction", "numerator": 1})
