@@ -13,10 +13,16 @@ from typing import Any
 import torch
 from torch import nn
 
-from actors.factory import bench_config, build_judge, build_policy, build_simulator, build_state_decoder
+from actors.factory import (
+    build_judge,
+    build_policy,
+    build_pool,
+    build_simulator,
+    build_state_decoder,
+    world_spec,
+)
 from actors.rollouts.recipe import Recipe
 from envs.episodes import Episode, LeRobotWriter
-from envs.physics.pool import BenchPool
 from pipeline.artefact import save_weights
 
 
@@ -28,20 +34,16 @@ def demo_recipe(cfg: Mapping[str, Any], folder: Path, episodes: int, starts: int
     data = folder / "dataset"
     if not (folder / "done").exists():
         torch.manual_seed(0)
-        bench = bench_config(cfg)
-        pool = BenchPool(bench, 1, cfg["task"]["horizon"], workers=1)
+        pool, robot = build_pool(cfg), world_spec(cfg).embodiment
         try:
             tracks = pool.script([(seed, (seed % 4) / 3) for seed in range(starts)], cfg["task"]["chunk"])
         finally:
             pool.close()
-        LeRobotWriter(data, bench.views, bench.size, cfg["task"]["control_hz"]).write(
-            [
-                Episode.from_track(
-                    track, "noisy" if number % 4 else "expert", bench.views, cfg["task"]["control_hz"]
-                )
-                for number, track in enumerate(tracks)
-            ]
-        )
+        made = [
+            Episode.from_track(track, "noisy" if number % 4 else "expert", robot)
+            for number, track in enumerate(tracks)
+        ]
+        LeRobotWriter(data, robot).write(made)
         simulator = build_simulator(cfg)
         modules: list[nn.Module] = [
             build_policy(cfg),

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,14 +13,22 @@ import pytest
 import torch
 import websockets.sync.server
 from openpi_client import msgpack_numpy
+from tensordict import TensorDict
 
-from actors.policies.openpi import OpenPIPolicy, PolicyServerError
-from actors.rollouts.evaluate import evaluate
+from actors.policies.openpi import OpenPIPolicy, PolicyServerError, compress
+from envs.conditioning.joint_commands import JointCommands
+from envs.embodiment import Embodiment
 from envs.geometry.kinematics import Kinematics
-from envs.layouts import CommandLayout, JointLayout, Joints
-from envs.physics.env import PhysicsEnv
-from envs.physics.tabletop.bench import BenchConfig
-from envs.specs import ActionMode
+from envs.specs import CHUNK, COMMAND, IMAGE, STATE, WorldSpec
+from tests.actors.test_serve import two_arms
+from tests.embodiments import (
+    ARM_JOINTS,
+    BIMANUAL_JOINTS,
+    BIMANUAL_POSES,
+    INSTRUCTIONS,
+    observations,
+    world_spec,
+)
 
 
 class PolicyServer:
@@ -42,94 +52,79 @@ class PolicyServer:
 
 @pytest.fixture
 def still() -> Iterator[PolicyServer]:
-    """A policy that holds the arms where they are, fifty rows at a time."""
+    """A policy that holds the joints where they are, fifty rows at a time; it sees grippers last."""
 
     def act(seen: dict[str, Any]) -> dict[str, Any]:
         state = seen["observation.state"]
-        row = np.concatenate([state[:7], state[14:15], state[7:14], state[15:]])
-        return {"actions": np.tile(row, (50, 1)).astype(np.float32)}
+        if len(state) == 16:
+            state = np.concatenate([state[:7], state[14:15], state[7:14], state[15:]])
+        return {"actions": np.tile(state, (50, 1)).astype(np.float32)}
 
     server = PolicyServer(act)
     yield server
     server.server.shutdown()
 
 
-@pytest.mark.parametrize("mode", [ActionMode.RELATIVE, ActionMode.ABSOLUTE])
-def test_it_drives_physics_through_kinematics(still: PolicyServer, mode: ActionMode) -> None:
-    env = PhysicsEnv(BenchConfig(), 2, 4, 8, mode=mode, workers=1)
-    try:
-        policy = OpenPIPolicy(still.url, BenchConfig().views, 4, CommandLayout.EEF, mode, Kinematics())
-        env.schedule([3, 4])
-        before = env.reset()
-        outcome = evaluate(env, policy, [3, 4])
-        after = env.rollout(1, policy=policy, auto_reset=True)
-    finally:
-        env.close()
-    assert len(outcome.seeds) == 2
-    shown = still.seen[0]
-    assert (
-        shown["observation.images.head"].shape == (64, 64, 3)
-        and shown["observation.images.head"].dtype == np.uint8
-        and "block" in shown["prompt"]
-    )
-    mine = Joints(before["observation", "state"][0], JointLayout.PER_ARM).to(JointLayout.GRIPPERS_LAST)
-    assert np.allclose(shown["observation.state"], mine.numpy(), atol=1e-5)
-    meant = Kinematics().flanges(Joints(after["observation", "state"][:, 0], JointLayout.PER_ARM))
-    assert torch.allclose(after["next", "observation", "command"][:, 0, :3], meant[:, :3], atol=1e-4)
+def ask(spec: WorldSpec, url: str, mode: str, joints: bool = False) -> tuple[TensorDict, OpenPIPolicy]:
+    policy = OpenPIPolicy(spec, url, mode, joints, grippers_last=True)
+    return policy(observations(spec, 2)), policy
 
 
-def test_joint_worlds_get_joints(still: PolicyServer) -> None:
-    from tensordict import TensorDict
+@pytest.mark.parametrize("robot", [BIMANUAL_JOINTS, ARM_JOINTS])
+def test_joint_worlds_get_joints_and_servers_see_grippers_last(
+    still: PolicyServer, robot: Embodiment
+) -> None:
+    spec = world_spec(robot)
+    said, _ = ask(spec, still.url, "absolute")
+    assert torch.equal(said[CHUNK], said[STATE][:, None].expand(-1, spec.chunk, -1))
+    shown, state = still.seen[0], said[STATE][0].tolist()
+    last = [state[k] for k in robot.grippers]
+    first = [value for k, value in enumerate(state) if k not in robot.grippers]
+    assert shown["observation.state"].tolist() == pytest.approx([*first, *last])
+    assert shown["prompt"] == INSTRUCTIONS[0] and still.seen[1]["prompt"] == INSTRUCTIONS[1]
+    picture = shown[f"observation.images.{robot.views[1]}"]
+    assert picture.shape == (*spec.size, 3) and picture.dtype == np.uint8
+    assert np.array_equal(picture, said[IMAGE][0, 1].permute(1, 2, 0).numpy())
+    said, _ = ask(spec, still.url, "relative")
+    assert torch.allclose(
+        said[CHUNK] + said[COMMAND][:, None], said[STATE][:, None].expand(-1, spec.chunk, -1)
+    )
 
-    policy = OpenPIPolicy(
-        still.url, ("head", "hand_left", "hand_right"), 25, CommandLayout.JOINTS, ActionMode.ABSOLUTE
-    )
-    state = torch.arange(16.0)[None]
-    said = policy(
-        TensorDict(
-            {
-                "observation": TensorDict(
-                    {
-                        "image": torch.zeros(1, 3, 3, 8, 8, dtype=torch.uint8),
-                        "state": state,
-                        "command": state,
-                    },
-                    [1],
-                )
-            },
-            [1],
-        )
-    )
-    assert torch.equal(said["vla_action", "chunk"], state[:, None].expand(-1, 25, -1))
+
+def test_pose_worlds_get_poses_through_the_kinematics(still: PolicyServer, tmp_path: Path) -> None:
+    robot = two_arms(tmp_path)
+    # This robot takes poses, and its state is its joints, as the bench's is.
+    body = replace(BIMANUAL_POSES, kinematics=robot, state_names=BIMANUAL_JOINTS.state_names)
+    said, policy = ask(world_spec(body), still.url, "absolute", joints=True)
+    assert policy.width == 16 and policy.grippers == (7, 15)
+    meant = JointCommands(body, Kinematics(robot))(said[STATE])
+    assert torch.allclose(said[CHUNK][:, 0], meant, atol=1e-5) and said[CHUNK].shape == (2, 4, 14)
+    with pytest.raises(PolicyServerError, match=r"simulator\.kinematics"):
+        ask(world_spec(BIMANUAL_POSES), still.url, "absolute", joints=True)
+
+
+def test_long_chunks_are_compressed_as_gesim_does() -> None:
+    rows = torch.stack([torch.arange(10.0), torch.arange(10.0)], 1)
+    made = compress(rows, 4, (1,))
+    assert made[:, 0].tolist() == [0.0, 2.5, 6.5, 9.0] and made[:, 1].tolist() == [0.0, 3.0, 6.0, 9.0]
+    assert torch.equal(compress(rows, 10, (1,)), rows) and compress(rows, 1, ()).tolist() == [[0.0, 0.0]]
+    assert compress(rows, 2, ()).tolist() == [[0.0, 0.0], [9.0, 9.0]]
 
 
 def test_what_a_policy_server_may_get_wrong() -> None:
-    from tensordict import TensorDict
-
-    state = torch.zeros(1, 16)
-    seen = TensorDict(
-        {
-            "observation": TensorDict(
-                {"image": torch.zeros(1, 1, 3, 8, 8, dtype=torch.uint8), "state": state, "command": state},
-                [1],
-            )
-        },
-        [1],
-    )
+    spec = world_spec(BIMANUAL_JOINTS)
     for answer, message in (
         ({"actions": np.zeros((50, 7), np.float32)}, r"\(50, 7\)"),
         ({"actions": np.full((50, 16), np.nan, np.float32)}, "finite"),
+        ({"actions": np.zeros((3, 16), np.float32)}, "at least 4 finite rows of 16"),
         ("Traceback", "Error in inference server"),
         ({}, "wanted at least"),
     ):
         server = PolicyServer(lambda _, answer=answer: answer)
-        policy = OpenPIPolicy(server.url, ("head",), 25, CommandLayout.JOINTS, ActionMode.ABSOLUTE)
         with pytest.raises(PolicyServerError, match=message):
-            policy(seen)
+            ask(spec, server.url, "absolute")
         server.server.shutdown()
     with pytest.raises(PolicyServerError, match="no openpi server listens"):
-        OpenPIPolicy("ws://127.0.0.1:9", ("head",), 25, CommandLayout.JOINTS, ActionMode.ABSOLUTE)
-    with pytest.raises(PolicyServerError, match="kinematics"):
-        OpenPIPolicy("ws://127.0.0.1:9", ("head",), 25, CommandLayout.EEF, ActionMode.ABSOLUTE)
+        ask(spec, "ws://127.0.0.1:9", "absolute")
     with pytest.raises(PolicyServerError, match="address of an openpi server"):
-        OpenPIPolicy("", ("head",), 25, CommandLayout.JOINTS, ActionMode.ABSOLUTE)
+        ask(spec, "", "absolute")
