@@ -11,7 +11,6 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,31 +22,15 @@ from actors.serving.batching import Company
 from actors.serving.page import joint_table
 from actors.serving.sessions import SessionHost
 from envs.conditioning.joint_commands import JointCommands
-from envs.embodiment import EmbodimentError, Robot
+from envs.embodiment import EmbodimentError
 from envs.geometry.kinematics import Kinematics
 from envs.simulators.dit.engine import DiTSimulator
 from tests.actors.serving import Running, Stranger, block, jpeg, serve_config, tiny_expert, tiny_world
+from tests.arms import two_arms
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES
 
 POSES = np.tile(np.array([0.3, 0.2, 0.4, 0, 0, 0, 0.5, 0.3, -0.2, 0.4, 0, 0, 0, 0.5], np.float32), (4, 1))
 JOINTS = np.zeros((4, 16), np.float32)
-
-
-def two_arms(folder: Path) -> Robot:
-    """A robot description of two arms of seven hinges."""
-
-    def arm(side: str) -> str:
-        links = "".join(
-            f'<body name="{side}{k}" pos="0 0 .1"><joint name="{side}_j{k}" axis="0 {k % 2} {1 - k % 2}"/>'
-            '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
-            for k in range(7)
-        )
-        return f'{links}<site name="{side}_flange"/>' + "</body>" * 7
-
-    path = folder / "arms.xml"
-    path.write_text(f"<mujoco><worldbody>{arm('left')}{arm('right')}</worldbody></mujoco>")
-    joints = tuple(tuple(f"{side}_j{k}" for k in range(7)) for side in ("left", "right"))
-    return Robot(str(path), joints, ("left_flange", "right_flange"))
 
 
 @pytest.fixture(scope="module")
