@@ -70,8 +70,8 @@ def stages(words: Words) -> None:
 
 
 def evaluate(words: Words) -> None:
-    """success of a policy: worldloop evaluate policy=<stage|folder> world=physics|imagined experiment=...; one
-    that needs no weights is a choice of configs/policy: policy=openpi policy.url=ws://...
+    """success of a policy: worldloop evaluate policy=<stage|folder> world=physics|imagined experiment=...;
+    one that needs no weights is a choice of configs/policy: policy=openpi policy.url=ws://...
     """
     from pipeline.config import choices
     from pipeline.evaluate import evaluate_policy

@@ -10,6 +10,7 @@ import contextlib
 import json
 import os
 import threading
+import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -93,7 +94,7 @@ class WandbTracker:
         self._run = wandb.init(
             project=cfg["track"]["project"],
             name=f"{cfg['name']}-seed{cfg['seed']}",
-            id=state.get("id") or wandb.util.generate_id(),
+            id=state.get("id") or uuid.uuid4().hex[:8],
             resume="allow" if cfg["track"]["wandb"] == "online" else None,
             dir=str(root),
             config=dict(cfg),

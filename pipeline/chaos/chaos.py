@@ -31,7 +31,7 @@ LEARNER = "pipeline.chaos.learner"
 
 
 class ChaosFailure(RuntimeError):
-    """The ledger do not balance, or something was left behind; the message says what."""
+    """The ledger does not balance, or something was left behind; the message says what."""
 
 
 def run_chaos(cfg: Mapping[str, Any], words: list[str], folder: Path) -> dict[str, Any]:
@@ -108,7 +108,8 @@ def run_chaos(cfg: Mapping[str, Any], words: list[str], folder: Path) -> dict[st
             if enough:
                 if learner.returncode != 143:
                     raise ChaosFailure(
-                        f"after SIGTERM the learner left with {learner.returncode}, not 143; see {folder}/learner.log"
+                        f"after SIGTERM the learner left with {learner.returncode}, not 143;"
+                        f" see {folder}/learner.log"
                     )
                 break
     report = _check(folder, before)
@@ -132,7 +133,8 @@ def _check(folder: Path, before: set[str]) -> dict[str, Any]:
     saved = Checkpoints(folder).facts()
     if saved is None:
         raise ChaosFailure(
-            f"no checkpoint was ever written; the run is too short for this machine, raise chaos.seconds (see {folder}/learner.log)"
+            "no checkpoint was ever written; the run is too short for this machine, raise chaos.seconds"
+            f" (see {folder}/learner.log)"
         )
     ledger = EpisodeLedger(**saved["ledger"])
     rows = _rows(folder)
@@ -152,11 +154,13 @@ def _check(folder: Path, before: set[str]) -> dict[str, Any]:
         wrong.append("a job was learned from twice")
     if len(jobs) * saved["episodes_per_job"] != ledger.learned + ledger.dropped.get("judge", 0):
         wrong.append(
-            f"{len(jobs)} jobs of {saved['episodes_per_job']} episodes were learned from, but the ledger say {ledger.learned} and {ledger.dropped}"
+            f"{len(jobs)} jobs of {saved['episodes_per_job']} episodes were learned from, but the ledger says"
+            f" {ledger.learned} and {ledger.dropped}"
         )
     if under_way < 0:
         wrong.append(
-            f"{ledger.asked} episodes asked are fewer than {ledger.learned} learned and {ledger.dropped} dropped"
+            f"{ledger.asked} episodes asked are fewer than {ledger.learned} learned and"
+            f" {ledger.dropped} dropped"
         )
     if any(later < sooner for sooner, later in itertools.pairwise(versions)):
         wrong.append("versions went backwards")

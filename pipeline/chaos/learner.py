@@ -15,10 +15,10 @@ from typing import Any
 
 import ray
 
-from actors.factory import build_policy, prepare_process
+from actors.factory import build_algorithm, build_policy, prepare_process
 from actors.fleets.launch import build_fleet
 from actors.fleets.ray_fleet import RayFleet
-from learners.rl.factory import build_algorithm
+from actors.policies.contract import freeze_perception
 from learners.rl.loop import train_rl
 from pipeline.config import load_config
 from pipeline.demo_world import demo_recipe
@@ -65,7 +65,7 @@ def main() -> None:
     recipe = demo_recipe(cfg, folder / "world", settings.envs // settings.shards)
     policy = build_policy(cfg, Path(recipe.policy))
     if settings.freeze_perception:
-        policy.freeze_perception()
+        freeze_perception(policy)
     fleet = build_fleet(recipe)
     assert isinstance(fleet, RayFleet)
     threading.Thread(

@@ -1,0 +1,35 @@
+"""Intervals and tests against published values."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pipeline.evaluation.quantiles import quantiles
+from pipeline.evaluation.statistics import confusion, mcnemar, rate_entry, wilson
+
+
+def test_wilson_matches_published_values() -> None:
+    # Newcombe 1998, table I: 81 of 263 and 0 of 20.
+    assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
+    assert wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
+    assert wilson(0, 0) == (0.0, 1.0)
+
+
+def test_exact_mcnemar() -> None:
+    before = torch.tensor([False] * 62 + [True] * 19 + [True] * 100)
+    after = torch.tensor([True] * 62 + [False] * 19 + [True] * 100)
+    result = mcnemar(before, after)
+    assert (result["gained"], result["lost"]) == (62, 19) and result["p"] == pytest.approx(1.773e-6, rel=0.01)
+    assert mcnemar(before, before)["p"] == 1.0
+
+
+def test_confusion_and_rates() -> None:
+    said, truth = torch.tensor([True, True, False, False]), torch.tensor([True, False, True, False])
+    assert confusion(said, truth) == {"tp": 1, "fp": 1, "fn": 1, "tn": 1, "accuracy": 0.5}
+    assert rate_entry(truth)["successes"] == 2
+
+
+def test_quantiles_leave_out_what_is_not_finite() -> None:
+    assert quantiles(torch.tensor([1.0, 2.0, 3.0, float("nan")]))["median"] == 2.0
+    assert quantiles(torch.zeros(0))["p90"] != quantiles(torch.zeros(0))["p90"]
