@@ -59,7 +59,11 @@ def train_tokenizer(
         value = ((error.abs() + _SQUARE * error.square()) * weight).sum() / (3 * weight.sum())
         return value, {"psnr": -10 * error.detach().square().mean().log10()}
 
+    wanted = {name: parameter.requires_grad for name, parameter in codec.named_parameters()}
+    codec.requires_grad_(True)  # engines keep it as it is while they learn
     stats = fit("tokenizer", codec, batch, loss, options, folder, watch="psnr")
+    for name, parameter in codec.named_parameters():
+        parameter.requires_grad_(wanted[name])
     device = next(codec.parameters()).device
     sample = store.frames(rows[:: max(1, len(rows) // _UNITS)]).flatten(0, 1).to(device).float() / 255
     codec.normalise(sample)

@@ -7,7 +7,9 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim import AdamW, Muon, Optimizer
+from torch.optim import AdamW, Optimizer
+
+from learners.training.muon import Muon
 
 Parameters = Mapping[str, nn.Parameter]
 
@@ -22,24 +24,16 @@ def adamw(trained: Parameters, lr: float, weight_decay: float) -> list[Optimizer
 
 
 def muon(trained: Parameters, lr: float, weight_decay: float) -> list[Optimizer]:
-    """Muon (Jordan et al. 2024) on matrices, AdamW on everything else, at one learning rate.
-
-    Muon's steps are scaled to the size that AdamW's have (Liu et al. 2025), so a rate that suits one suits
-    both.
-    """
+    """Muon on matrices and convolutions, AdamW on everything else, at one learning rate."""
     matrices = orthogonalised(trained)
     rest = {name: p for name, p in trained.items() if name not in matrices}
-    out: list[Optimizer] = []
-    if matrices:
-        out.append(
-            Muon(list(matrices.values()), lr=lr, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
-        )
+    out: list[Optimizer] = [Muon(matrices.values(), lr=lr, weight_decay=weight_decay)] if matrices else []
     return out + (adamw(rest, lr, weight_decay) if rest else [])
 
 
 def orthogonalised(trained: Parameters) -> dict[str, nn.Parameter]:
-    """The parameters whose steps Muon makes orthogonal: those that are matrices."""
-    return {name: p for name, p in trained.items() if p.ndim == 2}
+    """The parameters whose steps Muon makes orthogonal: those of two dimensions and more."""
+    return {name: p for name, p in trained.items() if p.ndim >= 2}
 
 
 OPTIMISERS: dict[str, Callable[[Parameters, float, float], list[Optimizer]]] = {"adamw": adamw, "muon": muon}

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from learners.training.checkpoint import Checkpoints
 from learners.training.fit import FitConfig, TrainingDiverged, fit, follow
+from learners.training.muon import Muon
 from learners.training.optimisers import OPTIMISERS, optimiser_state
 
 
@@ -132,12 +133,28 @@ def test_the_average_follows_the_weights() -> None:
     assert average["w"].tolist() == [1.5]
 
 
+def test_muon_steps_are_orthogonal_whatever_the_gradient(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    for shape in ((6, 20), (20, 6), (8, 2, 3, 3)):
+        weight = nn.Parameter(torch.zeros(shape))
+        weight.grad = torch.randn(shape) * 1e-6
+        Muon([weight], lr=1.0, weight_decay=0.0).step()
+        step = weight.detach().flatten(1)
+        scale = 0.2 * max(step.shape) ** 0.5
+        values = torch.linalg.svdvals(step) / scale
+        assert float(values.min()) > 0.5 and float(values.max()) < 1.3
+        assert float(step.square().mean().sqrt()) == pytest.approx(0.2, rel=0.3)  # as AdamW's
+
+
 def test_muon_takes_matrices_and_adamw_the_rest() -> None:
     net = Net()
     trained = dict(net.named_parameters())
     state = optimiser_state(OPTIMISERS["muon"](trained, 1e-3, 0.0), trained)
     assert set(state) == set(trained)
-    assert {name for name, held in state.items() if "momentum_buffer" in held} == {"line.weight"}
+    assert {name for name, held in state.items() if "momentum_buffer" in held} == {
+        "line.weight",
+        "conv.weight",
+    }
 
 
 def test_unknown_optimisers_are_refused() -> None:

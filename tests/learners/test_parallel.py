@@ -96,10 +96,10 @@ def train(folder: Path, stop_after: int | None = None, optimiser: str = "adamw")
     return [row["toy/loss"] for row in rows] + [float(p.detach().abs().sum()) for p in net.parameters()]
 
 
-def whole_and_cut(folder: Path, optimiser: str) -> list[float]:
+def whole_and_cut(folder: Path) -> list[float]:
     """A run, and the first half of another."""
-    values = train(folder / "whole", optimiser=optimiser)
-    assert train(folder / "cut", 5, optimiser) == []
+    values = train(folder / "whole")
+    assert train(folder / "cut", 5) == []
     return values
 
 
@@ -146,17 +146,19 @@ def two(work: Callable[..., list[float]], folder: Path, *given: Any) -> list[lis
     return [json.loads(path.read_text()) for path in sorted(folder.glob("values-*.json"))]
 
 
-@pytest.mark.parametrize("optimiser", ["adamw", "muon"])
-def test_two_workers_follow_one_and_either_goes_on_from_the_others_checkpoint(
-    tmp_path: Path, optimiser: str
-) -> None:
-    close = {"adamw": 1e-4, "muon": 2e-3}[optimiser]  # Muon's iteration runs in bfloat16
-    alone = train(tmp_path / "alone", optimiser=optimiser)
-    leader, follower = two(whole_and_cut, tmp_path / "two", optimiser)
-    assert leader == follower == pytest.approx(alone, rel=close)
-    assert train(tmp_path / "two" / "cut", optimiser=optimiser) == pytest.approx(alone, rel=close)
-    assert train(tmp_path / "from-one", 5, optimiser) == []
-    assert two(train, tmp_path / "from-one", None, optimiser)[1] == pytest.approx(alone, rel=close)
+def test_two_workers_follow_one_and_either_goes_on_from_the_others_checkpoint(tmp_path: Path) -> None:
+    alone = train(tmp_path / "alone")
+    leader, follower = two(whole_and_cut, tmp_path / "two")
+    assert leader == follower == pytest.approx(alone, rel=1e-4)
+    assert train(tmp_path / "two" / "cut") == pytest.approx(alone, rel=1e-4)
+    assert train(tmp_path / "from-one", 5) == []
+    assert two(train, tmp_path / "from-one")[1] == pytest.approx(alone, rel=1e-4)
+
+
+def test_two_workers_follow_one_with_muon(tmp_path: Path) -> None:
+    alone = train(tmp_path / "alone", optimiser="muon")
+    leader, follower = two(train, tmp_path / "two", None, "muon")
+    assert leader == follower == pytest.approx(alone, rel=1e-3)  # orthogonalising magnifies rounding
 
 
 def test_two_workers_follow_one_in_every_supervised_stage(
