@@ -32,7 +32,7 @@ class ClipSpec:
         chunk: frames a chunk adds, K.
         chunks: consecutive chunks per clip, L.
         stride: frames between two frames of the clip.
-        history: consecutive frames of commands and states up to now; 0 is as many as `memory`.
+        history: consecutive commands and states up to now, H; 0 is as many as `memory`.
     """
 
     memory: int = 4
