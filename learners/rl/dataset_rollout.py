@@ -40,7 +40,7 @@ def dataset_rollout(
     Raises:
         ValueError: if nobody said whether an episode succeeded.
     """
-    if not bool(store.labelled[episodes].all()):
+    if not bool(store.arrays["labelled"][episodes].all()):
         raise ValueError("a critic learns from episodes that were labelled with success; choose those")
     chunk, last = store.spec.chunk, store.length[episodes] - 1
     steps = int((last.max() + chunk - 1) // chunk)
