@@ -103,7 +103,8 @@ class Plan:
                     f" (process {number + 1} of {self.counts[role]})" if self.counts[role] > 1 else ""
                 )
                 raise ConfigError(
-                    f"{where} needs {_say(need)}, which no node has left: all roles together ask for {_say(asked)}, the {len(nodes)} node(s) have {_say(total)}. "
+                    f"{where} needs {_say(need)}, which no node has left: all roles together ask for"
+                    f" {_say(asked)}, the {len(nodes)} node(s) have {_say(total)}. "
                     "Lower launch.actors or the shares in launch.place, or add nodes"
                 )
             # Collocated fills the fullest node first, the others the emptiest.
@@ -183,7 +184,8 @@ def _knock(address: str) -> None:
             socket.create_connection((host, int(port)), timeout=5).close()
         except OSError as error:
             raise ConfigError(
-                f"launch.address={address} cannot be reached ({error}); is `ray start --head` running there, and the port open?"
+                f"launch.address={address} cannot be reached ({error}); is `ray start --head` running there,"
+                " and the port open?"
             ) from error
 
 
@@ -194,8 +196,10 @@ def _advice(address: str, error: Exception) -> str:
     if isinstance(error, ConnectionError) or "token" in said.lower() or "unauthenticated" in said.lower():
         # Ray logs InvalidAuthToken and then only says that it could not connect.
         return (
-            f"launch.address={address} listens, but does not let us in; most often it refused our token: copy ~/.ray/auth_token of the head node to this machine, "
-            f"or set RAY_AUTH_MODE=disabled everywhere on a network you trust ({type(error).__name__}: {said})"
+            f"launch.address={address} listens, but does not let us in; most often it refused our token: copy"
+            " ~/.ray/auth_token of the head node to this machine, "
+            f"or set RAY_AUTH_MODE=disabled everywhere on a network you trust ({type(error).__name__}:"
+            f" {said})"
         )
     return f"launch.address={address}: {type(error).__name__}: {said}; see /tmp/ray/session_latest/logs"
 

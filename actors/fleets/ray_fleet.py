@@ -148,12 +148,14 @@ class RayFleet:
             ref = ray.put(weights)
         except (ObjectStoreFullError, OutOfDiskError) as error:
             raise FleetError(
-                f"the object store is full ({type(error).__name__}); raise launch.object_store_mb, free disk space for what Ray spills, or lower rl.queue and rl.envs"
+                f"the object store is full ({type(error).__name__}); raise launch.object_store_mb, free disk"
+                " space for what Ray spills, or lower rl.queue and rl.envs"
             ) from error
         with self._changed:
             if version < self._newest[0]:
                 raise ValueError(
-                    f"weights of version {version} were published after version {self._newest[0]}; versions only grow"
+                    f"weights of version {version} were published after version {self._newest[0]}; versions"
+                    " only grow"
                 )
             self._newest = (version, ref)
         return {"sync_bytes": float(size_of(weights)), "sync_ms": 1e3 * watch.read()}
@@ -334,7 +336,8 @@ class RayFleet:
                 f"job {member.job.number}" if member.job else "being built (are there resources left for it?)"
             )
             tqdm.write(
-                f"fleet: the learner waits for host {member.number}, {what}, for {now - member.since:.0f} s, over launch.patience; it is replaced"
+                f"fleet: the learner waits for host {member.number}, {what}, for {now - member.since:.0f} s,"
+                " over launch.patience; it is replaced"
             )
             ray.kill(member.actor, no_restart=True)
             self._died(member, TimeoutError(f"no answer in {limit:.0f} s"))

@@ -31,14 +31,13 @@ class MainViewPolicy(TensorDictModuleBase):
     def __init__(self, spec: WorldSpec, policy: Mapping[str, Any], bins: int):
         super().__init__()
         self.view = spec.embodiment.main_view
-        self.tokenizer = UniformActionTokenizer(bins, low=-1.0, high=1.0, action_dim=spec.action_dim)
         self.policy = build(
             policy,
             "policy.policy",
             action_dim=spec.action_dim,
             chunk_size=spec.chunk,
             vocab_size=bins,
-            action_tokenizer=self.tokenizer,
+            action_tokenizer=UniformActionTokenizer(bins, low=-1.0, high=1.0, action_dim=spec.action_dim),
         )
         self.in_keys, self.out_keys = list(self.policy.in_keys), list(self.policy.out_keys)
         shown = TensorDict({IMAGE: torch.zeros(1, spec.views, 3, *spec.size, dtype=torch.uint8)}, [1])
@@ -65,12 +64,14 @@ class MainViewPolicy(TensorDictModuleBase):
         rows = chunks.flatten(0, 1)
         low, high = rows.amin(0), rows.amax(0)
         margin = 0.1 * (high - low) + 1e-6
-        self.tokenizer.low.copy_(low - margin)
-        self.tokenizer.high.copy_(high + margin)
+        tokenizer = self.policy.action_tokenizer
+        tokenizer.low.copy_(low - margin)
+        tokenizer.high.copy_(high + margin)
 
     def imitation_loss(self, observed: TensorDictBase, chunks: Tensor) -> Tensor:
         """Negative log-likelihood per number, in nats, of the tokens of chunks [B, K, A]."""
-        return -self.get_dist(observed).log_prob(self.tokenizer.encode(chunks)).mean() / chunks[0].numel()
+        tokens = self.policy.action_tokenizer.encode(chunks)
+        return -self.get_dist(observed).log_prob(tokens).mean() / chunks[0].numel()
 
     def _main_view(self, observed: TensorDictBase) -> TensorDictBase:
         out = observed.select(*self.in_keys).copy()

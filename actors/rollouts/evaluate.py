@@ -17,7 +17,10 @@ from envs.specs import JUDGE_STATUS, PROGRESS, SUCCESS, Status
 
 @dataclass
 class Outcome:
-    """Results per episode, in the order of the seeds: success bool [N], progress float [N], judged bool [N]."""
+    """Results per episode, in the order of the seeds.
+
+    success bool [N], progress float [N], judged bool [N]: whether a judge gave a verdict.
+    """
 
     seeds: list[int]
     success: Tensor

@@ -1,8 +1,8 @@
 """What one host of worlds does: a job in, a rollout out.
 
 A job says which episodes to run and which random numbers to draw; with the version of the weights it fixes
-the rollout, bit for bit. So it does not matter who runs it, in which order, or whether it is run a second time
-after a host died.
+the rollout, bit for bit. So it does not matter who runs it, in which order, or whether it is run a second
+time after a host died.
 """
 
 from __future__ import annotations

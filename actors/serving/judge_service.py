@@ -2,10 +2,9 @@
 asks it.
 
 Verdicts are remembered by content, so the same video is never paid for twice. A caller waits until a
-deadline, tries
-again with growing pauses, and then says ERROR, upon which learners drop the episode and count it; a spent
-budget says
-ABSTAIN. The service is a named actor that Ray restarts when it dies; callers find it again by name.
+deadline, tries again with growing pauses, and then says ERROR, upon which learners drop the episode and count
+it; a spent budget says ABSTAIN. The service is a named actor that Ray restarts when it dies; callers find it
+again by name.
 """
 
 from __future__ import annotations
@@ -26,9 +25,13 @@ import torch
 from ray.exceptions import GetTimeoutError, RayActorError, RayTaskError
 from torch import Tensor
 
-from actors.factory import ConfigError, build_judge, prepare_process
-from envs.judges import Judge, Verdict
+from actors.factory import build_judge, prepare_process
+from actors.policies.contract import device_of
+from envs.judges.base import Judge, Verdict
 from envs.specs import Status
+from envs.targets import ConfigError
+
+Clip = tuple[np.ndarray, np.ndarray, str]  # frames [T, V, 3, H, W], first [V, 3, H, W], instruction
 
 
 @dataclass(frozen=True)
@@ -45,13 +48,13 @@ class ServiceConfig:
         pause: seconds before the first of these; doubles each time.
     """
 
-    batch: int = 64
-    wait_ms: float = 5.0
-    cache: int = 20_000
-    budget: int = 0
-    deadline: float = 60.0
-    retries: int = 3
-    pause: float = 0.5
+    batch: int
+    wait_ms: float
+    cache: int
+    budget: int
+    deadline: float
+    retries: int
+    pause: float
 
 
 class JudgeServer:
@@ -64,7 +67,7 @@ class JudgeServer:
         self.judge = build_judge(config, Path(weights)).eval()
         self.options = options
         self.cache: OrderedDict[bytes, tuple[np.ndarray, np.ndarray, int]] = OrderedDict()
-        self.waiting: list[tuple[tuple[np.ndarray, ...], asyncio.Future[Any]]] = []
+        self.waiting: list[tuple[Clip, asyncio.Future[Any]]] = []
         self.counts = {"clips": 0, "judged": 0, "remembered": 0, "batches": 0, "refused": 0}
         self.worker: asyncio.Task[None] | None = None
 
@@ -77,21 +80,20 @@ class JudgeServer:
         return dict(self.counts)
 
     async def score(
-        self, frames: np.ndarray, first: np.ndarray, tokens: np.ndarray
+        self, frames: np.ndarray, first: np.ndarray, instruction: list[str]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Success and progress [B, T] and status [B] of clips; see Judge.score."""
         answers = await asyncio.gather(
-            *(self._clip(*parts) for parts in zip(frames, first, tokens, strict=True))
+            *(self._clip(parts) for parts in zip(frames, first, instruction, strict=True))
         )
         success, progress, status = zip(*answers, strict=True)
         return np.stack(success), np.stack(progress), np.array(status)
 
-    async def _clip(
-        self, frames: np.ndarray, first: np.ndarray, tokens: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, int]:
+    async def _clip(self, clip: Clip) -> tuple[np.ndarray, np.ndarray, int]:
         self.counts["clips"] += 1
-        digest = hashlib.blake2b(digest_size=16)
-        for part in (frames, first, tokens):
+        frames, first, instruction = clip
+        digest = hashlib.blake2b(instruction.encode(), digest_size=16)
+        for part in (frames, first):
             digest.update(str(part.shape).encode())
             digest.update(np.ascontiguousarray(part).tobytes())
         key = digest.digest()
@@ -103,7 +105,7 @@ class JudgeServer:
             self.counts["refused"] += 1
             return np.zeros(len(frames), np.float32), np.zeros(len(frames), np.float32), Status.ABSTAIN.value
         future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-        self.waiting.append(((frames, first, tokens), future))
+        self.waiting.append((clip, future))
         if self.worker is None or self.worker.done():
             self.worker = asyncio.create_task(self._work())
         answer = await future
@@ -120,14 +122,9 @@ class JudgeServer:
             shape = self.waiting[0][0][0].shape
             chosen = [item for item in self.waiting if item[0][0].shape == shape][: self.options.batch]
             self.waiting = [item for item in self.waiting if not any(item is other for other in chosen)]
-            parts = [
-                torch.tensor(np.stack(arrays)) for arrays in zip(*(item[0] for item in chosen), strict=True)
-            ]
+            clips = [clip for clip, _ in chosen]
             try:
-                # type: ignore[misc]
-                verdict = await asyncio.get_running_loop().run_in_executor(
-                    None, lambda p=parts: self.judge.score(*p)
-                )
+                verdict = await asyncio.get_running_loop().run_in_executor(None, self._judge, clips)
             except Exception as error:
                 for _, future in chosen:
                     future.set_exception(error)
@@ -135,10 +132,22 @@ class JudgeServer:
             self.counts["judged"] += len(chosen)
             self.counts["batches"] += 1
             rows = zip(
-                verdict.success.numpy(), verdict.progress.numpy(), verdict.status.tolist(), strict=True
+                verdict.success.cpu().numpy(),
+                verdict.progress.cpu().numpy(),
+                verdict.status.tolist(),
+                strict=True,
             )
             for (_, future), row in zip(chosen, rows, strict=True):
                 future.set_result(row)
+
+    def _judge(self, clips: list[Clip]) -> Verdict:
+        """Judge clips of equal shape on the judge's device."""
+        device = device_of(self.judge)
+        frames, first = (
+            torch.from_numpy(np.stack(parts)).to(device)
+            for parts in ([clip[0] for clip in clips], [clip[1] for clip in clips])
+        )
+        return self.judge.score(frames, first, [clip[2] for clip in clips])
 
 
 class JudgeClient(Judge):
@@ -158,20 +167,21 @@ class JudgeClient(Judge):
             about: Any = ray.get(ray.get_actor(service).describe.remote(), timeout=options.deadline)
         except (ValueError, RayActorError, GetTimeoutError) as error:
             raise ConfigError(
-                f"the judge service {service!r} does not answer: {error}; start it first, or use launch.judge_service=false"
+                f"the judge service {service!r} does not answer: {error}; start it first, or use"
+                " launch.judge_service=false"
             ) from error
-        super().__init__(about["threshold"], about["hold"])
+        super().__init__(about["hold"], about["threshold"])
 
-    def begin(self, frames: Tensor, first: Tensor, tokens: Tensor) -> Any:
-        """See Judge.begin; the service begins at once."""
-        arrays = tuple(value.cpu().numpy() for value in (frames, first, tokens))
-        ref: Any = None  # stays so if it is down just now; `end` asks again
+    def submit(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Any:
+        """See Judge.submit; the service begins at once."""
+        arrays = (frames.cpu().numpy(), first.cpu().numpy(), list(instruction))
+        ref: Any = None  # stays so if it is down just now; `fetch` asks again
         with contextlib.suppress(ValueError, RayActorError):
             ref = ray.get_actor(self.service).score.remote(*arrays)
         return arrays, ref, frames.device
 
-    def end(self, ticket: Any) -> Verdict:
-        """See Judge.end; what no attempt answered is an ERROR."""
+    def fetch(self, ticket: Any) -> Verdict:
+        """See Judge.fetch; what no attempt answered is an ERROR."""
         arrays, ref, device = ticket
         for attempt in range(self.options.retries + 1):
             try:
@@ -192,9 +202,9 @@ class JudgeClient(Judge):
         nothing = torch.zeros(batch, count, device=device)
         return Verdict(nothing, nothing.clone(), torch.full((batch,), Status.ERROR.value, device=device))
 
-    def score(self, frames: Tensor, first: Tensor, tokens: Tensor, objects: Tensor | None = None) -> Verdict:
-        """See Judge.score; `objects` is ignored."""
-        return self.end(self.begin(frames, first, tokens))
+    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Verdict:
+        """See Judge.score."""
+        return self.fetch(self.submit(frames, first, instruction))
 
 
 def start_service(
@@ -205,7 +215,11 @@ def start_service(
     resources: Mapping[str, Any],
     threads: int,
 ) -> Any:
-    """Start the named service and wait until it answers; returns the actor, which lives until it is killed."""
+    """Start the named service and wait until it answers.
+
+    Returns:
+        The actor, which lives until it is killed.
+    """
     server: Any = ray.remote(JudgeServer)
     actor = server.options(name=name, max_restarts=-1, max_concurrency=256, **resources).remote(
         config, weights, options, threads

@@ -96,6 +96,8 @@ class ToyTrackingEnv(ChunkedEnv):
             step = TensorDict({"action": action, "_step": ~won.squeeze(-1)}, self.batch_size)
             after = self.toy.step(step)["next"]
             won = won | after["success"]
+            if won.all():  # TorchRL cannot step nobody
+                break
         self._state, self._steps = after["observation", "state"].clone(), self._steps + self.chunk
         out = self._observed(won)
         late = (self._steps >= self.horizon).unsqueeze(-1)

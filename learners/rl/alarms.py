@@ -28,18 +28,24 @@ class Alarms:
     raised: list[str] = field(default_factory=list)
 
     def check(self, figures: dict[str, float], iteration: int) -> None:
-        """Look at one iteration's figures; warns once per kind, stops the run on numbers that are not finite."""
+        """Look at one iteration's figures; warns once per kind.
+
+        Raises:
+            TrainingDiverged: on numbers that are not finite.
+        """
         bad = [key for key, value in figures.items() if not math.isfinite(value)]
         if bad:
             raise TrainingDiverged(
-                f"rl: {bad} not finite at iteration {iteration}; lower rl.lr or raise algorithm clipping; the last checkpoint is kept"
+                f"rl: {bad} not finite at iteration {iteration}; lower rl.lr or raise algorithm clipping; the"
+                " last checkpoint is kept"
             )
         self.silent = self.silent + 1 if figures["reward_std"] < 1e-6 else 0
         if self.silent == self.patience:
             self._warn(
                 "no reward variance",
                 iteration,
-                "every episode scores the same; check the judge, or start from a policy that succeeds sometimes",
+                "every episode scores the same; check the judge, or start from a policy that succeeds"
+                " sometimes",
             )
         if figures.get("kl", 0.0) > self.kl:
             self._warn(

@@ -98,7 +98,8 @@ class Feed:
         ledger = self.fleet.ledger
         if ledger.lost > self.max_dropped * max(ledger.asked, 20 * self.fleet.episodes):
             raise FleetError(
-                f"{ledger.lost} of {ledger.asked} episodes were lost ({ledger.dropped}), more than rl.max_dropped={self.max_dropped}; the last: {last}"
+                f"{ledger.lost} of {ledger.asked} episodes were lost ({ledger.dropped}), more than"
+                f" rl.max_dropped={self.max_dropped}; the last: {last}"
             )
 
     def _join(

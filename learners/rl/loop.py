@@ -186,7 +186,8 @@ def train_rl(
             bar.set_postfix_str(f"success {figures['success']:.2f}", refresh=False)
             if iteration == first and leads():
                 tqdm.write(
-                    f"{name}: about {(updated - began) * (config.iterations - first - 1) / 60:.1f} min for {config.iterations - first - 1} more iterations"
+                    f"{name}: about {(updated - began) * (config.iterations - first - 1) / 60:.1f} min for"
+                    f" {config.iterations - first - 1} more iterations"
                 )
             stop = from_leader(asked)
             if (iteration + 1) % config.checkpoint_every == 0 or stop:
@@ -196,7 +197,8 @@ def train_rl(
             if stop and iteration + 1 < config.iterations:
                 bar.close()
                 tqdm.write(
-                    f"{name}: SIGTERM; stopped after iteration {iteration}, the same command goes on from there"
+                    f"{name}: SIGTERM; stopped after iteration {iteration}, the same command goes on from"
+                    " there"
                 )
                 raise SystemExit(143)
     bar.close()
@@ -216,13 +218,16 @@ def train_rl(
 def _check(fleet: Fleet, algorithm: Algorithm, config: RLConfig) -> None:
     if config.envs // config.shards != fleet.episodes:
         raise ValueError(
-            f"rl.envs={config.envs} in rl.shards={config.shards} jobs are {config.envs // config.shards} episodes each, but the hosts hold {fleet.episodes}"
+            f"rl.envs={config.envs} in rl.shards={config.shards} jobs are {config.envs // config.shards}"
+            f" episodes each, but the hosts hold {fleet.episodes}"
         )
     if fleet.episodes % algorithm.group_size:
         raise ValueError(
-            f"rl.envs / rl.shards = {fleet.episodes} must be a multiple of algorithm.group={algorithm.group_size}, or groups would be torn apart"
+            f"rl.envs / rl.shards = {fleet.episodes} must be a multiple of"
+            f" algorithm.group={algorithm.group_size}, or groups would be torn apart"
         )
     if config.rewards_later and not algorithm.supports_delayed_reward:
         raise ValueError(
-            f"rl.rewards_later=true, but algorithm={algorithm.name} learns from every step as it was rewarded; use grpo or filtered_bc"
+            f"rl.rewards_later=true, but algorithm={algorithm.name} learns from every step as it was"
+            " rewarded; use grpo or filtered_bc"
         )

@@ -121,8 +121,9 @@ class PPO:
         self.gae(batch)
 
     def warm_up(self, rollout: TensorDict, seed: int, minibatch: int = 256) -> float:
-        """Let the critic learn from a rollout [N, T] of learners.rl.dataset_rollout; a critic that begins from
-        nothing spoils the first iterations.
+        """Let the critic learn from a rollout [N, T] of learners.rl.dataset_rollout.
+
+        A critic that begins from nothing spoils the first iterations.
 
         Returns:
             The share of the targets' variance that it explains before the last pass.
