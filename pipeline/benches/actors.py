@@ -10,13 +10,14 @@ from typing import Any
 
 import ray
 
-from actors.factory import build_policy, prepare_process
+from actors.factory import build_policy, prepare_process, world_spec
 from actors.fleets.cluster import Plan, connect
 from actors.fleets.fleet import Fleet, LocalFleet, Result
 from actors.fleets.ray_fleet import RayFleet
+from actors.policies.contract import freeze_perception
 from actors.rollouts.host import Job, trained_weights
 from actors.rollouts.recipe import Recipe, build_host
-from envs.specs import IMAGE, STATE, STATE_DIM, TOKENS
+from envs.specs import TEXT_BYTES
 from pipeline.demo_world import demo_recipe
 
 _EPISODES, _JOBS = 32, 6
@@ -44,7 +45,8 @@ def actors(cfg: dict[str, Any]) -> None:
             finally:
                 fleet.close()
         print(
-            f"1 actor is {rates['1 actor'] / rates['local']:.2f}x local; 2 actors are {rates['2 actors'] / rates['1 actor']:.2f}x one (goal 1.8)"
+            f"1 actor is {rates['1 actor'] / rates['local']:.2f}x local;"
+            f" 2 actors are {rates['2 actors'] / rates['1 actor']:.2f}x one (goal 1.8)"
         )
         ray.shutdown()
         _row(Path(folder))
@@ -54,7 +56,7 @@ def _measure(name: str, fleet: Fleet, recipe: Recipe) -> float:
     """Episodes per second of jobs that are all there at once, after one warm-up per host."""
     policy = build_policy(recipe.config, Path(recipe.policy))
     if recipe.freeze_perception:
-        policy.freeze_perception()
+        freeze_perception(policy)
     sync = fleet.publish(0, trained_weights(policy))
     number = 0
 
@@ -73,14 +75,22 @@ def _measure(name: str, fleet: Fleet, recipe: Recipe) -> float:
     results, seconds = work(_JOBS)
     forward = sum(r.forward_seconds for r in results) / (fleet.size * seconds)
     rate = _EPISODES * len(results) / seconds
-    line = f"{name:<8} {rate:6.1f} episodes/s, {100 * forward:.1f}% of wall time inside networks (goal {'95' if name == 'local' else '90'})"
+    goal = 95 if name == "local" else 90
+    line = (
+        f"{name:<8} {rate:6.1f} episodes/s, {100 * forward:.1f}% of wall time inside networks (goal {goal})"
+    )
     if results[0].bytes:
         batch = results[0].batch
         assert batch is not None
-        views, size = recipe.config["task"]["views"], recipe.config["task"]["size"]
-        seen = batch.numel() * (3 * len(views) * size[0] * size[1] + 4 * STATE_DIM + 8 * 12)
-        line += f"; {results[0].bytes / _EPISODES / 1024:.0f} KiB per episode on the wire, {results[0].bytes / seen:.2f}x what the policy sees ({IMAGE[1]}, {STATE[1]}, {TOKENS[1]}; goal 1.2)"
-        line += f"; weights {sync['sync_bytes'] / 1024:.0f} KiB published in {sync['sync_ms']:.1f} ms, taken over in {1e3 * max(r.load_seconds for r in results):.1f} ms"
+        spec = world_spec(recipe.config)
+        pictures = 3 * spec.views * spec.size[0] * spec.size[1]
+        seen = batch.numel() * (pictures + 4 * spec.state_dim + TEXT_BYTES)
+        line += (
+            f"; {results[0].bytes / _EPISODES / 1024:.0f} KiB per episode on the wire,"
+            f" {results[0].bytes / seen:.2f}x what the policy sees (image, state, instruction; goal 1.2)"
+            f"; weights {sync['sync_bytes'] / 1024:.0f} KiB published in {sync['sync_ms']:.1f} ms, taken over"
+            f" in {1e3 * max(r.load_seconds for r in results):.1f} ms"
+        )
     print(line)
     return rate
 
@@ -97,7 +107,8 @@ def _recovery(fleet: RayFleet) -> None:
         time.sleep(0.05)
     said = f"{fleet.recoveries[0]:.1f} s" if fleet.recoveries else "not within a minute"
     print(
-        f"a killed host was replaced after {said} (goal 10); the four jobs under way were done after {time.monotonic() - began:.1f} s"
+        f"a killed host was replaced after {said} (goal 10); the four jobs under way were done after"
+        f" {time.monotonic() - began:.1f} s"
     )
 
 

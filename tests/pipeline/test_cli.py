@@ -18,7 +18,7 @@ def worldloop(*words: str) -> subprocess.CompletedProcess[str]:
 def test_help_lists_the_commands_without_loading_torch() -> None:
     out = worldloop("--help")
     assert out.returncode == 0 and "doctor" in out.stdout and "controls" in out.stdout
-    code = "import sys, pipeline.cli; pipeline.cli._help(); assert not {'torch', 'ray', 'wandb'} & set(sys.modules)"
+    code = "import sys, pipeline.cli as c; c._help(); assert not {'torch', 'ray', 'wandb'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 
 
