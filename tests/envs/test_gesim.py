@@ -5,13 +5,19 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
 from envs.conditioning import render_ray_map
+from envs.geometry.kinematics import Kinematics
+from envs.judges.learned import LearnedJudge
 from envs.simulators import memory
 from envs.simulators.gesim.checkpoint import CheckpointError, load_released, load_state_network
 from envs.simulators.gesim.engine import GESimulator
@@ -19,8 +25,11 @@ from envs.simulators.gesim.state_expert import GESimStateExpert
 from envs.simulators.inputs import build_inputs
 from envs.simulators.samplers import EDM, Distilled
 from envs.simulators.state_experts.flow import StateExpert
-from envs.specs import WorldSpec
-from tests.embodiments import BIMANUAL_POSES
+from envs.specs import CHUNK, STATE, ActionMode, Rewards, WorldSpec
+from envs.transforms import world_transforms
+from envs.world import InitialStates, WorldEnv
+from tests.arms import two_arms
+from tests.embodiments import BIMANUAL_JOINTS, BIMANUAL_POSES
 from tests.envs.clips_of import clip_of, first_of, future_of
 from tests.envs.gesim_tiny import NET, SPEC, VAE, build, write_checkpoint
 
@@ -178,3 +187,40 @@ def test_from_nothing_at_any_size_and_chunks_that_fit_the_autoencoder() -> None:
         build(None, scratch={"net": {"layrs": 3}, "vae": VAE})
     with pytest.raises(ValueError, match=r"simulator\.pose_map=true"):
         build(None, replace(SPEC, pose_map=False))
+
+
+def test_rl_runs_inside_a_joint_world(tmp_path: Path) -> None:
+    """GE-Sim of 16 joints is an ordinary environment: chunks go in, states and rewards come out."""
+    robot = replace(BIMANUAL_JOINTS, kinematics=two_arms(tmp_path))
+    spec = WorldSpec(robot, (32, 48), 5, pose_map=True, ray_map=True)
+    world = build(None, spec)
+    judge = LearnedJudge(spec, hold=2, margin=0.0, discount=0.9, width=8, points=8, text=8, hidden=16)
+    starts = InitialStates(first_of(spec, 3), ["pour"] * 3)
+    base = WorldEnv(world, starts, 2, 10, ActionMode.RELATIVE, bf16=False)
+    expert = GESimStateExpert(world, None).eval()
+    transforms = world_transforms(
+        spec, expert, judge, Rewards(1.0, 1.0), kinematics=Kinematics(two_arms(tmp_path))
+    )
+    env = TransformedEnv(base, transforms)
+    check_env_specs(env)
+    policy = ChunkMean(spec)
+    rollout = env.rollout(2, policy)
+    assert rollout[CHUNK].shape == (2, 2, 5, 16) and rollout["next", STATE].shape == (2, 2, 16)
+    assert torch.isfinite(rollout["next", "reward"]).all()
+    wrists = rollout["next", "camera", "c2w"]
+    assert not torch.allclose(wrists[:, 0, 1], wrists[:, 1, 1])  # went with their flange
+    assert torch.allclose(wrists[:, 0, 0], wrists[:, 1, 0])  # stands still
+
+
+class ChunkMean(TensorDictModuleBase):
+    """A policy that moves every joint on."""
+
+    in_keys: ClassVar = [STATE]
+    out_keys: ClassVar = [CHUNK]
+
+    def __init__(self, spec: WorldSpec):
+        super().__init__()
+        self.rows = 0.1 * torch.arange(1, spec.chunk + 1)[:, None].expand(-1, spec.action_dim)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set(CHUNK, self.rows.expand(*tensordict.shape, -1, -1).clone())
