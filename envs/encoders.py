@@ -1,8 +1,10 @@
-"""Image encoders that judges and policies share, built from what a world shows: any number of views of any
-size.
+"""The image encoder that policies, critics and judges share: any number of views of any size, all treated
+alike.
 """
 
 from __future__ import annotations
+
+import math
 
 import torch
 import torch.nn.functional as F
@@ -10,95 +12,92 @@ from torch import Tensor, nn
 
 from envs.specs import WorldSpec
 
-_SIDE_FEATURES = 32  # numbers of a view that is not the main one
+_NATIVE = 64  # pixels of a view's shorter side that the encoder is laid out for; larger ones are halved first
 
 
-class SpatialEncoder(nn.Module):
-    """Pictures to key-point coordinates and a coarse grid of features (Finn et al. 2016, spatial
-    soft-argmax).
+class ResidualBlock(nn.Module):
+    """x + conv(silu(norm(x))) of [B, channels, H, W]."""
 
-    Args:
-        points: number of soft key-points.
-        width: channels at half resolution, a multiple of 4; twice as many at a quarter.
-        pictures: how many are looked at as one, channel on channel.
-
-    Forward takes float [B, 3 * pictures, H, W] in -1..1 and returns float32 [B, out_features]: key-points as
-    (u, v) in half-pictures from the middle, then the grid.
-    """
-
-    def __init__(self, points: int, width: int, pictures: int = 1):
+    def __init__(self, channels: int):
         super().__init__()
-        self.stem = nn.Conv2d(3 * pictures, width, 5, stride=2, padding=2)
-        self.mid = nn.Conv2d(width, 2 * width, 3, stride=2, padding=1)
-        self.deep = nn.Conv2d(2 * width, 2 * width, 3, padding=1)
-        self.norm1 = nn.GroupNorm(4, width)
-        self.norm2, self.norm3 = nn.GroupNorm(8, 2 * width), nn.GroupNorm(8, 2 * width)
-        self.fine = nn.Conv2d(width, width, 1)
-        self.heat = nn.Conv2d(width, points, 3, padding=1)
-        self.lift = nn.Conv2d(2 * width, width, 1)
-        # Sharp from the start: over a near-uniform softmax, key-points sit in the middle and hardly learn.
-        self.temperature = nn.Parameter(torch.full((points,), 2.3))
-        self.grid = nn.Sequential(nn.AdaptiveAvgPool2d(4), nn.Conv2d(2 * width, width, 1), nn.Flatten())
-        self.out_features = 2 * points + 16 * width
+        self.norm = nn.GroupNorm(8, channels)
+        self.conv = nn.Conv2d(channels, channels, 3, padding=1)
 
-    def forward(self, pictures: Tensor) -> Tensor:
-        x = F.silu(self.norm1(self.stem(pictures.contiguous(memory_format=torch.channels_last))))
-        y = F.silu(self.norm2(self.mid(x)))
-        y = y + F.silu(self.norm3(self.deep(y)))
-        # Coarse features say what it is, fine ones where exactly.
-        up = F.interpolate(self.lift(y), size=x.shape[-2:], mode="nearest")
-        heat = self.heat(F.silu(self.fine(x) + up)).float()
-        share = (heat.flatten(2) * self.temperature.exp()[None, :, None]).softmax(-1)
-        keypoints = centres(share.unflatten(-1, heat.shape[-2:]))
-        return torch.cat((keypoints.flatten(1), self.grid(y).float()), -1)
-
-
-class PatchEncoder(nn.Module):
-    """A cheap encoder: float [B, 3 * pictures, H, W] in -1..1 to float32 [B, out_features]."""
-
-    def __init__(self, out_features: int, width: int = 16, pictures: int = 1):
-        super().__init__()
-        self.out_features = out_features
-        self.layers = nn.Sequential(
-            nn.Conv2d(3 * pictures, width, 8, stride=4, padding=2),
-            nn.SiLU(),
-            nn.Conv2d(width, 2 * width, 4, stride=4),
-            nn.SiLU(),
-            nn.AdaptiveAvgPool2d(4),
-            nn.Flatten(),
-            nn.Linear(32 * width, out_features),
-        )
-
-    def forward(self, pictures: Tensor) -> Tensor:
-        return self.layers(pictures).float()
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.conv(F.silu(self.norm(x)))
 
 
 class MultiViewEncoder(nn.Module):
-    """All views of a world to one vector: key-points and a grid of the main view, a few numbers of the
-    others.
+    """One convolutional trunk for all views; each view has its own embedding and its own key-points.
+
+    It says three things of every view: where soft key-points are (spatial soft-argmax, Finn et al. 2016),
+    what the
+    features look like there, and a coarse grid of features.
 
     Args:
-        spec: what the world shows; its embodiment names the main view.
-        points, width: of the main view's SpatialEncoder.
+        spec: what the world shows.
+        points: key-points per view.
+        width: channels at half resolution, a multiple of 8; twice as many from a quarter on.
         pictures: of each view that are looked at as one, channel on channel.
+        blocks: residual blocks at the lowest resolution.
+        grid: rows and columns of the coarse grid.
+        look: features said of each key-point.
 
     Forward takes uint8, or float in -1..1, [B, V, 3 * pictures, H, W] and returns float32 [B, out_features].
     """
 
-    def __init__(self, spec: WorldSpec, points: int, width: int, pictures: int = 1):
+    def __init__(
+        self,
+        spec: WorldSpec,
+        points: int,
+        width: int,
+        pictures: int = 1,
+        blocks: int = 1,
+        grid: int = 4,
+        look: int = 4,
+    ):
         super().__init__()
-        self.main_view = spec.embodiment.main_view
-        self.others = [view for view in range(spec.views) if view != self.main_view]
-        self.main = SpatialEncoder(points, width, pictures)
-        self.sides = nn.ModuleList(
-            PatchEncoder(_SIDE_FEATURES, pictures=pictures) for _ in range(spec.views - 1)
+        views, deep = spec.views, 2 * width
+        self.stem = nn.Conv2d(3 * pictures, width, 5, stride=2, padding=2)
+        self.halve = nn.Sequential()
+        for _ in range(max(0, round(math.log2(min(spec.size) / _NATIVE)))):
+            down = nn.Conv2d(width, width, 3, stride=2, padding=1)
+            self.halve.extend([nn.GroupNorm(8, width), nn.SiLU(), down])
+        self.view = nn.Parameter(0.02 * torch.randn(views, width))
+        self.norm = nn.GroupNorm(8, width)
+        self.down = nn.Conv2d(width, deep, 3, stride=2, padding=1)
+        self.blocks = nn.Sequential(*(ResidualBlock(deep) for _ in range(blocks)))
+        self.norm_out = nn.GroupNorm(8, deep)
+        self.fine = nn.Conv2d(width, width, 1)
+        self.lift = nn.Conv2d(deep, width, 1)
+        self.heat = nn.Parameter(torch.randn(views, points, width) / width**0.5)
+        # Sharp from the start: over a near-uniform softmax, key-points sit in the middle and hardly learn.
+        self.temperature = nn.Parameter(torch.full((views, points, 1), 2.3))
+        self.look = nn.Parameter(torch.randn(views, points, width, look) / width**0.5)
+        # Pooled before it is convolved, which is the same and sixteen times cheaper.
+        self.grid = nn.Sequential(
+            nn.AdaptiveAvgPool2d(grid), nn.Conv2d(deep, width, 1), nn.SiLU(), nn.Flatten()
         )
-        self.out_features = self.main.out_features + _SIDE_FEATURES * len(self.sides)
+        self.out_features = views * (points * (2 + look) + width * grid * grid)
 
     def forward(self, pictures: Tensor) -> Tensor:
-        frames = to_signed(pictures)
-        sides = (side(frames[:, view]) for view, side in zip(self.others, self.sides, strict=True))
-        return torch.cat((self.main(frames[:, self.main_view]), *sides), -1)
+        batch, views = pictures.shape[:2]
+        flat = to_signed(pictures).flatten(0, 1).contiguous(memory_format=torch.channels_last)
+        x = self.halve(self.stem(flat))
+        x = F.silu(self.norm(x + self.view.repeat(batch, 1)[:, :, None, None]))
+        y = F.silu(self.norm_out(self.blocks(self.down(x))))
+        # Coarse features say what it is, fine ones where exactly.
+        x = F.silu(self.fine(x) + F.interpolate(self.lift(y), size=x.shape[-2:], mode="nearest"))
+        height, width = x.shape[-2:]
+        places = x.flatten(2).unflatten(0, (batch, views)).float()  # [B, V, C, H * W]
+        share = ((self.heat @ places) * self.temperature.exp()).softmax(-1)  # [B, V, P, H * W]
+        looks = torch.einsum("bvpc,vpcl->bvpl", share @ places.transpose(-1, -2), self.look)
+        said = (
+            centres(share.unflatten(-1, (height, width))).flatten(1),
+            looks.flatten(1),
+            self.grid(y).float().unflatten(0, (batch, views)).flatten(1),
+        )
+        return torch.cat(said, -1)
 
 
 def pixel_centres(count: int, device: torch.device) -> Tensor:
@@ -107,9 +106,7 @@ def pixel_centres(count: int, device: torch.device) -> Tensor:
 
 
 def centres(share: Tensor) -> Tensor:
-    """Centres of mass [..., 2] of maps [..., H, W] that add up to 1, as (u, v) in half-pictures from the
-    middle.
-    """
+    """Centres of mass (u, v) [..., 2], in half-pictures from the middle, of maps [..., H, W] of sum 1."""
     v, u = pixel_centres(share.shape[-2], share.device), pixel_centres(share.shape[-1], share.device)
     return torch.stack(((share.sum(-2) * u).sum(-1), (share.sum(-1) * v).sum(-1)), -1)
 

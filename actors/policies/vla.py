@@ -66,6 +66,7 @@ class Fusion(nn.Module):
         super().__init__()
         self.register_buffer("state_mean", torch.zeros(states))
         self.register_buffer("state_std", torch.ones(states))
+        self.norm = nn.LayerNorm(visual)
         self.state = nn.Sequential(
             nn.Linear(states, _STATE_FEATURES), nn.SiLU(), nn.Linear(_STATE_FEATURES, _STATE_FEATURES)
         )
@@ -76,7 +77,7 @@ class Fusion(nn.Module):
     def forward(self, visual: Tensor, state: Tensor) -> Tensor:
         """float [..., visual], float [..., S] -> float32 [..., width]."""
         proprio = ((state - self.state_mean) / self.state_std).clamp(-5, 5)
-        return self.mix(torch.cat((visual, self.state(proprio)), -1))
+        return self.mix(torch.cat((self.norm(visual), self.state(proprio)), -1))
 
 
 class ChunkPolicy(ProbabilisticTensorDictSequential):
@@ -86,7 +87,7 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         spec: what the world shows of which robot.
         head: config section of the action head (heads.py): `_target_` and its options.
         width: of the hidden vector.
-        points, channels: key-points and width of the main view's encoder.
+        points, channels: key-points per view and width of the encoder.
 
     Reads image, state and the instruction's bytes; writes ("vla_action", "chunk") and its log-probability.
 
@@ -123,7 +124,7 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
             log_prob_key=LOG_PROB,
         )
         super().__init__(perception, fusion, parameters, sampler)
-        self.spec, self.frozen = spec, False
+        self.spec, self.width, self.frozen = spec, width, False
 
     @property
     def perception(self) -> Perception:
@@ -149,6 +150,16 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
     def visual_dim(self) -> int:
         """Numbers of ("policy", "visual_features")."""
         return self.perception.out_features
+
+    def policy_features(self, observed: TensorDictBase) -> Tensor:
+        """What perception and fusion make of observations [B], or of their visual features if those are
+        given:
+        float32 [B, width].
+        """
+        seen = observed.get(VISUAL_FEATURES, None)
+        if seen is None:
+            seen = self.perception(observed[IMAGE], observed[INSTRUCTION_UTF8])
+        return self.fusion(seen, observed[STATE])
 
     @property
     def trained(self) -> ProbabilisticTensorDictSequential:
@@ -177,11 +188,5 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         self.fusion.state_std.copy_(torch.where(spread > RESOLUTION, spread, 1.0))
 
     def imitation_loss(self, observed: TensorDictBase, chunks: Tensor) -> Tensor:
-        """The head's loss of imitating chunks [B, K, A] from observations [B], or from their visual features
-        if those are given.
-        """
-        seen = observed.get(VISUAL_FEATURES, None)
-        if seen is None:
-            seen = self.perception(observed[IMAGE], observed[INSTRUCTION_UTF8])
-        hidden = self.fusion(seen, observed[STATE])
-        return self.head.error(hidden, self.head.target(chunks))
+        """The head's loss of imitating chunks [B, K, A] from observations [B]."""
+        return self.head.error(self.policy_features(observed), self.head.target(chunks))

@@ -112,14 +112,19 @@ class Cloning:
             out["generated", IMAGE] = made["frames"]
         return out
 
+    def disturbed(self, observed: TensorDict, generator: torch.Generator) -> TensorDict:
+        """Observations [N] whose colours and states are disturbed a little, for robustness."""
+        out = observed.copy()
+        if IMAGE in out.keys(True, True):
+            out[IMAGE] = augment(out[IMAGE], generator)
+        state = out[STATE]
+        noise = torch.randn(state.shape, generator=generator) * self.state_noise
+        out[STATE] = state + noise.to(state.device)
+        return out
+
     def loss(self, data: TensorDict, generator: torch.Generator) -> Tensor:
         """Imitation loss of a batch of `sample`; pictures and states are disturbed a little."""
-        observed = data["observed"].copy()
-        if self._features is None:
-            observed[IMAGE] = augment(observed[IMAGE], generator)
-        state = observed[STATE]
-        noise = torch.randn(state.shape, generator=generator) * self.state_noise
-        observed[STATE] = state + noise.to(state.device)
+        observed = self.disturbed(data["observed"], generator)
         total = imitation_loss(self.policy, with_text(observed, self.policy), data["target"])
         if "generated" not in data.keys():
             return total

@@ -10,6 +10,7 @@ import torch
 from actors.factory import build_policy, build_simulator, prepare_process
 from learners.stages.generated import generated_frames
 from learners.stages.imitation import Cloning, train_imitation
+from learners.stages.perception import train_perception
 from pipeline.artefact import save_weights
 from pipeline.stage import Inputs, Place, stage
 from pipeline.stages.given import (
@@ -32,8 +33,13 @@ def imitation(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     demos = demonstrations(cfg, store)
     prepare_process(cfg["seed"])
     policy = build_policy(cfg)
-    fit = fit_options(cfg, cfg["imitation"]["fit"], "imitation.fit")
-    stats = train_imitation(Cloning(policy, store, demos, mode_of(cfg)), fit, folder)
+    section, mode = cfg["imitation"], mode_of(cfg)
+    eyes = fit_options(cfg, section["perception"], "imitation.perception")
+    everything = learning_episodes(store)
+    seen = train_perception(policy, store, everything, mode, eyes, folder / "perception", section["discount"])
+    fit = fit_options(cfg, section["fit"], "imitation.fit")
+    # Perception has taken its units from all frames; demonstrations must not change them again.
+    stats = seen | train_imitation(Cloning(policy, store, demos, mode), fit, folder, fresh=not seen)
     save_weights(policy, folder)
     return {**stats, "demos": len(demos)}
 
@@ -53,8 +59,13 @@ def clone(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     own = own[torch.isin(own, learning_episodes(store))].flip(0)[: section["imagined"]]  # the newest first
     simulator = build_simulator(cfg, inputs.weights("simulator"))
     made = generated_frames(simulator, store, own, cfg["simulator"]["bf16"])
+    mode, discount = mode_of(cfg), cfg["imitation"]["discount"]
+    eyes = fit_options(cfg, section["perception"], "clone.perception")
+    everything = learning_episodes(store)
+    seen = train_perception(
+        policy, store, everything, mode, eyes, folder / "perception", discount, fresh=False
+    )
     fit = fit_options(cfg, section["fit"], "clone.fit")
-    cloning = Cloning(policy, store, episodes, mode_of(cfg), made)
-    stats = train_imitation(cloning, fit, folder, fresh=False)
+    stats = seen | train_imitation(Cloning(policy, store, episodes, mode, made), fit, folder, fresh=False)
     save_weights(policy, folder)
     return {**stats, "episodes": len(episodes), "generated_frames": len(made)}
