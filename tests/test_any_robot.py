@@ -1,0 +1,103 @@
+"""The whole loop at its smallest, for robots that differ in all that an embodiment may differ in."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from envs.embodiment import Embodiment
+from tests.envs.episodes.lerobot_sets import FakeSet, write_set
+
+ROOT = Path(__file__).resolve().parent.parent
+POSE = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
+SMALL = (
+    "experiment=smoke",
+    "track=disabled",
+    "rounds.count=1",
+    "evaluate.episodes=10",
+    "evaluate.envs=10",
+    "measure.starts=8",
+    "collect.episodes={train: 16, held_out: 6, calibration: 6}",
+    "imitation.demos=2",
+    "rl.envs=8",
+)
+
+
+def loop(folder: Path, *words: str) -> dict[str, object]:
+    """Run the loop in a process of its own; its result.json."""
+    command = [sys.executable, "-m", "pipeline", "run", *SMALL, f"runs={folder}", *words]
+    out = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert out.returncode == 0, out.stderr[-4000:]
+    result = json.loads((folder / "smoke/result.json").read_text())
+    assert list((folder / "smoke/stages").glob("rl-1-*/weights.safetensors"))
+    return dict(result)
+
+
+def robot_of(folder: Path) -> Embodiment:
+    """The robot of what was collected."""
+    (info,) = (folder / "smoke/stages").glob("collect-*/dataset/meta/info.json")
+    return Embodiment.from_info(json.loads(info.read_text()))
+
+
+@pytest.mark.slow
+def test_two_arms_by_poses_with_calibrated_cameras(tmp_path: Path) -> None:
+    result = loop(tmp_path, "task=push", "task.chunk=4", "task.horizon=12", "task.size=[48,48]")
+    robot = robot_of(tmp_path)
+    assert robot.action_dim == 14 and robot.calibrated and len(robot.cameras) == 3
+    assert result["physics_after"]["episodes"] == 10  # type: ignore[index]
+
+
+@pytest.mark.slow
+def test_two_arms_by_joints_inside_gesim(tmp_path: Path) -> None:
+    joints = (
+        "task=push",
+        "task.suite.actions=joints",
+        "task.chunk=5",
+        "task.horizon=10",
+        "task.size=[32,48]",
+    )
+    loop(tmp_path, *joints, "simulator=gesim_small", "task.mode=absolute")
+    assert robot_of(tmp_path).action_dim == 16
+
+
+@pytest.mark.slow
+def test_one_arm_by_deltas_of_meta_world(tmp_path: Path) -> None:
+    pytest.importorskip("metaworld", reason="make setup installs metaworld")
+    loop(
+        tmp_path,
+        "task=metaworld",
+        "task.name=reach-v3",
+        "task.chunk=4",
+        "task.horizon=12",
+        "task.size=[32,32]",
+    )
+    robot = robot_of(tmp_path)
+    assert robot.action_dim == 4 and robot.delta and not robot.calibrated and len(robot.cameras) == 2
+
+
+@pytest.mark.slow
+def test_one_arm_from_recordings_with_cameras_of_different_sizes(tmp_path: Path) -> None:
+    cameras = {"observation.images.front": (48, 64), "observation.images.wrist": (32, 32)}
+    about = FakeSet("arm", 10.0, cameras, {"axes": POSE}, 7, labelled=True)
+    write_set(tmp_path / "set", about)
+    words = (
+        "task=lerobot",
+        f"task.data=[{tmp_path / 'set'}]",
+        "task.chunk=4",
+        "task.horizon=8",
+        "task.size=[32,32]",
+    )
+    result = loop(tmp_path, *words, "imitation.sources=['*']")
+    assert "physics_after" not in result
+
+
+@pytest.mark.slow
+def test_somebody_elses_task_simulator_policy_and_algorithm(tmp_path: Path) -> None:
+    suite = ("task.suite={_target_: examples.task_suite.DotToSquare}", "task.name=reach", "task.size=[32,32]")
+    policy = ("policy={_target_: examples.policy.CoarsePolicy, width: 32, std: 0.3}",)
+    loop(tmp_path, *suite, *policy, "task.mode=absolute", "task.chunk=4", "task.horizon=12")
+    assert robot_of(tmp_path).robot == "dot"
