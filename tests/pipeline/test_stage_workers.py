@@ -12,12 +12,13 @@ import ray
 import torch
 from safetensors.torch import load_file
 
-from actors.factory import ConfigError
-from pipeline import stages as work
+from envs.targets import ConfigError
 from pipeline.config import load_config
 from pipeline.demo_world import demo_recipe
 from pipeline.loop import build_loop
+from pipeline.stage import Inputs
 from pipeline.stage_workers import run_stage
+from pipeline.stages import prove, rl
 
 WORDS = [
     "experiment=smoke",
@@ -46,32 +47,23 @@ def losses(folder: Path, name: str) -> list[float]:
 def test_two_learners_and_an_evaluator_do_what_one_process_does(cluster: None, tmp_path: Path) -> None:
     cfg: dict[str, Any] = load_config([*WORDS, "rl.epochs=1", "launch.actors=1"])
     recipe = demo_recipe(cfg, tmp_path / "world", cfg["rl"]["envs"])
-    found = {
-        name: Path(path).parent
-        for name, path in (
+    folders = {
+        role: Path(path).parent
+        for role, path in (
             ("policy", recipe.policy),
-            ("vision", recipe.simulator),
+            ("simulator", recipe.simulator),
             ("state", recipe.decoder),
             ("judge", recipe.judge),
         )
     }
-    found["data"] = Path(recipe.data[0]).parent
-    names: dict[str, Any] = {
-        "data": ("data",),
-        "vision": "vision",
-        "state": "state",
-        "judge": "judge",
-        "policy": "policy",
-        "iterations": 1,
-        "number": 1,
-    }
+    settings = {"number": 1, "deployed": 0, "iterations": 1}
+    inputs = Inputs({**folders, "data": (Path(recipe.data[0]).parent,)}, settings)
     alone, both = tmp_path / "alone", tmp_path / "both"
     for folder in (alone, both):
         folder.mkdir()
-    one = work.rl(
-        load_config([*WORDS, "rl.epochs=1", "launch.actors=1", "launch.learners=1"]), alone, found, **names
-    )
-    two = run_stage("rl", cfg, both, found, names)
+    single = load_config([*WORDS, "rl.epochs=1", "launch.actors=1", "launch.learners=1"])
+    one = run_stage(rl.rl, "rl", single, alone, inputs)
+    two = run_stage(rl.rl, "rl", cfg, both, inputs)
     assert two.keys() == one.keys()
     assert losses(both, "rl/loss") == pytest.approx(losses(alone, "rl/loss"), rel=1e-3, abs=1e-5)
     weights = load_file(alone / "weights.safetensors")
@@ -79,10 +71,11 @@ def test_two_learners_and_an_evaluator_do_what_one_process_does(cluster: None, t
         torch.testing.assert_close(value, weights[name], rtol=1e-3, atol=2e-4)
     here, there = tmp_path / "here", tmp_path / "there"
     here.mkdir(), there.mkdir()
-    said = run_stage("evaluate_physics", cfg, there, {"policy": found["policy"]}, {"policy": "policy"})
+    policy = Inputs({"policy": folders["policy"]})
+    placed = run_stage(prove.evaluate_physics, "evaluate", cfg, there, policy)
+    local = {**cfg, "launch": {**cfg["launch"], "backend": "local"}}
     assert (
-        said["successes"]
-        == work.evaluate_physics(cfg, here, {"policy": found["policy"]}, policy="policy")["successes"]
+        placed["successes"] == run_stage(prove.evaluate_physics, "evaluate", local, here, policy)["successes"]
     )
     assert (there / "outcomes.pt").exists()
 

@@ -1,30 +1,58 @@
-"""What stages are given of the data."""
+"""What stages collect, and how it is split."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
+import pytest
 
-from envs.episodes import Episode, LeRobotWriter
-from envs.episodes.clips import ClipStore
-from pipeline.stages.given import successful_episodes
-from tests.conftest import BENCH
+from envs.targets import ConfigError
+from pipeline.config import load_config
+from pipeline.stages.collect import fingerprint, scripted_jobs, split_counts
+from pipeline.stages.seeds import Purpose, episode_seeds
 
 
-def test_what_worked_is_the_newest_policys_and_demonstrations_where_that_is_little(
-    episodes: list[Episode], tmp_path: Path
-) -> None:
-    names = ["expert", "expert", "policy-1", "policy-1", "policy-2", "policy-2", "policy-2", "noisy"]
-    won = [True, True, True, True, True, True, False, True]
-    seeds = [1, 2, 3, 4, 5, 6, 7, 9]  # those of policies divisible by 8 are kept for measuring
-    told = [
-        replace(episode, behaviour=name, seed=seed, success=np.full_like(episode.success, ok))
-        for episode, name, seed, ok in zip(episodes, names, seeds, won, strict=True)
+def test_splits_add_up_and_none_is_empty() -> None:
+    assert split_counts(16, {"held_out": 0.125, "calibration": 0.25}) == {
+        "train": 10,
+        "held_out": 2,
+        "calibration": 4,
+    }
+    assert split_counts(3, {"calibration": 0.1, "held_out": 0.1}) == {
+        "train": 1,
+        "held_out": 1,
+        "calibration": 1,
+    }
+
+
+def test_any_prefix_of_the_scripted_episodes_is_mixed() -> None:
+    cfg = load_config(["experiment=smoke"])
+    jobs = scripted_jobs(cfg)
+    assert len(jobs) == sum(cfg["collect"]["episodes"].values()) and len(
+        {seed for seed, _, _ in jobs}
+    ) == len(jobs)
+    assert {source for _, _, source in jobs[:20]} == {"expert", "noisy", "random"}
+    assert all(level == 0 for _, level, source in jobs if source == "expert")
+    low, high = cfg["collect"]["noise_level"]
+    assert all(low <= level <= high for _, level, source in jobs if source == "noisy")
+
+
+def test_seeds_of_purposes_and_experiments_never_meet() -> None:
+    drawn = [
+        set(episode_seeds(seed, purpose, 1000))
+        for seed in (0, 1)
+        for purpose in (Purpose.COLLECT, Purpose.DEPLOY, Purpose.PRACTICE)
     ]
-    LeRobotWriter(tmp_path / "dataset", BENCH.views, BENCH.size, 10.0).write(told)
-    known = ClipStore([tmp_path / "dataset"])
-    assert successful_episodes({"imitation": {"demos": 2}}, known, 2).tolist() == [4, 5]
-    assert successful_episodes({"imitation": {"demos": 3}}, known, 2).tolist() == [4, 5]
-    assert successful_episodes({"imitation": {"demos": 3}}, known, 3).tolist() == [0, 1]
+    evaluation = set(episode_seeds(0, Purpose.EVALUATE, 1000))
+    assert len(set().union(*drawn, evaluation)) == 7000
+    assert evaluation == set(episode_seeds(1, Purpose.EVALUATE, 1000))
+
+
+def test_recordings_have_a_fingerprint(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"info\.json is missing"):
+        fingerprint([str(tmp_path)])
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta/info.json").write_text("1")
+    first = fingerprint([str(tmp_path)])
+    (tmp_path / "meta/info.json").write_text("2")
+    assert fingerprint([str(tmp_path)]) != first
