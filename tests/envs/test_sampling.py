@@ -1,4 +1,4 @@
-"""Samplers against what is known of them: an exact flow, and diffusers' scheduler with the released numbers."""
+"""Samplers against what is known of them: an exact flow, and diffusers' scheduler with released numbers."""
 
 from __future__ import annotations
 
