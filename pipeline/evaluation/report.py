@@ -73,7 +73,7 @@ def _videos(inputs: Inputs) -> list[dict[str, str]]:
     kinds = sorted({file.stem.split("-")[0] for file in files}, reverse=True)  # before stands left of after
     ordered = [[file for file in files if file.stem.split("-")[0] == kind] for kind in kinds]
     most = max((len(some) for some in ordered), default=0)
-    picked = [some[k] for k in range(most) for some in reversed(ordered) if k < len(some)]
+    picked = [some[k] for k in range(most) for some in ordered if k < len(some)]
     return [{"name": file.stem, "url": inline(file.read_bytes(), "video/mp4")} for file in picked]
 
 

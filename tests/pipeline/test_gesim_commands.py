@@ -11,17 +11,17 @@ import torch
 from actors.factory import ConfigError, build_simulator, build_state_decoder
 from envs.simulators.dit.network import DiTShape
 from pipeline import cli
-from pipeline.benches.gesim import FULL, count_flops
+from pipeline.benches.gesim import FULL
+from pipeline.benches.gesim_floor import count_flops
 from pipeline.config import load_config
 from pipeline.finetune import build_finetune
 from pipeline.serving import build_session_host
-from tests.envs.gesim_tiny import NET, VAE, write_checkpoint
+from tests.envs.gesim_tiny import write_checkpoint
 
 WORDS = [
     "simulator=gesim",
     "task.size=[32,48]",
     "task.chunk=5",
-    "task.control_hz=30",
     "task.horizon=10",
     "task.mode=absolute",
     "track=disabled",
@@ -46,38 +46,29 @@ def test_finetune_a_checkpoint_and_serve_what_came_of_it(shared: Path, tmp_path:
         f"finetune.data=[{tmp_path / 'data'}]",
     ]
     words += [
-        "finetune.vision.fit.steps=2",
-        "finetune.vision.fit.batch=2",
-        "finetune.vision.lora=2",
+        "finetune.simulator.fit.steps=2",
+        "finetune.simulator.fit.batch=2",
+        "finetune.simulator.lora=2",
         "finetune.state.fit.steps=2",
         "finetune.state.fit.batch=2",
     ]
     cfg = load_config(words)
     graph = build_finetune(cfg, tmp_path / "runs/default")
     done = graph.run()
-    assert set(done) == {"vision", "state"}
-    simulator = build_simulator(cfg, graph.folder("vision") / "weights.safetensors")
-    build_state_decoder(cfg, simulator, graph.folder("state") / "weights.safetensors")
-    host, config = build_session_host(cfg, tmp_path / "runs/default")
-    assert config.host == "127.0.0.1" and host.simulator.shape.chunk == 5 and host.decoder is not None
+    assert set(done) == {"simulator", "state"}
+    simulator = build_simulator(graph.cfg, graph.folder("simulator") / "weights.safetensors")
+    build_state_decoder(graph.cfg, simulator, graph.folder("state") / "weights.safetensors")
+    host, config = build_session_host(graph.cfg, tmp_path / "runs/default")
+    assert config.host == "127.0.0.1" and host.simulator.spec.chunk == 5 and host.decoder is not None
     with pytest.raises(ConfigError, match="run this experiment first"):
         build_session_host(load_config(WORDS), tmp_path / "nowhere")
     with pytest.raises(ConfigError, match=r"finetune\.data"):
         build_finetune(load_config(WORDS), tmp_path / "none").run()
 
 
-def test_gesim_sizes_come_from_the_config() -> None:
-    cfg = load_config([*WORDS])
-    cfg["simulator"]["model"] |= {"net": NET, "vae": VAE}
-    assert build_simulator(cfg).feature_shape == (3, 36, 48)
-    cfg["simulator"]["model"]["net"] = {"layers": 3}
-    with pytest.raises(ConfigError, match="layers"):
-        build_simulator(cfg)
-
-
 def test_the_floor_counts_what_the_network_does() -> None:
-    small = count_flops(FULL, DiTShape(num_layers=2), 1, {"base_dim": 16})
-    twice = count_flops(FULL, DiTShape(num_layers=4), 1, {"base_dim": 16})
+    small = count_flops(FULL, 4, DiTShape(num_layers=2), 1, {"base_dim": 16})
+    twice = count_flops(FULL, 4, DiTShape(num_layers=4), 1, {"base_dim": 16})
     # Per layer: 24 width^2 a token for attention and feed-forward to itself, and attention over 8448 or 25344
     # tokens.
     tokens, width = 3 * 8448, 2048
