@@ -6,7 +6,7 @@ import os
 from typing import Any
 
 import numpy as np
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from envs.embodiment import ActionKind, Camera, Embodiment
 from envs.physics.suite import Array, Expert, Observation, TaskSuite
@@ -15,7 +15,7 @@ from tests.sections import CONFIGS, offered
 
 def task_section(choice: str, **changes: Any) -> dict[str, Any]:
     """A task of configs/task, with small pictures and with options of its suite changed."""
-    cfg = OmegaConf.load(CONFIGS / "task" / f"{choice}.yaml")
+    cfg = _load(choice)
     cfg.size = [24, 32]
     cfg.suite = {**cfg.suite, **changes}
     return OmegaConf.to_container(cfg, resolve=True)  # type: ignore[return-value]
@@ -23,12 +23,15 @@ def task_section(choice: str, **changes: Any) -> dict[str, Any]:
 
 def physical_tasks() -> dict[str, dict[str, Any]]:
     """Every task of configs/task that has a suite, and our bench commanded by joints, by name."""
-    out = {name: task_section(name) for name in offered("task") if "suite:" in _text(name)}
+    known = [name for name in offered("task") if _load(name).suite is not None]
+    out = {name: task_section(name) for name in known}
     return {**out, "push-joints": task_section("push", actions="joints")}
 
 
-def _text(choice: str) -> str:
-    return (CONFIGS / "task" / f"{choice}.yaml").read_text()
+def _load(choice: str) -> DictConfig:
+    cfg = OmegaConf.load(CONFIGS / "task" / f"{choice}.yaml")
+    assert isinstance(cfg, DictConfig)
+    return cfg
 
 
 class Counting(TaskSuite):

@@ -18,7 +18,7 @@ from tests.envs.physics.sections import task_section
 
 
 def tabletop(seed: int, **changes: Any) -> Tabletop:
-    suite = build_suite(task_section("push", **changes)["suite"])
+    suite = build_suite(task_section("push", **{"control_hz": 10.0, **changes})["suite"])
     assert isinstance(suite, Tabletop)
     suite.reset("push", seed)
     return suite
@@ -89,9 +89,8 @@ def test_described_kinematics_are_those_of_the_bench() -> None:
     assert robot.kinematics is not None and robot.commands_poses and seen.poses is not None
     assert tabletop(4).embodiment.kinematics is None and tabletop(4).embodiment.commands_poses
     kinematics = Kinematics(robot.kinematics)
-    told = kinematics.flanges([torch.from_numpy(seen.command[list(arm.numbers)]) for arm in robot.arms])[
-        :, :3
-    ]
+    joints = [torch.from_numpy(seen.command[list(arm.numbers)]) for arm in robot.arms]
+    told = kinematics.flanges(joints)[:, :3]
     assert np.abs(told.numpy() - seen.poses[:, :3]).max() < 1e-5
     assert np.abs(seen.poses[:, :3] - suite.privileged()["flange_poses"][:, :3]).max() < 0.005
 
