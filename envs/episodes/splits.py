@@ -17,7 +17,7 @@ from torch import Tensor
 
 from envs.episodes.episode import EpisodeError
 from envs.episodes.files import write_atomically
-from envs.episodes.formats.lerobot import read_info
+from envs.episodes.formats.lerobot_files import read_info
 
 if TYPE_CHECKING:
     from envs.episodes.clips import ClipStore

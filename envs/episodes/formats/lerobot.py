@@ -7,9 +7,7 @@ info.json and the file indices and timestamps of meta/episodes, so episodes may 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +15,20 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.dataset as pads
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from envs.embodiment import INFO_KEY, Embodiment, EmbodimentError, camera_features
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.formats import lerobot_columns as names
-from envs.episodes.formats.lerobot_columns import PRIVILEGED, VERSION, calibrated
+from envs.episodes.formats.lerobot_columns import PRIVILEGED, calibrated
+from envs.episodes.formats.lerobot_files import (
+    column_array,
+    open_parquet,
+    read_episode_rows,
+    read_info,
+    read_tasks,
+)
+from envs.episodes.formats.lerobot_robot import agreed_robot
 from envs.episodes.pictures import resize_intrinsics, resize_picture
 from envs.episodes.video import read_clip
 
@@ -239,7 +244,7 @@ class LeRobotDataset:
         tasks = row.get("tasks")
         if tasks is not None and len(tasks) == 1:
             return str(tasks[0])
-        index = table["task_index"][0].as_py() if "task_index" in table.column_names else None
+        index = int(table["task_index"][0].as_py()) if "task_index" in table.column_names else -1
         return str(self._tasks.get(index, tasks[0] if tasks else ""))
 
     # -- pictures
@@ -272,140 +277,9 @@ class LeRobotDataset:
         return np.asarray(picture, np.uint8)
 
 
-def agreed_robot(info: dict[str, Any], given: Embodiment | None = None) -> Embodiment:
-    """The robot of a data set, as its info.json and the reader's own knowledge say together.
-
-    A data set with our description must agree in all that numbers mean; of another one, names that it lacks
-    and what its actions are is taken from the given robot.
-
-    Raises:
-        EmbodimentError: if they contradict each other.
-    """
-    recorded = _known_cameras(Embodiment.from_info(info), info["features"])
-    if given is None:
-        return recorded
-    known = recorded
-    if INFO_KEY not in (info["features"]["action"].get("info") or {}):
-        known = replace(recorded, action_kind=given.action_kind, delta=given.delta)
-        for field in ("action_names", "state_names"):
-            unnamed = tuple(str(k) for k in range(len(getattr(recorded, field))))
-            if getattr(recorded, field) == unnamed and len(getattr(given, field)) == len(unnamed):
-                known = replace(known, **{field: getattr(given, field)})
-    other = given.differs(known)
-    if other:
-        raise EmbodimentError(f"the data are of another robot: {other}")
-    cameras = tuple(
-        replace(mine, size=theirs.size, calibrated=mine.calibrated and theirs.calibrated)
-        for mine, theirs in zip(given.cameras, recorded.cameras, strict=True)
-    )
-    return replace(given, cameras=cameras)
-
-
-def _known_cameras(robot: Embodiment, features: dict[str, Any]) -> Embodiment:
-    """The robot whose cameras are calibrated as far as columns say: LeRobot's tools may have removed them,
-    and a data set without our description may have poses of every camera.
-    """
-    if names.C2W not in features or names.INTRINSIC not in features:
-        cameras = tuple(replace(camera, calibrated=False) for camera in robot.cameras)
-        return replace(robot, cameras=cameras)
-    count = int(np.prod(features[names.C2W]["shape"])) // 16
-    if count == len(calibrated(robot)):
-        return robot
-    if count == len(robot.cameras):
-        cameras = tuple(replace(camera, calibrated=True) for camera in robot.cameras)
-        return replace(robot, cameras=cameras)
-    raise EmbodimentError(
-        f"{names.C2W} holds poses of {count} cameras, but {len(calibrated(robot))} of {list(robot.views)} are"
-        " calibrated; correct features.action.info.worldloop, or remove the column"
-    )
-
-
 def _first_command(robot: Embodiment, action: NDArray[Any], states: NDArray[Any]) -> NDArray[Any]:
     """The command in force at the start, where no column says it."""
     if robot.delta:
         return np.zeros_like(action[0])
     same = robot.state_names == robot.action_names
     return states[0].astype(action.dtype) if same else action[0]
-
-
-def column_array(table: pa.Table, name: str) -> NDArray[Any]:
-    """A column of numbers or of lists of numbers, however nested, as [rows, n].
-
-    Raises:
-        EpisodeError: if something is missing in it.
-    """
-    values = table[name].combine_chunks()
-    if isinstance(values, pa.ChunkedArray):
-        values = pa.concat_arrays(values.chunks) if values.num_chunks else pa.array([], values.type)
-    if isinstance(values, pa.ExtensionArray):
-        values = values.storage
-    while pa.types.is_list(values.type) or _fixed(values.type) or pa.types.is_large_list(values.type):
-        if values.null_count:
-            raise EpisodeError(f"column {name} misses values; what is unknown is left out as a whole")
-        values = values.flatten()
-    if values.null_count:
-        raise EpisodeError(f"column {name} misses values; what is unknown is left out as a whole")
-    flat = values.to_numpy(zero_copy_only=False)
-    return flat.reshape(len(table), -1)
-
-
-def _fixed(kind: pa.DataType) -> bool:
-    return bool(pa.types.is_fixed_size_list(kind))
-
-
-def open_parquet(path: Path) -> pq.ParquetFile:
-    """Open a parquet file, or say which one is damaged."""
-    try:
-        return pq.ParquetFile(path)
-    except (OSError, pa.ArrowInvalid) as error:
-        raise EpisodeError(f"{path}: {error}; restore the file or collect its episodes again") from error
-
-
-def read_info(root: Path) -> dict[str, Any]:
-    """The contents of meta/info.json of a LeRobot v3.0 data set.
-
-    Raises:
-        EpisodeError: if there is none, or of another version.
-    """
-    path = Path(root) / "meta/info.json"
-    try:
-        info: dict[str, Any] = json.loads(path.read_text())
-    except (OSError, json.JSONDecodeError) as error:
-        raise EpisodeError(
-            f"{path}: {error}; {root} is not a LeRobot data set, or its collection never finished a shard"
-        ) from error
-    if info.get("codebase_version") != VERSION:
-        raise EpisodeError(
-            f"{path}: codebase_version {info.get('codebase_version')} is not {VERSION}; convert the data set"
-            " with LeRobot's own tools first"
-        )
-    missing = [key for key in ("features", "fps") if key not in info]
-    if missing:
-        raise EpisodeError(f"{path}: {missing} are missing; the file is damaged")
-    return info
-
-
-def read_episode_rows(root: Path, stats: bool = False) -> list[dict[str, Any]]:
-    """Metadata of every episode, by episode_index; with their statistics, if asked for."""
-    rows: list[dict[str, Any]] = []
-    for path in sorted((Path(root) / "meta/episodes").glob("chunk-*/file-*.parquet")):
-        file = open_parquet(path)
-        chosen = [name for name in file.schema_arrow.names if stats or not name.startswith("stats/")]
-        try:
-            rows += file.read(columns=chosen).to_pylist()
-        except (OSError, pa.ArrowInvalid) as error:
-            raise EpisodeError(f"{path}: {error}; restore the file") from error
-    return sorted(rows, key=lambda row: int(row["episode_index"]))
-
-
-def read_tasks(root: Path) -> dict[str, int]:
-    """Instruction -> task index; empty for a new data set."""
-    path = Path(root) / "meta/tasks.parquet"
-    if not path.exists():
-        return {}
-    table = open_parquet(path).read()
-    # LeRobot keeps the instruction in pandas' index, which may have no name.
-    column = next((name for name in ("task", "__index_level_0__") if name in table.column_names), None)
-    if column is None or "task_index" not in table.column_names:
-        raise EpisodeError(f"{path}: has columns {table.column_names}, not task and task_index")
-    return dict(zip(table[column].to_pylist(), table["task_index"].to_pylist(), strict=True))

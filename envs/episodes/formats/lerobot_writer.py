@@ -24,13 +24,6 @@ from envs.embodiment import IMAGE_PREFIX, Embodiment, EmbodimentError
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.files import write_atomically
 from envs.episodes.formats import lerobot_columns as names
-from envs.episodes.formats.lerobot import (
-    agreed_robot,
-    open_parquet,
-    read_episode_rows,
-    read_info,
-    read_tasks,
-)
 from envs.episodes.formats.lerobot_columns import (
     CHUNK_FILES,
     DATA_PATH,
@@ -41,6 +34,8 @@ from envs.episodes.formats.lerobot_columns import (
     features_of,
     plain_rate,
 )
+from envs.episodes.formats.lerobot_files import open_parquet, read_episode_rows, read_info, read_tasks
+from envs.episodes.formats.lerobot_robot import agreed_robot
 from envs.episodes.formats.lerobot_stats import column_stats, merge_stats, picture_stats
 from envs.episodes.video import write_video
 
@@ -64,6 +59,9 @@ class LeRobotWriter:
 
     def __init__(self, root: Path, embodiment: Embodiment):
         self.root, self.embodiment = Path(root), embodiment
+        # Metadata of finished episodes with their statistics; reading them for every shard would take longer
+        # than writing it.
+        self._rows: list[dict[str, Any]] = []
         if not (self.root / "meta/info.json").exists():
             return
         info = read_info(self.root)
@@ -78,8 +76,8 @@ class LeRobotWriter:
                     " appends to nothing else. Choose another folder."
                 )
         self._finish_journal()
-        rows = read_episode_rows(self.root)
-        if len(rows) != info.get("total_episodes"):  # interrupted before the description was rewritten
+        self._rows = read_episode_rows(self.root, stats=True)
+        if len(self._rows) != info.get("total_episodes"):  # interrupted before the description was rewritten
             self._describe(info["features"])
 
     @property
@@ -90,7 +88,7 @@ class LeRobotWriter:
     @property
     def episodes(self) -> int:
         """Number of finished episodes."""
-        return len(read_episode_rows(self.root))
+        return len(self._rows)
 
     def write(self, episodes: Sequence[Episode]) -> None:
         """Add one shard; afterwards the data set on disk is complete and consistent.
@@ -102,7 +100,7 @@ class LeRobotWriter:
             return
         features = self._check(episodes)
         self._finish_journal()
-        rows = read_episode_rows(self.root)
+        rows = self._rows
         shard = self._fresh_shard()
         place = {"chunk_index": shard // CHUNK_FILES, "file_index": shard % CHUNK_FILES}
         videos = {view: IMAGE_PREFIX + view for view in self.embodiment.views}
@@ -142,6 +140,7 @@ class LeRobotWriter:
             self._write_json("meta/info.json", self._info(features, [], {}))
         table = self._like_existing(pa.Table.from_pylist(records))
         write_atomically(self.root / listing, lambda path: pq.write_table(table, path))
+        self._rows = [*rows, *records]
         self._describe(features)
         (self.root / _JOURNAL).unlink()
 
@@ -224,10 +223,9 @@ class LeRobotWriter:
 
     def _describe(self, features: dict[str, Any]) -> None:
         """Rewrite stats.json and info.json from the finished shards."""
-        rows = read_episode_rows(self.root, stats=True)
-        if rows:
-            self._write_json("meta/stats.json", merge_stats(rows))
-        self._write_json("meta/info.json", self._info(features, rows, read_tasks(self.root)))
+        if self._rows:
+            self._write_json("meta/stats.json", merge_stats(self._rows))
+        self._write_json("meta/info.json", self._info(features, self._rows, read_tasks(self.root)))
 
     def _info(
         self, features: dict[str, Any], rows: list[dict[str, Any]], tasks: dict[str, int]

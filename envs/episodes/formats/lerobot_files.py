@@ -1,0 +1,97 @@
+"""The files of a LeRobot v3.0 data set but videos: info.json, tasks, episodes, rows; damage is named."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from envs.episodes.episode import EpisodeError
+from envs.episodes.formats.lerobot_columns import VERSION
+
+
+def column_array(table: pa.Table, name: str) -> NDArray[Any]:
+    """A column of numbers or of lists of numbers, however nested, as [rows, n].
+
+    Raises:
+        EpisodeError: if something is missing in it.
+    """
+    values = table[name].combine_chunks()
+    if isinstance(values, pa.ChunkedArray):
+        values = pa.concat_arrays(values.chunks) if values.num_chunks else pa.array([], values.type)
+    if isinstance(values, pa.ExtensionArray):
+        values = values.storage
+    while pa.types.is_list(values.type) or _fixed(values.type) or pa.types.is_large_list(values.type):
+        if values.null_count:
+            raise EpisodeError(f"column {name} misses values; what is unknown is left out as a whole")
+        values = values.flatten()
+    if values.null_count:
+        raise EpisodeError(f"column {name} misses values; what is unknown is left out as a whole")
+    flat = values.to_numpy(zero_copy_only=False)
+    return flat.reshape(len(table), -1)
+
+
+def _fixed(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_fixed_size_list(kind))
+
+
+def open_parquet(path: Path) -> pq.ParquetFile:
+    """Open a parquet file, or say which one is damaged."""
+    try:
+        return pq.ParquetFile(path)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise EpisodeError(f"{path}: {error}; restore the file or collect its episodes again") from error
+
+
+def read_info(root: Path) -> dict[str, Any]:
+    """The contents of meta/info.json of a LeRobot v3.0 data set.
+
+    Raises:
+        EpisodeError: if there is none, or of another version.
+    """
+    path = Path(root) / "meta/info.json"
+    try:
+        info: dict[str, Any] = json.loads(path.read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise EpisodeError(
+            f"{path}: {error}; {root} is not a LeRobot data set, or its collection never finished a shard"
+        ) from error
+    if info.get("codebase_version") != VERSION:
+        raise EpisodeError(
+            f"{path}: codebase_version {info.get('codebase_version')} is not {VERSION}; convert the data set"
+            " with LeRobot's own tools first"
+        )
+    missing = [key for key in ("features", "fps") if key not in info]
+    if missing:
+        raise EpisodeError(f"{path}: {missing} are missing; the file is damaged")
+    return info
+
+
+def read_episode_rows(root: Path, stats: bool = False) -> list[dict[str, Any]]:
+    """Metadata of every episode, by episode_index; with their statistics, if asked for."""
+    rows: list[dict[str, Any]] = []
+    for path in sorted((Path(root) / "meta/episodes").glob("chunk-*/file-*.parquet")):
+        file = open_parquet(path)
+        chosen = [name for name in file.schema_arrow.names if stats or not name.startswith("stats/")]
+        try:
+            rows += file.read(columns=chosen).to_pylist()
+        except (OSError, pa.ArrowInvalid) as error:
+            raise EpisodeError(f"{path}: {error}; restore the file") from error
+    return sorted(rows, key=lambda row: int(row["episode_index"]))
+
+
+def read_tasks(root: Path) -> dict[str, int]:
+    """Instruction -> task index; empty for a new data set."""
+    path = Path(root) / "meta/tasks.parquet"
+    if not path.exists():
+        return {}
+    table = open_parquet(path).read()
+    # LeRobot keeps the instruction in pandas' index, which may have no name.
+    column = next((name for name in ("task", "__index_level_0__") if name in table.column_names), None)
+    if column is None or "task_index" not in table.column_names:
+        raise EpisodeError(f"{path}: has columns {table.column_names}, not task and task_index")
+    return dict(zip(table[column].to_pylist(), table["task_index"].to_pylist(), strict=True))
