@@ -38,6 +38,7 @@ from tqdm import tqdm
 from actors.fleets.fleet import EpisodeLedger, FleetError, Result
 from actors.rollouts.host import Host, Job, Stopwatch, Weights, pack, size_of, unpack
 from actors.rollouts.recipe import Recipe, build_host_process
+from envs.targets import options
 
 
 class HostActor:
@@ -92,11 +93,11 @@ class Patience:
             meanwhile counts a tenth.
     """
 
-    job: float = 300.0
-    start: float = 180.0
-    stage: float = 14400.0
-    retries: int = 1
-    rebuilds: int = 3
+    job: float
+    start: float
+    stage: float
+    retries: int
+    rebuilds: int
 
 
 class RayFleet:
@@ -106,7 +107,7 @@ class RayFleet:
         recipe: what every host is built from.
         actors: how many.
         resources: options of the actors, such as num_cpus and num_gpus.
-        patience: deadlines and retries.
+        patience: deadlines and retries; those of launch.patience if not given.
         attached: further actors that end with the fleet, such as the judge service.
     """
 
@@ -119,7 +120,8 @@ class RayFleet:
         attached: tuple[Any, ...] = (),
     ):
         self.ledger, self.size, self.episodes = EpisodeLedger(), actors, recipe.episodes
-        self.patience = patience or Patience()
+        section = recipe.config["launch"]["patience"]
+        self.patience = patience or options(Patience, section, "launch.patience")
         self._recipe, self._resources = recipe.plain(), dict(resources or {"num_cpus": 1})
         self._attached = attached
         self._actor_class: Any = ray.remote(HostActor)

@@ -1,4 +1,4 @@
-"""The judge as a service: same verdicts, remembered, within its budget, and an honest ERROR when it is gone."""
+"""The judge as a service: same verdicts, remembered, within its budget, and an ERROR when it is gone."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from envs.specs import EPISODE, JUDGE_STATUS, SUCCESS, Status
 from learners.rl.algorithm import first_episode
 from pipeline.artefact import save_weights
 
-OPTIONS = ServiceConfig(batch=8, wait_ms=20.0, budget=40, deadline=20.0, retries=1, pause=0.1)
+OPTIONS = ServiceConfig(batch=8, wait_ms=20.0, cache=1000, budget=40, deadline=20.0, retries=1, pause=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +38,10 @@ def service(cfg: dict[str, Any], weights: str) -> Iterator[Any]:
     ray.shutdown()
 
 
-def clips(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def clips(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor, list[str]]:
     draw = torch.Generator().manual_seed(seed)
     frames = torch.randint(0, 256, (count, 4, 3, 3, 64, 64), dtype=torch.uint8, generator=draw)
-    return frames, frames[:, 0], torch.randint(0, 50, (count, 12), generator=draw)
+    return frames, frames[:, 0], [f"push block {k % 2}" for k in range(count)]
 
 
 def test_service_agrees_remembers_and_gathers(cfg: dict[str, Any], weights: str, service: Any) -> None:
@@ -52,9 +52,9 @@ def test_service_agrees_remembers_and_gathers(cfg: dict[str, Any], weights: str,
     asked = clips(6, 0)
     said, wanted = client.score(*asked), inline.score(*asked)
     assert torch.allclose(said.success, wanted.success, atol=1e-5) and torch.equal(said.status, wanted.status)
-    tickets = [client.begin(*clips(2, 1)), client.begin(*clips(2, 2)), client.begin(*asked)]
+    tickets = [client.submit(*clips(2, 1)), client.submit(*clips(2, 2)), client.submit(*asked)]
     for ticket in tickets:
-        client.end(ticket)
+        client.fetch(ticket)
     stats = ray.get(service.stats.remote())
     assert stats["clips"] == 16 and stats["judged"] == 10 and stats["remembered"] == 6
     assert stats["batches"] < 4  # two callers' clips were judged together
@@ -66,7 +66,7 @@ def test_spent_budget_abstains(service: Any) -> None:
 
 
 def test_restarted_service_is_found_again_and_a_lost_one_is_an_error(service: Any) -> None:
-    client = JudgeClient("judge-test", ServiceConfig(deadline=60.0, retries=5, pause=0.5))
+    client = JudgeClient("judge-test", replace(OPTIONS, deadline=60.0, retries=6, pause=1.0))
     ray.kill(service, no_restart=False)
     assert client.score(*clips(2, 9)).status.tolist() == [Status.OK.value] * 2
     ray.kill(service, no_restart=True)

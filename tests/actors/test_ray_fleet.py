@@ -14,15 +14,15 @@ import ray
 import torch
 from tensordict import TensorDict
 
-from actors.factory import ConfigError, build_policy
+from actors.factory import ConfigError, build_algorithm, build_policy
 from actors.fleets.cluster import Plan, connect
 from actors.fleets.fleet import Fleet, FleetError, LocalFleet
 from actors.fleets.launch import build_fleet
 from actors.fleets.ray_fleet import Patience, RayFleet
 from actors.rollouts.host import Job, pack, trained_weights, unpack
 from actors.rollouts.recipe import Recipe, build_host
+from envs.targets import options
 from learners.rl.algorithm import RLConfig
-from learners.rl.factory import build_algorithm
 from learners.rl.loop import train_rl
 
 
@@ -33,6 +33,11 @@ def cluster(cfg: dict[str, Any]) -> Iterator[None]:
     ray.shutdown()
 
 
+def patience(recipe: Recipe, **changes: Any) -> Patience:
+    """launch.patience with some of it changed."""
+    return options(Patience, {**recipe.config["launch"]["patience"], **changes}, "launch.patience")
+
+
 def learn(
     fleet: Fleet, recipe: Recipe, folder: Path, **changes: Any
 ) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
@@ -41,17 +46,9 @@ def learn(
     policy = build_policy(cfg, Path(recipe.policy))
     policy.freeze_perception()
     torch.manual_seed(3)
-    settings = RLConfig(
-        **{
-            "iterations": 2,
-            "envs": 16,
-            "shards": 4,
-            "epochs": 1,
-            "minibatch": 32,
-            "freeze_perception": True,
-            **changes,
-        }
-    )
+    smoke = {"iterations": 2, "envs": 16, "shards": 4, "epochs": 1, "minibatch": 32}
+    own = {**cfg["rl"], "microbatches": 1, "seed": 0, "freeze_perception": True, **smoke, **changes}
+    settings = options(RLConfig, own, "rl")
     stats = train_rl(fleet, policy, build_algorithm(cfg, policy), settings, folder, starts=8)
     return {name: value.clone() for name, value in policy.state_dict().items()}, stats
 
@@ -141,7 +138,7 @@ def test_async_keeps_lag_bounded_and_books_balanced(cluster: None, recipe: Recip
 
 
 def test_a_job_that_raises_is_given_up_and_counted(cluster: None, recipe: Recipe, tmp_path: Path) -> None:
-    fleet = RayFleet(recipe, 1, patience=Patience(retries=0))
+    fleet = RayFleet(recipe, 1, patience=patience(recipe, retries=0))
     try:
         policy = build_policy(recipe.config, Path(recipe.policy))
         policy.freeze_perception()
@@ -163,7 +160,7 @@ def test_a_job_that_raises_is_given_up_and_counted(cluster: None, recipe: Recipe
 
 def test_hosts_that_cannot_be_built_stop_the_run(cluster: None, recipe: Recipe) -> None:
     plain = recipe.plain() | {"data": ("/nowhere",)}
-    fleet = RayFleet(Recipe(**plain), 1, patience=Patience(rebuilds=2))
+    fleet = RayFleet(Recipe(**plain), 1, patience=patience(recipe, rebuilds=2))
     try:
         fleet.publish(0, {})
         fleet.submit(Job(0, (0,), 0))

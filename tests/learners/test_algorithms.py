@@ -198,9 +198,9 @@ def test_end_to_end_pictures_travel_and_the_encoder_learns(tmp_path: Path) -> No
     batch = host.run(Job(0, tuple(range(8)), 0))
     assert IMAGE in batch.keys(True, True) and INSTRUCTION_UTF8 in batch.keys(True, True)
     assert ("next", *IMAGE) not in batch.keys(True, True)  # critics read features
-    before = policy.perception.views.main.stem.weight.clone()
+    before = policy.perception.views.stem.weight.clone()
     train_rl(LocalFleet(host), policy, algorithm_of("ppo", policy, env.spec), settings(), tmp_path, starts=4)
-    assert not torch.equal(policy.perception.views.main.stem.weight, before)
+    assert not torch.equal(policy.perception.views.stem.weight, before)
 
 
 def test_next_features_are_those_of_the_next_observation(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,40 @@
+"""Encoders take any number of views of any size, and see each of them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from envs.embodiment import Embodiment
+from envs.encoders import MultiViewEncoder, centres, to_signed
+from envs.specs import IMAGE
+from tests.embodiments import ARM_DELTAS, EMBODIMENTS, observations, world_spec
+
+
+@pytest.mark.parametrize("robot", EMBODIMENTS.values(), ids=list(EMBODIMENTS))
+@pytest.mark.parametrize("size", [(32, 32), (48, 80)])
+def test_every_view_counts(robot: Embodiment, size: tuple[int, int]) -> None:
+    torch.manual_seed(0)
+    spec = world_spec(robot, size)
+    encoder = MultiViewEncoder(spec, points=4, width=8)
+    image = observations(spec, 2)[IMAGE]
+    with torch.no_grad():
+        out = encoder(image)
+        assert out.shape == (2, encoder.out_features) and out.dtype == torch.float32
+        for view in range(spec.views):
+            other = image.clone()
+            other[:, view] = 255 - other[:, view]
+            assert not torch.allclose(encoder(other), out)
+        assert torch.allclose(encoder(to_signed(image)), out)  # bytes and signed floats are the same
+
+
+def test_two_pictures_of_a_view_are_seen_as_one() -> None:
+    spec = world_spec(ARM_DELTAS)
+    encoder = MultiViewEncoder(spec, points=4, width=8, pictures=2)
+    assert encoder(torch.randn(3, spec.views, 6, 32, 32)).shape == (3, encoder.out_features)
+
+
+def test_centres_are_in_half_pictures_from_the_middle() -> None:
+    share = torch.zeros(2, 4, 8)
+    share[0, 0, 0] = share[1, 3, 7] = 1.0
+    assert torch.allclose(centres(share), torch.tensor([[-0.875, -0.75], [0.875, 0.75]]))

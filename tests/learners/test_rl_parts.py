@@ -1,0 +1,56 @@
+"""What algorithms share: masks of rollouts, and alarms."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from envs.specs import INVALID_ACTION, JUDGE_STATUS, Status
+from envs.targets import ConfigError, options
+from learners.rl.alarms import Alarms
+from learners.rl.algorithm import RLConfig, finite, first_episode, judged, sound
+from learners.training.fit import TrainingDiverged
+from tests.learners.test_algorithms import RL
+
+DONE = torch.tensor([[False, True, False, True], [False, False, False, True]])
+
+
+def test_an_episode_that_a_judge_or_a_nan_spoiled_is_left_out_whole() -> None:
+    assert first_episode(DONE).tolist() == [[True, True, False, False], [True] * 4]
+    status = torch.full((2, 4, 1), Status.OK.value)
+    status[0, 3] = Status.ERROR.value
+    invalid = torch.zeros(2, 4, 1, dtype=torch.bool)
+    invalid[1, 2] = True
+    after = TensorDict({JUDGE_STATUS: status, "done": DONE.unsqueeze(-1)}, [2, 4])
+    batch = TensorDict({"next": after, INVALID_ACTION: invalid}, [2, 4])
+    assert judged(batch).tolist() == [[True, True, False, False], [True] * 4]
+    assert finite(batch).tolist() == [[True] * 4, [False] * 4]
+    assert sound(batch).tolist() == [[True, True, False, False], [False] * 4]
+
+
+def test_alarms() -> None:
+    alarms = Alarms(patience=2)
+    for iteration in range(2):
+        alarms.check({"reward_std": 0.0, "kl": 0.0, "entropy": 1.0}, iteration)
+    alarms.check({"reward_std": 1.0, "kl": 3.0, "entropy": -50.0}, 3)
+    assert [text.split(" at ")[0] for text in alarms.raised] == [
+        "no reward variance",
+        "exploding KL",
+        "collapsed entropy",
+    ]
+    with pytest.raises(TrainingDiverged, match="kl"):
+        alarms.check({"reward_std": 1.0, "kl": float("nan")}, 4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"schedule": "now"}, "must be sync or async"),
+        ({"shards": 3}, "must be a multiple of shards=3"),
+        ({"epoch": 3}, r"rl\.epoch is not an option of RLConfig; did you mean epochs"),
+    ],
+)
+def test_options_that_cannot_work_are_named(changes: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        options(RLConfig, {**RL, **changes}, "rl")
