@@ -215,7 +215,8 @@ def _variants(world: GESimulator, device: torch.device, watch: Watch, plain: flo
     print("one change at a time, against the plain run:")
     known = world.net._known
     # type: ignore[method-assign, assignment]
-    world.net._known = lambda text, batch: [text[:1].repeat(batch, 1, 1)] * len(world.net.transformer_blocks)
+    blocks_of: Any = world.net
+    blocks_of._known = lambda text, batch: [text[:1].repeat(batch, 1, 1)] * len(blocks_of.transformer_blocks)
     ratio("the text's keys computed anew for every view, block and step")
     world.net._known = known  # type: ignore[method-assign]
     codec: Any = world.codec

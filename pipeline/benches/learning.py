@@ -17,9 +17,11 @@ from actors.policies.vla import ChunkPolicy
 from actors.rollouts.evaluate import evaluate
 from actors.rollouts.host import Host
 from envs.physics.toy_tracking import ToyTrackingEnv
+from envs.targets import options
 from learners.rl.algorithm import RLConfig
 from learners.rl.grpo import GRPO
 from learners.rl.loop import train_rl
+from pipeline.config import load_config
 
 GOAL, EPISODES, SEEDS = 0.6, 100, (0, 1, 2)
 # "35-68 s an iteration, 2-3 hours" by its own account and a trial on two cores: two hours is the kinder
@@ -62,16 +64,17 @@ def learn(seed: int, limit: int, folder: Path, envs: int = 256) -> tuple[float, 
         return rate >= GOAL
 
     began = time.perf_counter()
-    config = RLConfig(
-        iterations=limit,
-        envs=envs,
-        epochs=2,
-        minibatch=256,
-        lr=1e-3,
-        kl_stop=1.0,
-        checkpoint_every=limit,
-        seed=seed,
-    )
+    own = {
+        "envs": envs,
+        "shards": 1,
+        "epochs": 2,
+        "minibatch": 256,
+        "lr": 1e-3,
+        "kl_stop": 1.0,
+        "anchor": 0.0,
+    }
+    shared = {**load_config([])["rl"], **own, "checkpoint_every": limit}
+    config = options(RLConfig, {**shared, "iterations": limit, "microbatches": 1, "seed": seed}, "rl")
     try:
         train_rl(
             fleet,

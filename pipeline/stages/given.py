@@ -57,10 +57,10 @@ def mode_of(cfg: Cfg) -> ActionMode:
 
 def datasets(folders: Iterable[Path]) -> list[Path]:
     """The data sets that stages left in their folders, or point to."""
-    out = []
+    out: list[str] = []
     for folder in folders:
         elsewhere = folder / DATASETS
-        out += json.loads(elsewhere.read_text()) if elsewhere.exists() else [folder / "dataset"]
+        out += json.loads(elsewhere.read_text()) if elsewhere.exists() else [str(folder / "dataset")]
     return [Path(path) for path in out]
 
 

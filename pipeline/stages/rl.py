@@ -30,12 +30,13 @@ from pipeline.stages.given import (
     successful_episodes,
 )
 from pipeline.stages.seeds import Purpose, episode_seeds
+from pipeline.view import ConfigView
 
 LEARNING = ("policy", "algorithm", "rl", "imitation", "microbatches")
 
 
 @stage(reads=(*WORLD, *LEARNING), place=Place.LEARNERS)
-def rl(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Reinforcement learning inside the simulator.
 
     Settings: number of the round, iterations; deployed, the round whose true successes anchor the policy (0:
@@ -91,7 +92,7 @@ def _warm_up(
 
 
 @stage(reads=(*PHYSICS, *LEARNING))
-def rl_in_physics(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+def rl_in_physics(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The same reinforcement learning in physics, from the first policy: a control of imagination.
 
     Settings: iterations.

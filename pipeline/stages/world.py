@@ -101,7 +101,7 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     section = cfg["judge_fit"][phase]
     store = open_store(cfg, inputs)
     prepare_process(cfg["seed"])
-    model = build_judge(cfg, inputs.weights("warm"))
+    model: Any = build_judge(cfg, inputs.weights("warm"))
     stats: dict[str, Any] = {}
     if learns(model):
         train = labelled(store, store.split("train"))
