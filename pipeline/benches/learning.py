@@ -73,7 +73,7 @@ def learn(seed: int, limit: int, folder: Path, envs: int = 256) -> tuple[float, 
         "kl_stop": 1.0,
         "anchor": 0.0,
     }
-    shared = {**load_config([])["rl"], **own, "checkpoint_every": limit}
+    shared = {**load_config([])["rl"], **own, "anchor": 0.0, "checkpoint_every": limit}
     config = options(RLConfig, {**shared, "iterations": limit, "microbatches": 1, "seed": seed}, "rl")
     try:
         train_rl(
