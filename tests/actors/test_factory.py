@@ -1,0 +1,93 @@
+"""From a config to robots, specs and parts."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from actors.factory import build_policy, device_of, prepare_process, world_spec
+from envs.embodiment import INFO_KEY, Embodiment
+from envs.targets import ConfigError
+from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES
+from tests.sections import section
+
+AROUND = {"pose_map": "auto", "ray_map": "auto", "kinematics": None}
+
+
+def recorded(robot: Embodiment, folder: Path) -> Path:
+    """A data set of which there is only the description."""
+    features: dict[str, Any] = {
+        "action": {"shape": [robot.action_dim], "names": list(robot.action_names), "dtype": "float32"},
+        "observation.state": {"shape": [robot.state_dim], "names": list(robot.state_names)},
+    }
+    for camera in robot.cameras:
+        features[f"observation.images.{camera.name}"] = {
+            "dtype": "image",
+            "shape": [*camera.size, 3],
+            "names": ["height", "width", "channels"],
+        }
+    (folder / "meta").mkdir(parents=True)
+    features["action"]["info"] = {INFO_KEY: robot.to_info()}
+    info = {"robot_type": robot.robot, "fps": robot.fps, "features": features}
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    return folder
+
+
+def config(*folders: Path, **simulator: Any) -> dict[str, Any]:
+    """A config whose robot is known from data alone."""
+    task = {"suite": None, "data": [str(folder) for folder in folders], "size": [32, 48], "chunk": 4}
+    return {
+        "task": {**task, "mode": "absolute"},
+        "simulator": {**AROUND, **simulator},
+        "policy": section("policy/chunk_gaussian", "absolute"),
+        "launch": {"device": "cpu"},
+    }
+
+
+@pytest.mark.parametrize(
+    ("robot", "pose_map", "ray_map"),
+    [(BIMANUAL_POSES, True, True), (BIMANUAL_JOINTS, False, True), (ARM_DELTAS, False, False)],
+)
+def test_conditioning_is_what_the_robot_allows(
+    robot: Embodiment, pose_map: bool, ray_map: bool, tmp_path: Path
+) -> None:
+    cfg = config(recorded(robot, tmp_path / "a"))
+    spec = world_spec(cfg)
+    assert spec.embodiment == robot and spec.size == (32, 48)
+    assert (spec.pose_map, spec.ray_map) == (pose_map, ray_map)
+    assert not world_spec(config(tmp_path / "a", pose_map=False, ray_map=False)).ray_map
+    assert build_policy(cfg).head.actions == robot.action_dim
+    if not pose_map:
+        with pytest.raises(ConfigError, match="pose_map"):
+            world_spec(config(tmp_path / "a", pose_map=True))
+
+
+def test_robots_that_are_unknown_or_differ_are_named(tmp_path: Path) -> None:
+    one, other = recorded(ARM_DELTAS, tmp_path / "a"), recorded(ARM_JOINTS, tmp_path / "b")
+    with pytest.raises(ConfigError, match="different robots: action_names"):
+        world_spec(config(one, other))
+    with pytest.raises(ConfigError, match="no robot is known"):
+        world_spec(config())
+    with pytest.raises(ConfigError, match="does not exist"):
+        world_spec(config(tmp_path / "c"))
+    with pytest.raises(ConfigError, match="must be auto, true or false"):
+        world_spec(config(one, ray_map="perhaps"))
+
+
+def test_a_gpu_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert device_of({"launch": {"device": "auto"}}).type == "cpu"
+    with pytest.raises(ConfigError, match=r"launch\.device=cuda"):
+        device_of({"launch": {"device": "cuda"}})
+
+
+def test_processes_are_prepared_alike() -> None:
+    drawn = []
+    for _ in range(2):
+        prepare_process(5, 1)
+        drawn.append(torch.rand(3).tolist())
+    assert drawn[0] == drawn[1] and torch.get_num_threads() == 1
