@@ -48,7 +48,7 @@ TEXT_BYTES = 256  # of an instruction; longer ones are cut
 
 
 class Status(Enum):
-    """What a judge says of its own verdict; ERROR is never a zero reward, the episode is dropped and counted."""
+    """What a judge says of its own verdict; ERROR is never a zero reward: the episode is dropped, counted."""
 
     OK = 0
     ABSTAIN = 1
@@ -95,13 +95,13 @@ class WorldSpec:
         if (self.pose_map or self.ray_map) and not robot.calibrated:
             bare = [camera.name for camera in robot.cameras if not camera.calibrated]
             raise ValueError(
-                f"simulator.pose_map and simulator.ray_map need calibrated cameras, and {bare} of {robot.robot} are not;"
-                " set both to false"
+                f"simulator.pose_map and simulator.ray_map need calibrated cameras, and {bare} of"
+                f" {robot.robot} are not; set both to false"
             )
         if self.pose_map and not robot.commands_poses:
             raise ValueError(
-                f"simulator.pose_map needs end-effector poses, which the actions of {robot.robot} do not say; set"
-                " simulator.pose_map=false, or simulator.kinematics for joint commands"
+                f"simulator.pose_map needs end-effector poses, which the actions of {robot.robot} do not"
+                " say; set simulator.pose_map=false, or simulator.kinematics for joint commands"
             )
 
     @property

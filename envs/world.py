@@ -97,7 +97,6 @@ class WorldEnv(ChunkedEnv):
         if shown != wanted:
             raise ValueError(f"initial states show {shown}, the simulator {wanted}; train it on these views")
         super().__init__(spec, batch, horizon, mode, device, seed)
-        self.shows = spec
         self.simulator, self.starts, self.shared_noise, self.bf16 = simulator, starts, shared_noise, bf16
         self.session: TensorDict | None = None
         pictures = (batch, spec.chunk, spec.views, 3, *spec.size)
@@ -130,7 +129,7 @@ class WorldEnv(ChunkedEnv):
         else:
             self.session = memory.replace(self.session, mask.to(self.device), begun)
         self._steps[mask] = 0
-        batch, spec = self.batch_size[0], self.shows
+        batch, spec = self.batch_size[0], self.spec
         out = self._observe()
         frames = (batch, spec.chunk, spec.views, 3, *spec.size)
         out[FRAMES] = torch.zeros(frames, dtype=torch.uint8, device=self.device)
@@ -162,7 +161,7 @@ class WorldEnv(ChunkedEnv):
         now = memory.newest(self.session)
         out = TensorDict({}, self.batch_size, device=self.device)
         out[IMAGE], out[STATE], out[COMMAND] = now["frames"], now["states"], now["commands"]
-        if self.shows.embodiment.calibrated:
+        if self.spec.embodiment.calibrated:
             out[INTRINSIC], out[C2W] = self.session["intrinsic"], now["c2w"]
         out[SUCCESS] = torch.zeros(batch, 1, dtype=torch.bool, device=self.device)
         out[PROGRESS] = torch.zeros(batch, 1, device=self.device)

@@ -90,7 +90,7 @@ def intrinsics(spec: WorldSpec, *batch: int) -> Tensor:
 
 
 def camera_poses(spec: WorldSpec, *batch: int) -> Tensor:
-    """Camera-to-world poses float32 [*batch, V, 4, 4]: a metre above the origin, looking down, side by side."""
+    """Camera-to-world poses float32 [*batch, V, 4, 4]: a metre up, looking down, side by side."""
     poses = torch.eye(4).expand(*batch, spec.views, 4, 4).clone()
     poses[..., 1, 1] = poses[..., 2, 2] = -1.0
     poses[..., 2, 3] = 1.0

@@ -60,7 +60,7 @@ def test_two_arms_by_joints_inside_gesim(tmp_path: Path) -> None:
         "task.horizon=10",
         "task.size=[32,48]",
     )
-    loop(tmp_path, *joints, "simulator=gesim_small", "task.mode=absolute")
+    loop(tmp_path, *joints, "simulator=gesim_tiny", "task.mode=absolute")
     assert robot_of(tmp_path).action_dim == 16
 
 

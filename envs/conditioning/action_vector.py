@@ -14,7 +14,9 @@ class ActionVector(nn.Module):
     """Commands as float32 numbers of about unit spread.
 
     Absolute commands are told twice: as moves from the command in force when the chunk begins, which say what
-    changes, and as they are, which say where. Deltas are told as they are.
+    changes, and as they are, which say where. Deltas are told as they are and summed up, for only their sum
+    says where
+    things end.
 
     Args:
         embodiment: whose actions.
@@ -30,7 +32,7 @@ class ActionVector(nn.Module):
     def __init__(self, embodiment: Embodiment):
         super().__init__()
         count = embodiment.action_dim
-        self.delta, self.size = embodiment.delta, count * (1 if embodiment.delta else 2)
+        self.delta, self.size = embodiment.delta, 2 * count
         self.register_buffer("centre", torch.zeros(count))
         self.register_buffer("scale", torch.ones(count))
         self.register_buffer("move_scale", torch.ones(count))
@@ -45,7 +47,7 @@ class ActionVector(nn.Module):
         """float32 [..., K, size] of commands [..., K, A] after the command in force [..., A]."""
         where = ((commands - self.centre) * self.scale).float()
         if self.delta:
-            return where
+            return torch.cat((where, where.cumsum(-2) / 2), -1)
         return torch.cat(((commands - now.unsqueeze(-2)) * self.move_scale, where), -1).float()
 
 

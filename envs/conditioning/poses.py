@@ -28,8 +28,8 @@ def end_effector_poses(
     """
     if not embodiment.commands_poses and kinematics is None:
         raise EmbodimentError(
-            f"commands of {embodiment.robot} ({embodiment.action_kind.value}, delta={embodiment.delta}) do not"
-            " say where its flanges will be; set simulator.pose_map=false, or simulator.kinematics for joints"
+            f"commands of {embodiment.robot} ({embodiment.action_kind.value}, delta={embodiment.delta}) do"
+            " not say where flanges will be; set simulator.pose_map=false, or simulator.kinematics for joints"
         )
     numbers = [commands[..., list(arm.numbers)] for arm in embodiment.arms]
     if embodiment.action_kind is ActionKind.JOINTS:

@@ -88,6 +88,11 @@ class Simulator(nn.Module):
         within a chunk
         [N, A] (zeros of delta actions), states [N, S]. Here there are none to take."""
 
+    def fit_camera_statistics(self, frames: Tensor) -> None:
+        """Learn how cameras usually see, before the first training, from frames uint8 [N, V, 3, H, W] of
+        different
+        episodes. Here nothing is learned."""
+
     def recall(self, state: TensorDict, future: TensorDict) -> TensorDict:
         """What is remembered for the next chunk, [B, M, ...]; evenly spread over the past, with the first
         frame.

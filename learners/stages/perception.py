@@ -18,9 +18,9 @@ from torch import Tensor, nn
 
 from actors.policies.contract import with_text
 from envs.episodes.clips import ClipStore
-from envs.judges.labels import progress_to_success
 from envs.specs import ActionMode
 from learners.stages.imitation import Cloning
+from learners.stages.judge import frame_targets
 from learners.training.fit import FitConfig, fit
 
 _SPREAD = 1e-3  # of a number of the chunk below which it is a constant that nobody need predict
@@ -76,16 +76,6 @@ class PerceptionTasks(nn.Module):
         return acted + soon, {"action_error": acted.detach(), "time_to_success": soon.detach()}
 
 
-def progress_of_rows(store: ClipStore, discount: float) -> Tensor:
-    """Discounted time to success of every row of a store, float32 [rows]; NaN where nobody labelled."""
-    out = torch.full((len(store.arrays["present"]),), torch.nan)
-    if "success" in store.arrays:
-        for number in store.arrays["labelled"].nonzero().flatten().tolist():
-            rows = slice(int(store.start[number]), int(store.start[number] + store.length[number]))
-            out[rows] = progress_to_success(store.arrays["success"][rows].float(), discount)
-    return out
-
-
 def train_perception(
     policy: nn.Module,
     store: ClipStore,
@@ -106,12 +96,13 @@ def train_perception(
     if not hasattr(policy, "policy_features") or not options.steps:
         return {}
     frames = Cloning(policy, store, episodes, mode)  # type: ignore[arg-type]
-    progress = progress_of_rows(store, discount)[frames.rows]
+    progress = frame_targets(store, 1, discount)[1][frames.rows]
     if fresh and hasattr(policy, "normalise"):
-        policy.normalise(frames.targets, frames.states)
+        policy.normalise(frames.targets, frames.states)  # type: ignore[operator]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
-        tasks = PerceptionTasks(policy, tuple(frames.targets.shape[1:])).to(next(policy.parameters()).device)
+        tasks = PerceptionTasks(policy, (store.spec.chunk, store.spec.action_dim))
+    tasks.to(next(policy.parameters()).device)
     tasks.normalise(frames.targets)
 
     def batch(step: int, generator: torch.Generator) -> TensorDict:

@@ -10,9 +10,12 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.episodes.clips import ClipSpec, ClipStore
+from envs.rng import step_generator
 from envs.simulators.base import Simulator
 from learners.training.fit import FitConfig, fit
 from learners.training.lora import low_rank
+
+_FIRST_FRAMES = 512  # of different episodes, by which a simulator learns how its cameras usually see
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,8 @@ def train_simulator(
     """
     if fresh:
         simulator.normalise(*units(store, episodes))
+        order = torch.randperm(len(episodes), generator=step_generator(options.seed, options.steps))
+        simulator.fit_camera_statistics(store.frames(store.start[episodes[order[:_FIRST_FRAMES]]]))
 
     def batch(step: int, generator: torch.Generator) -> TensorDict:
         chunks = 1 if step < config.single_chunk_fraction * options.steps else config.unroll

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-
 from scipy.spatial.transform import Rotation
 
 from envs.geometry.cameras import follow_wrists, on_plane, project, resize_intrinsics

@@ -19,16 +19,20 @@ def _urdf(path: Path) -> Path:
         for k in range(1, 8):
             name = f"link{k}_{side}"
             links.append(
-                f'<link name="{name}"><visual><geometry><mesh filename="nowhere/{name}.stl"/></geometry></visual></link>'
+                f'<link name="{name}"><visual><geometry><mesh filename="nowhere/{name}.stl"/></geometry>'
+                "</visual></link>"
             )
             offset = f"0 {y} 0" if k == 1 else "0 0 0.1"
             joints.append(
-                f'<joint name="joint{k}_{side}" type="revolute"><parent link="{before}"/><child link="{name}"/><origin xyz="{offset}" rpy="0 0 0"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>'
+                f'<joint name="joint{k}_{side}" type="revolute"><parent link="{before}"/>'
+                f'<child link="{name}"/><origin xyz="{offset}" rpy="0 0 0"/>'
+                '<axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>'
             )
             before = name
         links.append(f'<link name="tool_{side}"/>')
         joints.append(
-            f'<joint name="fixed_{side}" type="fixed"><parent link="{before}"/><child link="tool_{side}"/><origin xyz="0.05 0 0" rpy="0 0 0"/></joint>'
+            f'<joint name="fixed_{side}" type="fixed"><parent link="{before}"/>'
+            f'<child link="tool_{side}"/><origin xyz="0.05 0 0" rpy="0 0 0"/></joint>'
         )
     path.write_text(f'<robot name="two">{"".join(links)}{"".join(joints)}</robot>')
     return path

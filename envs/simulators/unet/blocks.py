@@ -6,10 +6,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from envs.conditioning import ActionVector
 from envs.precision import working_dtype
 from envs.simulators.unet.folding import fold
+from envs.specs import WorldSpec
 
 FOLD = 4  # pixels folded into channels, both ways
+_MAPS = 16  # channels of the action map before it is lifted
 
 
 class FilmBlock(nn.Module):
@@ -68,15 +71,74 @@ class Embed(nn.Module):
         return F.linear(folded, weight / 127.5, self.bias - weight.sum(1)).permute(0, 3, 1, 2)
 
 
-def output_head(width: int, chunk: int, maps: int) -> nn.Sequential:
-    """Output layer of one view; it starts from the last frame, for random output takes hundreds of steps to
+class ActionEncoder(nn.Module):
+    """A chunk of actions, and the robot's state, as a vector and as a coarse map.
+
+    The map lets the network tell where actions act even without pose maps.
+
+    Args:
+        spec: whose actions and states.
+        cond: numbers of the vector.
+        width: channels of the map.
+        cells: its rows and columns.
+    """
+
+    state_mean: Tensor
+    state_std: Tensor
+
+    def __init__(self, spec: WorldSpec, cond: int, width: int, cells: tuple[int, int]):
+        super().__init__()
+        self.vector = ActionVector(spec.embodiment)
+        self.register_buffer("state_mean", torch.zeros(spec.state_dim))
+        self.register_buffer("state_std", torch.ones(spec.state_dim))
+        size = spec.chunk * self.vector.size + spec.state_dim
+        self.layers = nn.Sequential(
+            nn.Linear(size, cond), nn.SiLU(), nn.Linear(cond, cond), nn.SiLU(), nn.Linear(cond, cond)
+        )
+        cut = nn.Unflatten(1, (_MAPS, *cells))
+        self.map = nn.Sequential(nn.SiLU(), nn.Linear(cond, _MAPS * cells[0] * cells[1]), cut)
+        self.lift = nn.Conv2d(_MAPS, width, 1)
+
+    def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
+        """Take units from data; arguments as of Simulator.normalise."""
+        self.vector.normalise(commands, moves)
+        self.state_mean.copy_(states.mean(0))
+        self.state_std.copy_(states.std(0).clamp(min=0.02))
+
+    def forward(self, commands: Tensor, now: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """[B, cond] and [B, width, *cells] of commands [B, K, A], the one in force [B, A] and the state [B,
+        S].
+        """
+        told = self.vector(commands, now).flatten(1)
+        joints = ((state - self.state_mean) / self.state_std).clamp(-5, 5)
+        cond = self.layers(torch.cat((told, joints), 1))
+        return cond, self.lift(self.map(cond))
+
+
+def output_head(width: int, chunk: int, maps: int, memory: int) -> nn.Sequential:
+    """Output maps of one view; it starts from the last frame, for random output takes hundreds of steps to
     unlearn.
+
+    Args:
+        width: channels that come in.
+        chunk: frames per chunk.
+        maps: per frame; the first are logits of the `memory` remembered frames, of which the last is the
+            newest.
     """
     last = nn.Conv2d(width, maps * chunk * FOLD**2, 1)
     bias = torch.zeros(chunk, maps, FOLD**2)
-    bias[:, 0] = 3.0
+    bias[:, memory - 1 : memory + 1] = 1.0
     nn.init.zeros_(last.weight)
     last.bias = nn.Parameter(bias.flatten())
+    return nn.Sequential(nn.GroupNorm(8, width), nn.SiLU(), last)
+
+
+def flow_head(width: int, chunk: int) -> nn.Sequential:
+    """Flow of one view, [B, 2 * chunk, h / 4, w / 4]: one vector per square and frame keeps it smooth."""
+    last = nn.Conv2d(width, 2 * chunk, 3, padding=1)
+    nn.init.zeros_(last.weight)
+    assert last.bias is not None
+    nn.init.zeros_(last.bias)
     return nn.Sequential(nn.GroupNorm(8, width), nn.SiLU(), last)
 
 

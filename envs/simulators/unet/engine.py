@@ -4,11 +4,11 @@ Each view is folded into channels (all but the main one at half the detail); mem
 where there
 are any, ride along as channels, and actions modulate every block. A pixel of the output is a soft choice
 between
-sources (warp, mask and residual, as in Finn et al. 2016): the last frame as it is, the first frame, the last
-frame
-moved by a predicted flow, and a drawn colour. What moves is then copied instead of remembered by the network,
-which
-is learned far faster than a residual.
+sources (warp, mask and residual, as in Finn et al. 2016): each remembered frame as it is, the last one moved
+by a
+predicted flow, and a drawn colour. What moves is then copied instead of repainted, which is learned far
+faster than a
+residual.
 """
 
 from __future__ import annotations
@@ -18,16 +18,25 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from envs.conditioning import ActionVector, render_ray_map
+from envs.conditioning import render_ray_map
 from envs.precision import working_dtype
 from envs.simulators.base import Simulator, to_bytes
 from envs.simulators.inputs import build_inputs
-from envs.simulators.unet.blocks import FOLD, Embed, FilmBlock, at_detail, output_head
-from envs.simulators.unet.compose import SOURCES, compose, motion_weight
+from envs.simulators.unet.blocks import (
+    FOLD,
+    ActionEncoder,
+    Embed,
+    FilmBlock,
+    at_detail,
+    flow_head,
+    output_head,
+)
+from envs.simulators.unet.compose import DRAWN, changed, compose
 from envs.simulators.unet.folding import unfold
 from envs.specs import WorldSpec
 
-_MAPS = SOURCES + 2 + 3  # logits of the sources, flow, drawn colour
+_COND = 256  # numbers of the action embedding
+_SQUARE = 50.0  # weight of squared errors beside absolute ones
 
 
 class UNetSimulator(Simulator):
@@ -36,11 +45,14 @@ class UNetSimulator(Simulator):
     Args:
         spec: what it shows; sizes must be multiples of 16.
         memory_frames: sparse memory frames, the first and the last among them.
-        width: channels at the fine level; the coarse level has twice as many.
+        width: channels at a quarter of the resolution, a multiple of 8; at an eighth twice as many.
         fine_blocks, deep_blocks: residual blocks per fine half, and in the bottleneck.
-        motion: extra loss weight of what moves or differs from the episode's first frame.
+        motion: extra loss weight of pixels that change, or look unusual for their place.
         side_weight: loss weight of every view but the main one.
     """
+
+    mean: Tensor
+    spread: Tensor
 
     def __init__(
         self,
@@ -59,30 +71,36 @@ class UNetSimulator(Simulator):
         self.motion = motion
         self.shrink = tuple(1 if view == main else 2 for view in range(spec.views))
         self.emphasis = tuple(1.0 if view == main else side_weight for view in range(spec.views))
-        wide, cond = 2 * width, 256
-        self.feature_shape = (wide + cond,)
-        self.vector = ActionVector(spec.embodiment)
-        self.actions = nn.Sequential(
-            nn.Linear(spec.chunk * self.vector.size, cond), nn.SiLU(), nn.Linear(cond, cond)
-        )
-        maps = memory_frames + spec.chunk if spec.pose_map else 0
-        pictures = 3 * (memory_frames + maps)
+        wide, cells = 2 * width, (spec.size[0] // (2 * FOLD), spec.size[1] // (2 * FOLD))
+        self.feature_shape = (wide + _COND,)
+        self.actions = ActionEncoder(spec, _COND, wide, cells)
+        pictures = 3 * (memory_frames + (memory_frames + spec.chunk if spec.pose_map else 0))
         self.embed = nn.ModuleList(Embed(pictures, width if s == 1 else wide, s) for s in self.shrink)
+        self.where = nn.Parameter(0.02 * torch.randn(1, width, 2 * cells[0], 2 * cells[1]))
         self.rays = nn.Conv2d(12 * spec.views, wide, 1) if spec.ray_map else None
         self.down = nn.Conv2d(width, wide, 2, stride=2)
         self.up = nn.Conv2d(wide, width * 4, 1)
         self.fuse = nn.Conv2d(2 * width, width, 1)
-        self.fine_in = nn.ModuleList(FilmBlock(width, cond) for _ in range(fine_blocks))
-        self.deep = nn.ModuleList(FilmBlock(wide, cond) for _ in range(deep_blocks))
-        self.fine_out = nn.ModuleList(FilmBlock(width, cond) for _ in range(fine_blocks))
-        self.heads = nn.ModuleList(
-            output_head(width if s == 1 else wide, spec.chunk, _MAPS) for s in self.shrink
-        )
+        self.fine_in = nn.ModuleList(FilmBlock(width, _COND) for _ in range(fine_blocks))
+        self.deep = nn.ModuleList(FilmBlock(wide, _COND) for _ in range(deep_blocks))
+        self.fine_out = nn.ModuleList(FilmBlock(width, _COND) for _ in range(fine_blocks))
+        self.maps = memory_frames + 1 + DRAWN  # logits of the sources, and drawn colour
+        widths = [width if s == 1 else wide for s in self.shrink]
+        self.heads = nn.ModuleList(output_head(w, spec.chunk, self.maps, memory_frames) for w in widths)
+        self.flows = nn.ModuleList(flow_head(w, spec.chunk) for w in widths)
+        self.register_buffer("mean", torch.zeros(spec.views, 3, *spec.size))
+        self.register_buffer("spread", torch.ones(spec.views, 3, *spec.size))
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
         """See Simulator.normalise."""
-        self.vector.normalise(commands, moves)
+        self.actions.normalise(commands, moves, states)
+
+    def fit_camera_statistics(self, frames: Tensor) -> None:
+        """See Simulator.fit_camera_statistics."""
+        spread, mean = torch.std_mean(frames.to(self.mean.device).float() / 255, 0)
+        self.mean.copy_(mean)
+        self.spread.copy_(spread)
 
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; features are the pooled bottleneck beside the action embedding."""
@@ -108,21 +126,19 @@ class UNetSimulator(Simulator):
 
     def _encode(self, inputs: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
         """Fine maps, coarse maps and the action embedding."""
-        memory, future = inputs["memory"], inputs["future"]
-        told = self.vector(future["commands"], inputs["now", "command"])
-        cond = self.actions(told.flatten(1))
+        memory, future, now = inputs["memory"], inputs["future"], inputs["now"]
+        cond, action_map = self.actions(future["commands"], now["command"], now["state"])
         parts = [memory["frames"], *([memory["pose_map"], future["pose_map"]] if self.spec.pose_map else [])]
-        fine: list[Tensor] = []
-        deep: list[Tensor] = [] if self.rays is None else [self.rays(self._rays(inputs))]
+        fine, deep = [self.where.expand(len(cond), -1, -1, -1)], [action_map]
+        if self.rays is not None:
+            deep.append(self.rays(self._rays(inputs)))
         for view, (shrink, embed) in enumerate(zip(self.shrink, self.embed, strict=True)):
             pictures = torch.cat([part[:, :, view].flatten(1, 2) for part in parts], 1)
             (fine if shrink == 1 else deep).append(embed(pictures))
-        x = torch.stack(fine).sum(0)
+        x = torch.stack(fine).sum(0).contiguous(memory_format=torch.channels_last)
         for block in self.fine_in:
             x = block(x, cond)
-        z = self.down(x)
-        for more in deep:
-            z = z + more
+        z = (self.down(x) + torch.stack(deep).sum(0)).contiguous(memory_format=torch.channels_last)
         for block in self.deep:
             z = block(z, cond)
         return x, z, cond
@@ -136,16 +152,20 @@ class UNetSimulator(Simulator):
         for block in self.fine_out:
             x = block(x, cond)
         views: list[Tensor] = []
-        frames = inputs["memory", "frames"]
-        for view, (shrink, head) in enumerate(zip(self.shrink, self.heads, strict=True)):
-            drawn = unfold(head(x if shrink == 1 else z).permute(0, 2, 3, 1).float(), FOLD)
-            first, last = (at_detail(frames[:, at, view], shrink) for at in (0, -1))
-            views.append(compose(drawn.unflatten(1, (self.spec.chunk, -1)), first, last))
+        chunk, frames = self.spec.chunk, inputs["memory", "frames"]
+        for view, (shrink, head, flow) in enumerate(zip(self.shrink, self.heads, self.flows, strict=True)):
+            y = x if shrink == 1 else z
+            drawn = unfold(head(y).permute(0, 2, 3, 1).float(), FOLD).unflatten(1, (chunk, self.maps))
+            moves = F.interpolate(flow(y).float(), scale_factor=FOLD, mode="bilinear").unflatten(
+                1, (chunk, 2)
+            )
+            known = at_detail(frames[:, :, view].flatten(0, 1), shrink).unflatten(0, frames.shape[:2])
+            views.append(compose(drawn, moves, known))
         return views, torch.cat([z.float().mean((-2, -1)), cond.float()], 1)
 
     def _rays(self, inputs: TensorDict) -> Tensor:
-        """Ray maps [B, V * 12, h, w] of the last remembered and the last future frame at the bottleneck's
-        resolution.
+        """Ray maps [B, V * 12, h, w] of the last remembered and the last future frame, at the bottleneck's
+        size.
         """
         # [B, V, 2, 4, 4]
         c2w = torch.stack([inputs["memory", "c2w"][:, -1], inputs["future", "c2w"][:, -1]], 2)
@@ -163,12 +183,8 @@ class UNetSimulator(Simulator):
         for number in range(chunks):
             part = slice(number * chunk, (number + 1) * chunk)
             views, _ = self.views(build_inputs(self.spec, clip, number, drawn))
-            truth = clip["future", "frames"][:, part]
-            losses.append(
-                self._error(
-                    views, truth, clip["memory", "frames"][:, number], clip["future", "valid"][:, part]
-                )
-            )
+            truth, valid = clip["future", "frames"][:, part], clip["future", "valid"][:, part]
+            losses.append(self._error(views, truth, clip["memory", "frames"][:, number, -1], valid))
             if number + 1 < chunks:
                 with torch.no_grad():
                     pictures = self._enlarge(views)
@@ -178,21 +194,32 @@ class UNetSimulator(Simulator):
             "last_chunk": losses[-1].detach(),
         }
 
-    def _error(self, views: list[Tensor], truth: Tensor, memory: Tensor, valid: Tensor) -> Tensor:
-        """Mean weighted error of a chunk's views against true frames uint8 [B, K, V, 3, H, W], where valid
-        [B, K].
+    def _error(self, views: list[Tensor], truth: Tensor, last: Tensor, valid: Tensor) -> Tensor:
+        """Mean weighted error of a chunk's views.
+
+        Args:
+            truth: uint8 [B, K, V, 3, H, W]; last: uint8 [B, V, 3, H, W], the frame before; valid: [B, K].
         """
         error, norm = torch.zeros((), device=truth.device), torch.zeros((), device=truth.device)
         for view, (frames, shrink, emphasis) in enumerate(
             zip(views, self.shrink, self.emphasis, strict=True)
         ):
             wanted = at_detail(truth[:, :, view].flatten(0, 1), shrink).unflatten(0, truth.shape[:2])
-            first, last = (at_detail(memory[:, at, view], shrink) for at in (0, -1))
-            weight = (
-                motion_weight(wanted, first, last, self.motion) * valid[:, :, None, None, None] * emphasis
-            )
+            moved = changed(wanted, at_detail(last[:, view], shrink))
+            weight = 1 + self.motion * torch.maximum(moved, self._unusual(wanted, view))
+            weight = weight * valid[:, :, None, None, None] * emphasis
             # An absolute error alone never leaves "nothing moves", the median of sparse change; squares do.
             gap = frames - wanted
-            error = error + ((gap.abs() + 50 * gap.square()) * weight).sum()
+            error = error + ((gap.abs() + _SQUARE * gap.square()) * weight).sum()
             norm = norm + 3 * weight.sum()
         return error / norm.clamp(min=1)
+
+    def _unusual(self, frames: Tensor, view: int) -> Tensor:
+        """How unusual pixels of frames [B, K, 3, h, w] look for their place, 0..1, [B, K, 1, h, w].
+
+        Small things are so more than large ones, and a blurred small thing costs little else.
+        """
+        shrink = self.shrink[view]
+        mean, spread = (F.avg_pool2d(value[view], shrink) for value in (self.mean, self.spread))
+        odd = ((frames - mean).abs() / (spread + 0.03)).amax(2, keepdim=True)
+        return ((odd - 1.5) / 3).clamp(0, 1)
