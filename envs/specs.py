@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torchrl.data.vla import ACTION_CHUNK_KEY, IMAGE_KEY, INSTRUCTION_KEY, STATE_KEY
 
-from envs.embodiment import Embodiment
+from envs.embodiment import ActionKind, Embodiment
 
 CHUNK = ACTION_CHUNK_KEY  # ("vla_action", "chunk") float32 [B, K, A]
 LOG_PROB = ("vla_action", "log_probs")  # float32 [B]
@@ -98,7 +98,8 @@ class WorldSpec:
                 f"simulator.pose_map and simulator.ray_map need calibrated cameras, and {bare} of"
                 f" {robot.robot} are not; set both to false"
             )
-        if self.pose_map and not robot.commands_poses:
+        # Joint commands without kinematics pass: recordings and clients may bring the poses along.
+        if self.pose_map and not robot.commands_poses and robot.action_kind is not ActionKind.JOINTS:
             raise ValueError(
                 f"simulator.pose_map needs end-effector poses, which the actions of {robot.robot} do not"
                 " say; set simulator.pose_map=false, or simulator.kinematics for joint commands"

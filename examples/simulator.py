@@ -60,6 +60,6 @@ class ShiftingWorld(Simulator):
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean squared error of the clip's first chunk."""
         drawn, _ = self._draw(build_inputs(self.spec, clip, 0))
-        part = clip["future"][:, : self.spec.chunk]
-        gap = (drawn - part["frames"].float() / 255).square().mean((2, 3, 4, 5)) * part["valid"]
-        return gap.sum() / part["valid"].sum().clamp(min=1), {}
+        truth, valid = (clip["future", name][:, : self.spec.chunk] for name in ("frames", "valid"))
+        gap = (drawn - truth.float() / 255).square().mean((2, 3, 4, 5)) * valid
+        return gap.sum() / valid.sum().clamp(min=1), {}

@@ -266,7 +266,11 @@ class _Builder:
 
     def _pose_maps(self, episode: Episode, c2w: NDArray[np.float32]) -> NDArray[np.uint8]:
         poses = self._poses(episode)
-        assert poses is not None and episode.intrinsic is not None  # WorldSpec has seen to both
+        if poses is None or episode.intrinsic is None:
+            raise EpisodeError(
+                f"{self.data.root}: episode {episode.seed} has no end_effector.command or no calibration, so"
+                " no pose map can be drawn; set simulator.pose_map=false, or simulator.kinematics for joints"
+            )
         maps = render_pose_map(
             poses,
             torch.from_numpy(c2w).transpose(0, 1),

@@ -10,6 +10,7 @@ from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import Transform
 
 from envs.conditioning import PoseMapStyle, end_effector_poses, render_pose_map
+from envs.embodiment import EmbodimentError
 from envs.geometry.cameras import follow_wrists
 from envs.geometry.kinematics import Kinematics
 from envs.specs import (
@@ -46,6 +47,11 @@ class ActionDecoding(Transform):
             *([CHUNK_C2W] if spec.embodiment.calibrated else []),
         ]
         super().__init__(in_keys_inv=keys, out_keys_inv=[CHUNK])
+        if spec.pose_map and not spec.embodiment.commands_poses:
+            raise EmbodimentError(
+                f"commands of {spec.embodiment.robot} do not say where its flanges will be, so an imagined"
+                " world cannot draw pose maps; name the robot's model by simulator.kinematics"
+            )
         self.spec, self.style, self.kinematics = spec, style, kinematics
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
