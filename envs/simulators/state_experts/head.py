@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from envs.conditioning import ActionVector
 from envs.simulators.base import Simulator
+from envs.simulators.row_linear import RowLinear
 from envs.simulators.state_experts.base import StateDecoder
 
 
@@ -34,11 +35,11 @@ class StateHead(StateDecoder):
         self.register_buffer("state_std", torch.ones(self.states))
         self.norm = nn.LayerNorm(features)
         size = features + (self.chunk + memory_frames) * self.vector.size + memory_frames * self.states
-        last = nn.Linear(width, self.chunk * self.states)
+        last = RowLinear(width, self.chunk * self.states)
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
         self.layers = nn.Sequential(
-            nn.Linear(size, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), last
+            RowLinear(size, width), nn.SiLU(), RowLinear(width, width), nn.SiLU(), last
         )
 
     def decode(

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from envs.conditioning import ActionVector
 from envs.precision import working_dtype
+from envs.simulators.row_linear import RowLinear
 from envs.simulators.unet.folding import fold
 from envs.specs import WorldSpec
 
@@ -28,7 +29,7 @@ class FilmBlock(nn.Module):
         self.norm1, self.norm2 = nn.GroupNorm(8, width), nn.GroupNorm(8, width)
         self.conv1 = nn.Conv2d(width, width, 3, padding=1)
         self.conv2 = nn.Conv2d(width, width, 3, padding=1)
-        self.film = nn.Linear(cond, 2 * width)
+        self.film = RowLinear(cond, 2 * width)
         nn.init.zeros_(self.conv2.weight)
         nn.init.zeros_(self.film.weight)
         nn.init.zeros_(self.film.bias)
@@ -93,10 +94,10 @@ class ActionEncoder(nn.Module):
         self.register_buffer("state_std", torch.ones(spec.state_dim))
         size = spec.chunk * self.vector.size + spec.state_dim
         self.layers = nn.Sequential(
-            nn.Linear(size, cond), nn.SiLU(), nn.Linear(cond, cond), nn.SiLU(), nn.Linear(cond, cond)
+            RowLinear(size, cond), nn.SiLU(), RowLinear(cond, cond), nn.SiLU(), RowLinear(cond, cond)
         )
         cut = nn.Unflatten(1, (_MAPS, *cells))
-        self.map = nn.Sequential(nn.SiLU(), nn.Linear(cond, _MAPS * cells[0] * cells[1]), cut)
+        self.map = nn.Sequential(nn.SiLU(), RowLinear(cond, _MAPS * cells[0] * cells[1]), cut)
         self.lift = nn.Conv2d(_MAPS, width, 1)
 
     def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
