@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,12 @@ def atomic(path: Path) -> Iterator[Path]:
     except BaseException:
         remove(part)
         raise
+
+
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file by `write`, which is called with the neighbour's path; see `atomic`."""
+    with atomic(path) as part:
+        write(part)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -73,8 +73,8 @@ def evaluate(words: Words) -> None:
     """success of a policy: worldloop evaluate policy=<stage|folder> world=physics|imagined experiment=...;
     one that needs no weights is a choice of configs/policy: policy=openpi policy.url=ws://...
     """
+    from pipeline.commands.evaluate import evaluate_policy
     from pipeline.config import choices
-    from pipeline.evaluate import evaluate_policy
 
     own, rest = {"weights": "", "world": "physics"}, []
     for word in words:
@@ -91,7 +91,7 @@ def evaluate(words: Words) -> None:
 
 def controls(words: Words) -> None:
     """whose gain is it: beside a finished run the loop without RL iterations, RL in physics, filtered BC"""
-    from pipeline.controls import run_controls, table_text
+    from pipeline.commands.controls import run_controls, table_text
     from pipeline.track import tracking
 
     cfg, root = _prepared(words)
@@ -115,7 +115,7 @@ def finetune(words: Words) -> None:
     """train a simulator on any LeRobot data: worldloop finetune simulator=gesim simulator.checkpoint=<folder>
     finetune.data=[<folder>]
     """
-    from pipeline.finetune import build_finetune
+    from pipeline.commands.finetune import build_finetune
     from pipeline.track import tracking
 
     cfg, root = _prepared(words)
@@ -130,7 +130,7 @@ def serve(words: Words) -> None:
     simulator.checkpoint=<folder>
     """
     from actors.serving.app import serve as run_server
-    from pipeline.serving import build_session_host
+    from pipeline.commands.serving import build_session_host
 
     cfg, root = _prepared(words)
     host, config = build_session_host(cfg, root)
@@ -147,7 +147,7 @@ def convert(words: Words) -> None:
     """GE-Sim, AgiBot or Bridge recordings to LeRobot v3.0, and LeRobot back to GE-Sim 2.0 bundles: worldloop
     convert SRC DST [frames=N] [size=[H,W]]
     """
-    from pipeline.convert import convert as write
+    from pipeline.commands.convert import convert as write
 
     usage = "say from where to where: worldloop convert SRC DST [frames=N] [size=[H,W]]"
     paths, cut, _ = _source_and_cut(words, usage)
@@ -159,7 +159,7 @@ def inspect(words: Words) -> None:
     [frames=N] [tool_offset=0.15]
     """
     from envs.conditioning import PoseMapStyle
-    from pipeline.convert import inspect as draw
+    from pipeline.commands.convert import inspect as draw
 
     usage = "say from where to where: worldloop inspect SRC DST [frames=N] [size=[H,W]] [tool_offset=0.15]"
     paths, cut, own = _source_and_cut(words, usage)
@@ -193,8 +193,8 @@ def verify(words: Words) -> None:
 
 def submit(words: Words) -> None:
     """run a command on a Ray cluster: worldloop submit http://head:8265 rl launch=ray launch.actors=8"""
+    from pipeline.commands.submit import submit as send
     from pipeline.config import load_config
-    from pipeline.submit import submit as send
 
     if not words or not words[0].startswith("http"):
         raise ConfigError(
@@ -233,7 +233,7 @@ def config(words: Words) -> None:
 
 def doctor(words: Words) -> None:
     """say what this machine has and what is missing"""
-    from pipeline.doctor import examine
+    from pipeline.commands.doctor import examine
 
     sys.exit(examine())
 

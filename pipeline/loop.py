@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pipeline.graph import Graph
-from pipeline.stage_workers import learners_of
+from pipeline.graph.graph import Graph
+from pipeline.graph.workers import learners_of
 from pipeline.stages import collect, imitation, prove, rl, show, world
 
 Cfg = Mapping[str, Any]

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from envs.episodes.episode import EpisodeError
-from envs.episodes.files import write_atomically
 from envs.episodes.formats.lerobot_files import read_info
+from envs.files import write_atomically
 
 if TYPE_CHECKING:
     from envs.episodes.clips import ClipStore

@@ -28,7 +28,6 @@ WORLD_OPTIONS = (
     "shared_noise",
     "bf16",
     "state_expert",
-    "tokenizer",
 )
 
 

@@ -7,7 +7,7 @@ parameters,
 gradients and optimiser state in shards, gathers what a forward pass needs and averages gradients. So results
 depend on
 the number of microbatches, not on who computes them. Worker processes are started by
-pipeline/stage_workers.py.
+pipeline/graph/workers.py.
 """
 
 from __future__ import annotations

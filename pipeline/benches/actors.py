@@ -18,7 +18,7 @@ from actors.policies.contract import freeze_perception
 from actors.rollouts.host import Job, trained_weights
 from actors.rollouts.recipe import Recipe, build_host
 from envs.specs import TEXT_BYTES
-from pipeline.demo_world import demo_recipe
+from pipeline.commands.demo_world import demo_recipe
 
 _EPISODES, _JOBS = 32, 6
 

@@ -13,7 +13,7 @@ from actors.factory import build_simulator, open_clips, prepare_process
 from envs.physics.pool import TaskPool
 from envs.precision import mixed_precision
 from envs.simulators.replay import future_of
-from pipeline.demo_world import demo_recipe
+from pipeline.commands.demo_world import demo_recipe
 
 _CHUNKS = 8  # steps of a simulator that are timed
 

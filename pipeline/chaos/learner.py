@@ -20,8 +20,8 @@ from actors.fleets.launch import build_fleet
 from actors.fleets.ray_fleet import RayFleet
 from actors.policies.contract import freeze_perception
 from learners.rl.loop import train_rl
+from pipeline.commands.demo_world import demo_recipe
 from pipeline.config import load_config
-from pipeline.demo_world import demo_recipe
 from pipeline.stages.given import rl_options
 
 

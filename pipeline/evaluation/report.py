@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from pipeline.evaluation.media import inline, plot, smooth
 from pipeline.evaluation.result import manifests
 from pipeline.evaluation.statistics import rate
-from pipeline.stage import Inputs
+from pipeline.graph.stage import Inputs
 from pipeline.track import read_metrics
 
 _TEMPLATE = "report.html.j2"

@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
-from pipeline.artefact import read_manifest
 from pipeline.evaluation.statistics import mcnemar, rate
-from pipeline.stage import Inputs
+from pipeline.graph.artefact import read_manifest
+from pipeline.graph.stage import Inputs
 
 _ENTRY = ("successes", "episodes", "low", "high")
 

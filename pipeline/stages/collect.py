@@ -21,9 +21,9 @@ from envs.episodes.write_behind import WriteBehind
 from envs.files import write_text
 from envs.physics.worker import Track
 from envs.targets import ConfigError
-from pipeline.code_version import digest
 from pipeline.evaluation.statistics import rate_entry
-from pipeline.stage import Inputs, stage
+from pipeline.graph.code_version import digest
+from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.given import DATASETS, PHYSICS, ROBOT, Cfg
 from pipeline.stages.seeds import Purpose, episode_seeds
 

@@ -9,8 +9,8 @@ import torch
 
 from actors.factory import build_policy, prepare_process
 from learners.stages.imitation import Cloning, train_imitation
-from pipeline.artefact import save_weights
-from pipeline.stage import Inputs, Place, stage
+from pipeline.graph.artefact import save_weights
+from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import (
     POLICY,
     Cfg,

@@ -11,8 +11,8 @@ from actors.factory import build_simulator, build_state_decoder, open_clips, pre
 from envs.targets import options
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
-from pipeline.artefact import save_weights
-from pipeline.stage import Inputs, Place, stage
+from pipeline.graph.artefact import save_weights
+from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import Cfg, fit_options
 
 _READS = ("seed", "task", "simulator", "microbatches")

@@ -17,7 +17,7 @@ from envs.targets import ConfigError, options
 from envs.world import InitialStates
 from learners.rl.algorithm import RLConfig
 from learners.training.fit import FitConfig
-from pipeline.stage import Inputs
+from pipeline.graph.stage import Inputs
 
 Cfg = Mapping[str, Any]
 

@@ -11,8 +11,8 @@ from actors.factory import build_policy, build_simulator, prepare_process
 from learners.stages.generated import generated_frames
 from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.perception import train_perception
-from pipeline.artefact import save_weights
-from pipeline.stage import Inputs, Place, stage
+from pipeline.graph.artefact import save_weights
+from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import (
     POLICY,
     WORLD,

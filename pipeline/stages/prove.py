@@ -21,7 +21,7 @@ from envs.simulators.replay import replay
 from pipeline.evaluation import measurement
 from pipeline.evaluation.judging import episode_success, judge_table
 from pipeline.evaluation.statistics import rate_entry
-from pipeline.stage import Inputs, Place, stage
+from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import PHYSICS, WORLD, Cfg, load_world, open_store
 from pipeline.stages.seeds import Purpose, episode_seeds
 

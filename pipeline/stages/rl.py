@@ -16,8 +16,9 @@ from learners.rl.dataset_rollout import dataset_rollout
 from learners.rl.loop import train_rl
 from learners.stages.imitation import Cloning
 from learners.training.parallel import leads
-from pipeline.artefact import save_weights
-from pipeline.stage import Inputs, Place, stage
+from pipeline.graph.artefact import save_weights
+from pipeline.graph.stage import Inputs, Place, stage
+from pipeline.graph.view import ConfigView
 from pipeline.stages.given import (
     PHYSICS,
     WORLD,
@@ -30,7 +31,6 @@ from pipeline.stages.given import (
     successful_episodes,
 )
 from pipeline.stages.seeds import Purpose, episode_seeds
-from pipeline.view import ConfigView
 
 LEARNING = ("policy", "algorithm", "rl", "imitation", "microbatches")
 

@@ -19,7 +19,7 @@ from envs.simulators.replay import replay
 from pipeline.evaluation.media import paired_frames, paired_video, write_gif
 from pipeline.evaluation.report import build_report
 from pipeline.evaluation.result import build_result
-from pipeline.stage import Inputs, stage
+from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.collect import run_recorded
 from pipeline.stages.given import EVERYTHING, WORLD, Cfg, open_store
 from pipeline.stages.seeds import Purpose, episode_seeds

@@ -16,9 +16,9 @@ from learners.stages.judge import calibrate, judge_recordings, train_judge
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
 from learners.stages.tokenizer import train_tokenizer
-from pipeline.artefact import save_weights
 from pipeline.evaluation.judging import episode_success, labelled
-from pipeline.stage import Inputs, Place, stage
+from pipeline.graph.artefact import save_weights
+from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import (
     WORLD,
     Cfg,

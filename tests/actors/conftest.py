@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from actors.rollouts.recipe import Recipe
+from pipeline.commands.demo_world import demo_recipe
 from pipeline.config import load_config
-from pipeline.demo_world import demo_recipe
 
 
 @pytest.fixture(scope="session")

@@ -25,8 +25,8 @@ from actors.fleets.launch import build_fleet
 from actors.fleets.ray_fleet import RayFleet
 from actors.rollouts.host import Job, trained_weights
 from actors.rollouts.recipe import Recipe
+from pipeline.commands.submit import entrypoint
 from pipeline.config import load_config
-from pipeline.submit import entrypoint
 
 
 def test_a_lost_node_costs_no_job(recipe: Recipe) -> None:

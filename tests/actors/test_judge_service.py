@@ -18,7 +18,7 @@ from actors.rollouts.recipe import Recipe, build_host
 from actors.serving.judge_service import JudgeClient, ServiceConfig, start_service
 from envs.specs import EPISODE, JUDGE_STATUS, SUCCESS, Status
 from learners.rl.algorithm import first_episode
-from pipeline.artefact import save_weights
+from pipeline.graph.artefact import save_weights
 
 OPTIONS = ServiceConfig(batch=8, wait_ms=20.0, cache=1000, budget=40, deadline=20.0, retries=1, pause=0.1)
 

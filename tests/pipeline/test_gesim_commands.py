@@ -13,9 +13,9 @@ from envs.simulators.dit.network import DiTShape
 from pipeline import cli
 from pipeline.benches.gesim import FULL
 from pipeline.benches.gesim_floor import count_flops
+from pipeline.commands.finetune import build_finetune
+from pipeline.commands.serving import build_session_host
 from pipeline.config import load_config
-from pipeline.finetune import build_finetune
-from pipeline.serving import build_session_host
 from tests.envs.gesim_tiny import write_checkpoint
 
 WORDS = [

@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
-from pipeline import code_version
-from pipeline.artefact import read_manifest
-from pipeline.code_version import code_of
-from pipeline.graph import Graph
-from pipeline.stage import Inputs, Stage, stage
-from pipeline.view import ConfigView, UndeclaredRead
+from pipeline.graph import code_version
+from pipeline.graph.artefact import read_manifest
+from pipeline.graph.code_version import code_of
+from pipeline.graph.graph import Graph
+from pipeline.graph.stage import Inputs, Stage, stage
+from pipeline.graph.view import ConfigView, UndeclaredRead
 
 LOG: list[str] = []
 CFG: dict[str, Any] = {"x": 1, "y": {"first": 2, "second": 3}, "other": 4, "launch": {"device": "cpu"}}
@@ -207,7 +207,7 @@ def test_many_rounds_are_keyed_and_followed_at_once(tmp_path: Path) -> None:
 
 
 def test_a_stage_is_found_by_its_path() -> None:
-    from pipeline.stage import find_stage
+    from pipeline.graph.stage import find_stage
     from pipeline.stages.collect import deploy
 
     assert isinstance(deploy, Stage) and find_stage(deploy.path) is deploy

@@ -13,11 +13,11 @@ import torch
 from safetensors.torch import load_file
 
 from envs.targets import ConfigError
+from pipeline.commands.demo_world import demo_recipe
 from pipeline.config import load_config
-from pipeline.demo_world import demo_recipe
+from pipeline.graph.stage import Inputs
+from pipeline.graph.workers import run_stage
 from pipeline.loop import build_loop
-from pipeline.stage import Inputs
-from pipeline.stage_workers import run_stage
 from pipeline.stages import prove, rl
 
 WORDS = [

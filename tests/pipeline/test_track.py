@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from pipeline import track
-from pipeline.graph import Graph
-from pipeline.stage import Inputs, stage
+from pipeline.graph.graph import Graph
+from pipeline.graph.stage import Inputs, stage
+from pipeline.graph.view import ConfigView
 from pipeline.track import WandbTracker, tracking
-from pipeline.view import ConfigView
 
 CFG: dict[str, Any] = {
     "name": "tiny",

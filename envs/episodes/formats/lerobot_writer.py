@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from envs.embodiment import IMAGE_PREFIX, Embodiment, EmbodimentError
 from envs.episodes.episode import Episode, EpisodeError
-from envs.episodes.files import write_atomically
 from envs.episodes.formats import lerobot_columns as names
 from envs.episodes.formats.lerobot_columns import (
     CHUNK_FILES,
@@ -38,6 +37,7 @@ from envs.episodes.formats.lerobot_files import open_parquet, read_episode_rows,
 from envs.episodes.formats.lerobot_robot import agreed_robot
 from envs.episodes.formats.lerobot_stats import column_stats, merge_stats, picture_stats
 from envs.episodes.video import write_video
+from envs.files import write_atomically
 
 _JOURNAL = "meta/worldloop.writing.json"
 _FILE = re.compile(r"chunk-(\d+)/file-(\d+)\.")

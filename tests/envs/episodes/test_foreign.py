@@ -20,7 +20,7 @@ from envs.episodes.formats.foreign import Cut, read_foreign
 from envs.episodes.formats.gesim import GENIE, GENIE_POSES, write_bundle
 from envs.episodes.video import write_video
 from envs.specs import WorldSpec
-from pipeline.convert import convert, inspect
+from pipeline.commands.convert import convert, inspect
 from tests.moving_square import moving_square
 
 

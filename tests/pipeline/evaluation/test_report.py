@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.evaluation.report import build_report
 from pipeline.evaluation.result import verdict
-from pipeline.stage import Inputs
+from pipeline.graph.stage import Inputs
 
 
 def entry(successes: int) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from pipeline.view import ConfigView
+from pipeline.graph.view import ConfigView
 
 Result = Mapping[str, Any]
 

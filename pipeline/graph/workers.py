@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from envs.files import write_text
 from envs.targets import ConfigError
-from pipeline.stage import Inputs, Place, Stage, find_stage
+from pipeline.graph.stage import Inputs, Place, Stage, find_stage
 
 
 @dataclass(frozen=True)

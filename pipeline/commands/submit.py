@@ -60,7 +60,7 @@ def submit(address: str, words: Sequence[str]) -> str:
         client = JobSubmissionClient(address)
         job = client.submit_job(
             entrypoint=command,
-            runtime_env={"working_dir": str(Path(__file__).resolve().parent.parent), "excludes": EXCLUDES},
+            runtime_env={"working_dir": str(Path(__file__).resolve().parents[2]), "excludes": EXCLUDES},
         )
     except (ConnectionError, RuntimeError, ValueError) as error:
         raise ConfigError(

@@ -23,7 +23,7 @@ from actors.factory import (
 )
 from actors.rollouts.recipe import Recipe
 from envs.episodes import Episode, LeRobotWriter
-from pipeline.artefact import save_weights
+from pipeline.graph.artefact import save_weights
 
 
 def demo_recipe(cfg: Mapping[str, Any], folder: Path, episodes: int, starts: int = 16) -> Recipe:

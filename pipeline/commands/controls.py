@@ -21,7 +21,7 @@ from envs.targets import ConfigError
 from pipeline.evaluation.report import build_report
 from pipeline.evaluation.result import outcomes
 from pipeline.evaluation.statistics import mcnemar, rate, rate_entry, rate_line
-from pipeline.graph import Graph
+from pipeline.graph.graph import Graph
 from pipeline.loop import build_loop, has_physics, last_round, of_round
 from pipeline.stages import controls as only_here
 from pipeline.stages import prove, rl

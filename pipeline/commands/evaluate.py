@@ -10,7 +10,7 @@ from actors.factory import build_physics, build_policy
 from actors.rollouts.evaluate import evaluate
 from envs.targets import ConfigError
 from pipeline.evaluation.statistics import rate_entry, rate_line
-from pipeline.graph import Graph
+from pipeline.graph.graph import Graph
 from pipeline.loop import build_loop
 from pipeline.stages.given import load_world, open_store
 from pipeline.stages.seeds import Purpose, episode_seeds

@@ -13,12 +13,12 @@ from typing import Any
 from tqdm import tqdm
 
 from envs.files import write_text
-from pipeline.artefact import Identity, finish, read_manifest
-from pipeline.code_version import code_of, digest
-from pipeline.stage import Inputs, Stage
-from pipeline.stage_workers import run_stage
+from pipeline.graph.artefact import Identity, finish, read_manifest
+from pipeline.graph.code_version import code_of, digest
+from pipeline.graph.stage import Inputs, Stage
+from pipeline.graph.view import ConfigView, sections
+from pipeline.graph.workers import run_stage
 from pipeline.track import NullTracker, Tracker
-from pipeline.view import ConfigView, sections
 
 Names = Mapping[str, str | Sequence[str] | None]
 

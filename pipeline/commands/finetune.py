@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from envs.targets import ConfigError
-from pipeline.graph import Graph
+from pipeline.graph.graph import Graph
 from pipeline.stages import finetune
 from pipeline.stages.collect import fingerprint
 

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("envs", "actors", "learners", "pipeline")  # packages of this repository
 _INSTALLED = ("site-packages", "dist-packages")
 

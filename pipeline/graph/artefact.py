@@ -21,7 +21,7 @@ from torch import nn
 
 from envs.files import atomic, write_text
 from learners.training.parallel import leads
-from pipeline.code_version import digest
+from pipeline.graph.code_version import digest
 
 _PACKAGES = ("worldloop", "torch", "torchrl", "tensordict", "numpy", "mujoco")
 
@@ -45,7 +45,7 @@ def versions() -> dict[str, str]:
             out[package] = version(package)
         except PackageNotFoundError:
             out[package] = "not installed"
-    root = Path(__file__).resolve().parent.parent
+    root = Path(__file__).resolve().parents[2]
     commit = subprocess.run(
         ["git", "-C", str(root), "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
     )

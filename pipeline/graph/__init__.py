@@ -1,0 +1,1 @@
+"""The stage graph: what a stage is, what it may read, when it runs again."""
