@@ -144,7 +144,7 @@ def run_recorded(cfg: Cfg, policy: Any, seeds: list[int], stochastic: bool = Tru
         env.close()
 
 
-@stage(reads=("task",))
+@stage(reads=ROBOT)
 def recordings(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Recorded data sets in place of physics; nothing is copied.
 

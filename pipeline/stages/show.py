@@ -47,11 +47,15 @@ def videos(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 @stage(reads=("seed", "task", "simulator", "measure.videos"))
 def replays(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """Paired videos without physics: held-out recordings, and their actions in the simulator."""
+    """Paired videos without physics: recordings, held-out ones if there are any, and their actions in the
+    simulator.
+    """
     prepare_process(cfg["seed"])
     simulator, store = build_simulator(cfg, inputs.weights("simulator")), open_store(cfg, inputs)
-    episodes = store.split("held_out")[: cfg["measure"]["videos"]]
-    return {"videos": _paired(cfg, folder / "media", simulator, store, episodes, "held-out")}
+    held = store.split("held_out")
+    label, episodes = ("held-out", held) if len(held) else ("learned-from", torch.arange(len(store)))
+    chosen = episodes[: cfg["measure"]["videos"]]
+    return {"videos": _paired(cfg, folder / "media", simulator, store, chosen, label)}
 
 
 def _paired(
