@@ -1,7 +1,7 @@
 """Your own task suite: a dot that moves to the square which the words name.
 
-    worldloop run experiment=smoke task=push task.suite='{_target_: examples.task_suite.DotToSquare}' \
-        task.name=reach task.size=[32,32] task.mode=absolute
+    worldloop run experiment=smoke '~task' '+task={suite: {_target_: examples.task_suite.DotToSquare}, \
+        name: reach, size: [32,32], chunk: 4, horizon: 12, mode: absolute}'
 """
 
 from __future__ import annotations

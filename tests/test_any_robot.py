@@ -95,8 +95,10 @@ def test_one_arm_from_recordings_with_cameras_of_different_sizes(tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_somebody_elses_task_simulator_policy_and_algorithm(tmp_path: Path) -> None:
-    suite = ("task.suite={_target_: examples.task_suite.DotToSquare}", "task.name=reach", "task.size=[32,32]")
-    policy = ("~policy", "+policy={_target_: examples.policy.CoarsePolicy, width: 32, std: 0.3}")
-    worldloop("rl", tmp_path, *suite, *policy, "task.mode=absolute", "task.chunk=4", "task.horizon=12")
+def test_somebody_elses_task_policy_and_algorithm(tmp_path: Path) -> None:
+    suite = "suite: {_target_: examples.task_suite.DotToSquare}"
+    task = f"+task={{{suite}, name: reach, size: [32,32], chunk: 4, horizon: 12, mode: absolute}}"
+    policy = "+policy={_target_: examples.policy.CoarsePolicy, width: 32, std: 0.3}"
+    algorithm = "+algorithm={_target_: examples.algorithm.Reinforce, entropy: 0.0}"
+    worldloop("rl", tmp_path, "~task", task, "~policy", policy, "~algorithm", algorithm)
     assert robot_of(tmp_path).robot == "dot"

@@ -214,6 +214,8 @@ def _from_nothing(spec: WorldSpec, net: dict[str, Any], vae: dict[str, Any]) -> 
     }
     try:
         trunk = MultiViewDiT(DiTShape(**{"views": spec.views, **sizes}))
-        return trunk, WanCodec(AutoencoderKLWan(**vae))
+        # Configs hand lists over as tuples, and diffusers adds lists to its own.
+        lists = {key: list(value) if isinstance(value, tuple) else value for key, value in vae.items()}
+        return trunk, WanCodec(AutoencoderKLWan(**lists))
     except TypeError as error:
         raise ValueError(f"simulator.scratch.net or simulator.scratch.vae: {error}") from error
