@@ -6,9 +6,6 @@ independence and exact resumption rest on.
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterable
-
 import torch
 
 _MASK = 0x7FFF_FFFF_FFFF
@@ -37,9 +34,3 @@ def update_seed(seed: int, iteration: int) -> int:
 def sampling_seed(seed: int, iteration: int, shard: int) -> int:
     """Seed of a policy's exploration in one job of an RL iteration."""
     return seed * 7_919 + iteration + shard * 1_000_000_007
-
-
-def seed_of(numbers: Iterable[int]) -> int:
-    """One seed of many numbers, for streams that go on where a queue of given ones ends."""
-    digest = hashlib.blake2b(",".join(str(int(number)) for number in numbers).encode(), digest_size=6)
-    return int.from_bytes(digest.digest(), "big") & _MASK

@@ -51,7 +51,7 @@ class Simulator(nn.Module):
     @property
     def device(self) -> torch.device:
         """Where its tensors are; the CPU, if it has none."""
-        tensor = next((value for value in (*self.parameters(), *self.buffers())), None)
+        tensor = next(iter((*self.parameters(), *self.buffers())), None)
         return torch.device("cpu") if tensor is None else tensor.device
 
     # -- what an engine gives
@@ -137,10 +137,6 @@ class Simulator(nn.Module):
         inputs = memory.build_inputs(state, self.recall(state, future), future)
         frames, features = self.predict(inputs)
         return frames, features.float(), memory.append(state, frames, future)
-
-    def __repr__(self) -> str:
-        """Class and size; the modules in it would fill a screen."""
-        return f"{type(self).__name__}({sum(p.numel() for p in self.parameters()):,} parameters)"
 
 
 def to_bytes(frames: Tensor) -> Tensor:
