@@ -67,12 +67,10 @@ def prepare_process(seed: int, threads: int = 0) -> None:
     """Settings every process needs before heavy work: seeds, threads, and an allocator that keeps its memory.
 
     Video batches are tens of megabytes; glibc would map and unmap them at every operation, and page faults
-    then
-    cost a third more time per training step (8.4 ms a sample with this, 11.3 without).
+    then cost a third more time per training step (8.4 ms a sample with this, 11.3 without).
     """
     # Softmax tails leave gradients too small for normal floats, on which Intel CPUs are ten times slower;
-    # threads
-    # started later inherit the setting.
+    # threads started later inherit the setting.
     torch.set_flush_denormal(True)
     torch.manual_seed(seed)
     # Processes that train together on a machine share its cores; Ray Train and torchrun say how many they

@@ -26,9 +26,8 @@ class ActionKind(str, Enum):
     """What the numbers of an action are.
 
     END_EFFECTOR: per arm a flange pose [x, y, z, roll, pitch, yaw] in metres and radians (or fewer of them),
-    and a gripper.
-    JOINTS: per arm joint positions in radians, and a gripper.
-    OTHER: numbers whose meaning is the robot's own affair.
+    and a gripper. JOINTS: per arm joint positions in radians, and a gripper. OTHER: numbers whose meaning is
+    the robot's own affair.
     """
 
     END_EFFECTOR = "end_effector"

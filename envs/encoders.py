@@ -31,8 +31,7 @@ class MultiViewEncoder(nn.Module):
     """One convolutional trunk for all views; each view has its own embedding and its own key-points.
 
     It says three things of every view: where soft key-points are (spatial soft-argmax, Finn et al. 2016),
-    what the
-    features look like there, and a coarse grid of features.
+    what the features look like there, and a coarse grid of features.
 
     Args:
         spec: what the world shows.

@@ -2,8 +2,7 @@
 rewards.
 
 Keys are those of TorchRL's VLA stack (torchrl.data.vla) where one exists, so that its policies and losses
-plug in.
-B is a batch of episodes, K the actions of a chunk, V cameras, A numbers of an action, S of a state
+plug in. B is a batch of episodes, K the actions of a chunk, V cameras, A numbers of an action, S of a state
 (embodiment.py).
 """
 
@@ -59,8 +58,7 @@ class ActionMode(str, Enum):
     """How the numbers of a policy's chunk are meant.
 
     RELATIVE: offsets from the command in force when the chunk begins, number by number; for absolute actions
-    only.
-    ABSOLUTE: commands as the robot takes them (for a robot whose actions are deltas: those deltas).
+    only. ABSOLUTE: commands as the robot takes them (for a robot whose actions are deltas: those deltas).
     """
 
     RELATIVE = "relative"

@@ -1,8 +1,8 @@
 """WorldEnv: any Simulator behind the contract of PhysicsEnv. Frames are generated in `_step`.
 
 The bare environment takes commands with their conditioning (pose maps, cameras) and knows neither the robot's
-states
-nor rewards; the transforms of envs/transforms add them: TransformedEnv(WorldEnv(...), world_transforms(...)).
+states nor rewards; the transforms of envs/transforms add them: TransformedEnv(WorldEnv(...),
+world_transforms(...)).
 """
 
 from __future__ import annotations
@@ -62,10 +62,9 @@ class WorldEnv(ChunkedEnv):
     """A batch of imagined episodes.
 
     An episode's seed says where it begins (seed modulo the number of initial states) and, with the chunk's
-    index, all
-    its noise: it is the same in any slot, batch or process. Seeds that differ by a multiple of the number of
-    initial
-    states begin alike and differ in noise, unless `shared_noise` makes them alike in that too.
+    index, all its noise: it is the same in any slot, batch or process. Seeds that differ by a multiple of the
+    number of initial states begin alike and differ in noise, unless `shared_noise` makes them alike in that
+    too.
 
     Args:
         simulator: the learned world, already on its device.

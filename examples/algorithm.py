@@ -1,8 +1,7 @@
 """Your own algorithm: REINFORCE with the batch's mean return as its baseline.
 
 algorithm:
-  _target_: examples.algorithm.Reinforce
-  entropy: 0.0
+  _target_: examples.algorithm.Reinforce entropy: 0.0
 """
 
 from __future__ import annotations

@@ -2,9 +2,7 @@
 words.
 
     policy:
-      _target_: examples.policy.CoarsePolicy
-      width: 128
-      std: 0.3
+      _target_: examples.policy.CoarsePolicy width: 128 std: 0.3
 """
 
 from __future__ import annotations

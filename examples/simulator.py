@@ -1,8 +1,7 @@
 """Your own simulator: the last frame, moved as one by what the actions say.
 
 simulator:
-  _target_: examples.simulator.ShiftingWorld
-  memory_frames: 1
+  _target_: examples.simulator.ShiftingWorld memory_frames: 1
 """
 
 from __future__ import annotations

@@ -101,9 +101,7 @@ def controls(words: Words) -> None:
 
 
 def compare(words: Words) -> None:
-    """finished runs side by side, as a Markdown table: worldloop compare runs/quickstart
-    runs/quickstart_dit
-    """
+    """finished runs side by side as Markdown: worldloop compare runs/quickstart runs/quickstart_dit"""
     from pipeline.evaluation.compare import compare as table
 
     if not words:

@@ -25,8 +25,7 @@ class Plan:
     allowed).
 
     Strategies: "collocated" packs all roles on as few nodes as possible, "disaggregated" spreads them,
-    "hybrid" keeps
-    learner and judge together and spreads the actors.
+    "hybrid" keeps learner and judge together and spreads the actors.
     """
 
     strategy: str

@@ -47,8 +47,7 @@ class EpisodeLedger:
     """Episodes and why they were lost; `asked == learned + sum(dropped.values())` once a run has ended.
 
     Episodes of a job that is run again after its host died count in `rerun`: they were begun, nobody learned
-    from
-    them, and the same episodes came later.
+    from them, and the same episodes came later.
     """
 
     asked: int = 0

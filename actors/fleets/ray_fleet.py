@@ -1,17 +1,13 @@
 """Hosts as Ray actors under a supervisor of our own.
 
 Why not TorchRL's RayCollector: it does not survive faults. In sync mode one dead actor shuts all of it down;
-with
-max_restarts every weight sync after a restart fails; with a replay buffer its thread dies unnoticed and the
-learner
-waits for ever. Here a job is a pure function of weights, seeds and exploration seed (rollouts.py), so a host
-that died
-is replaced and its job run again by anybody, with the same result; TorchRL's Collector works inside each
-host.
+with max_restarts every weight sync after a restart fails; with a replay buffer its thread dies unnoticed and
+the learner waits for ever. Here a job is a pure function of weights, seeds and exploration seed
+(rollouts.py), so a host that died is replaced and its job run again by anybody, with the same result;
+TorchRL's Collector works inside each host.
 
 The supervisor is one thread in the learner's process. It hands out jobs, watches deadlines, rebuilds what
-died and
-keeps what came back; the learner only submits and takes.
+died and keeps what came back; the learner only submits and takes.
 """
 
 from __future__ import annotations

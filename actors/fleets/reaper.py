@@ -1,8 +1,7 @@
 """Ends what a local Ray leaves running when the process that started it is killed.
 
 Ray's own processes die with their driver, but two of its agents do not always notice. `reap_after_me` starts
-a small
-process that waits for this one's end and then ends the agents; after a clean exit it finds none.
+a small process that waits for this one's end and then ends the agents; after a clean exit it finds none.
 """
 
 from __future__ import annotations

@@ -34,9 +34,7 @@ class Head(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def normalise(self, chunks: Tensor, varies: Tensor) -> None:
-        """Set units from demonstrated chunks [N, K, A]; numbers that do not vary (bool [A]) become
-        constants.
-        """
+        """Set units from demonstrated chunks [N, K, A]; what does not vary (bool [A]) becomes constant."""
 
     @abc.abstractmethod
     def target(self, chunks: Tensor) -> Tensor:

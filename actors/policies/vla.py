@@ -153,8 +153,7 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
 
     def policy_features(self, observed: TensorDictBase) -> Tensor:
         """What perception and fusion make of observations [B], or of their visual features if those are
-        given:
-        float32 [B, width].
+        given: float32 [B, width].
         """
         seen = observed.get(VISUAL_FEATURES, None)
         if seen is None:

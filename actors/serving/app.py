@@ -1,10 +1,8 @@
 """The HTTP side of a served simulator: GE-Sim's endpoints, their status codes, and the live page.
 
 Clients written for the released server work unchanged. What is new is overlooked by them: many sessions
-instead of
-one, `seed` in /init, `state` beside the first frame, `chunk` in /step (a repeated step is answered again, not
-made
-again), and what /healthz says beside "ok".
+instead of one, `seed` in /init, `state` beside the first frame, `chunk` in /step (a repeated step is answered
+again, not made again), and what /healthz says beside "ok".
 """
 
 from __future__ import annotations

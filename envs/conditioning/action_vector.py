@@ -15,8 +15,7 @@ class ActionVector(nn.Module):
 
     Absolute commands are told twice: as moves from the command in force when the chunk begins, which say what
     changes, and as they are, which say where. Deltas are told as they are and summed up, for only their sum
-    says where
-    things end.
+    says where things end.
 
     Args:
         embodiment: whose actions.

@@ -1,8 +1,7 @@
 """Pose maps: the commanded grippers drawn into each camera, as in GE-Sim 2.0.
 
 A filled circle marks each fingertip (size: how near, shade: how closed) and three thick lines its axes.
-Drawing
-goes plane by plane into the [3, H, W] result, which saves the transposition an RGB canvas would need.
+Drawing goes plane by plane into the [3, H, W] result, which saves the transposition an RGB canvas would need.
 """
 
 from __future__ import annotations
@@ -20,8 +19,7 @@ from envs.geometry.rotations import pose_transforms
 CANVAS = 50  # of 255, where nothing is drawn
 _AXIS = 0.1  # m
 # RGB of the x, y and z axis lines, and colour map of the circle, of the first arm (GE-Sim's left), the second
-# (its
-# right); further arms, of which GE-Sim has none, begin anew.
+# (its right); further arms, of which GE-Sim has none, begin anew.
 AXIS_RGB = (((0, 0, 255), (255, 255, 0), (0, 255, 255)), ((255, 0, 255), (255, 0, 0), (0, 255, 0)))
 _COLOUR_MAPS = ("Greens", "Reds")
 _REFERENCE_HEIGHT = 384  # the picture height for which radii and thickness are given
@@ -65,8 +63,7 @@ def render_pose_map(
 
     Args:
         poses: [..., T, arms, 7] flange poses [x, y, z, roll, pitch, yaw, gripper], metres and radians, world
-            frame;
-            gripper 0 open .. 1 closed, values beyond take the colour map's ends.
+            frame; gripper 0 open .. 1 closed, values beyond take the colour map's ends.
         c2w: [..., V, T, 4, 4] camera to world, OpenCV convention.
         intrinsic: [..., V, 3, 3] in pixels of `size`.
         size: (height, width) in pixels.

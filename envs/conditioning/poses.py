@@ -20,8 +20,7 @@ def end_effector_poses(
 
     Returns:
         float32 [..., arms, 7] = [x, y, z, roll, pitch, yaw, gripper]; metres, radians, gripper 0 open .. 1
-        closed
-        (beyond, where the data go beyond); 0 for an arm without a gripper.
+        closed (beyond, where the data go beyond); 0 for an arm without a gripper.
 
     Raises:
         EmbodimentError: if the robot's commands do not say where its flanges will be.

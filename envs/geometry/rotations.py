@@ -1,8 +1,7 @@
 """Rotations and rigid transforms in torch, batched over leading dimensions.
 
 Angles are extrinsic roll, pitch, yaw: R = Rz(yaw) Ry(pitch) Rx(roll), scipy's "xyz". What is not on a
-rollout's path
-goes to scipy.spatial.transform; here stands what must run batched on the rollout's device.
+rollout's path goes to scipy.spatial.transform; here stands what must run batched on the rollout's device.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Worker processes that hold task suites, so that a batch of true worlds uses every core.
 
 Episodes are dealt to workers by slot number, and what happens in one depends on its task, seed and actions
-alone: the number of workers changes the speed and nothing else. So a worker that dies
-can be replaced by another that runs its episodes again up to where they were, bit for bit.
+alone: the number of workers changes the speed and nothing else. So a worker that dies can be replaced by
+another that runs its episodes again up to where they were, bit for bit.
 """
 
 from __future__ import annotations

@@ -17,8 +17,8 @@ class MissingGL(RuntimeError):
 class Offscreen:
     """Renders any model that has the same assets as the one it was made with.
 
-    MuJoCo's own Renderer is tied to one model and makes one GL context each; a batch of benches would
-    exhaust the driver.
+    MuJoCo's own Renderer is tied to one model and makes one GL context each; a batch of benches would exhaust
+    the driver.
 
     Raises:
         MissingGL: if no EGL or OSMesa driver answers.
@@ -90,8 +90,8 @@ def offscreen_for(assets: str, model: mujoco.MjModel, size: tuple[int, int]) -> 
 def calibration(
     model: mujoco.MjModel, data: mujoco.MjData, views: tuple[str, ...], size: tuple[int, int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pinhole intrinsics [V, 3, 3] in pixels for pictures of `size` = (height, width), and camera poses
-    [V, 4, 4] (camera to world, OpenCV convention) of the named cameras.
+    """Pinhole intrinsics [V, 3, 3] in pixels for pictures of `size` = (height, width), and camera poses [V,
+    4, 4] (camera to world, OpenCV convention) of the named cameras.
     """
     height, width = size
     intrinsic = np.zeros((len(views), 3, 3))

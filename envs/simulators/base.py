@@ -1,10 +1,9 @@
 """The contract of a learned world.
 
 A simulator is a function of explicit state: `reset` makes the state of a batch of sessions, `step` turns it
-and a
-chunk of commands into frames, features and the next state. The state is a TensorDict with one row per session
-(memory.py), so resetting some sessions is a masked write, and all randomness comes from (session seed, chunk
-index).
+and a chunk of commands into frames, features and the next state. The state is a TensorDict with one row per
+session (memory.py), so resetting some sessions is a masked write, and all randomness comes from (session
+seed, chunk index).
 """
 
 from __future__ import annotations
@@ -60,14 +59,11 @@ class Simulator(nn.Module):
         """Generate the frames of one chunk.
 
         Args:
-            inputs: TensorDict [B], as memory.py and inputs.py build it, with
-                memory: frames uint8 [M, V, 3, H, W], commands [M, A], and pose_map uint8 [M, V, 3, H, W], c2w
-                    [M, V, 4, 4]
-                    where the spec asks for them;
-                future: commands [K, A], and pose_map, c2w likewise;
-                now: command [A], state [S];
-                intrinsic [V, 3, 3] pixels, if cameras are calibrated;
-                seed int64 [], chunk_index int64 [].
+            inputs: TensorDict [B], as memory.py and inputs.py build it, with memory: frames uint8 [M, V, 3,
+                H, W], commands [M, A], and pose_map uint8 [M, V, 3, H, W], c2w
+                    [M, V, 4, 4] where the spec asks for them;
+                future: commands [K, A], and pose_map, c2w likewise; now: command [A], state [S]; intrinsic
+                [V, 3, 3] pixels, if cameras are calibrated; seed int64 [], chunk_index int64 [].
 
         Returns:
             frames uint8 [B, K, V, 3, H, W] and features float32 [B, *feature_shape] for the state expert.
@@ -108,8 +104,8 @@ class Simulator(nn.Module):
 
         Args:
             first: TensorDict [B] with frames uint8 [V, 3, H, W], command [A], state [S]; of calibrated robots
-                also
-                intrinsic [V, 3, 3] and c2w [V, 4, 4]; pose_map uint8 [V, 3, H, W] if the spec asks for it.
+                also intrinsic [V, 3, 3] and c2w [V, 4, 4]; pose_map uint8 [V, 3, H, W] if the spec asks for
+                it.
             seed: int64 [B].
             capacity: frames to keep room for, where it is known how long sessions last; longer ones make
                 more.
@@ -125,13 +121,11 @@ class Simulator(nn.Module):
 
         Args:
             future: TensorDict [B] with commands [K, A], and pose_map uint8 [K, V, 3, H, W], c2w [K, V, 4, 4]
-                where the
-                spec asks for them.
+                where the spec asks for them.
 
         Returns:
             frames uint8 [B, K, V, 3, H, W], features [B, *feature_shape], next state. The robot's states in
-            the new
-            frames are unknown here and repeat the last; the state expert fills them in
+            the new frames are unknown here and repeat the last; the state expert fills them in
             (`memory.write_states`).
         """
         inputs = memory.build_inputs(state, self.recall(state, future), future)

@@ -20,8 +20,7 @@ def build_inputs(
 
     Args:
         drawn: uint8 [B, number * K, V, 3, H, W], the model's own frames of the chunks before; memory then
-            shows these
-            instead of true ones.
+            shows these instead of true ones.
         generator: draws the noise seeds; without one they are zero.
     """
     size = clip.shape

@@ -2,10 +2,8 @@
 from.
 
 The state of B sessions is a TensorDict [B]: history (rows of frames, commands, states, and pose_map, c2w
-where there
-are any), length int64, intrinsic if cameras are calibrated, seed int64, chunk_index int64. Rows of the
-history past a
-session's length hold anything and are never read.
+where there are any), length int64, intrinsic if cameras are calibrated, seed int64, chunk_index int64. Rows
+of the history past a session's length hold anything and are never read.
 """
 
 from __future__ import annotations

@@ -18,8 +18,7 @@ class Replay(NamedTuple):
     """Generated episodes beside the rows of the true ones.
 
     frames uint8 [N, T, V, 3, H, W] generated, rows int64 [N, T] of the true frames, valid bool [N, T], states
-    float32
-    [N, T, S] decoded.
+    float32 [N, T, S] decoded.
     """
 
     frames: Tensor

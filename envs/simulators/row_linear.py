@@ -12,8 +12,7 @@ class RowLinear(nn.Linear):
     """nn.Linear on rows padded to a multiple of sixteen.
 
     CPU libraries multiply odd rows at the end of a matrix by other kernels, which round otherwise: an episode
-    would
-    differ in its last bits by the slot it is in. For the small matrices of conditioning, padding costs
+    would differ in its last bits by the slot it is in. For the small matrices of conditioning, padding costs
     nothing.
 
     Examples:

@@ -25,8 +25,7 @@ class JudgeReward(Transform):
         judge: scores frames.
         rewards: turns progress and success into a number.
         later: do not wait for verdicts. Episodes then run to their horizon, and `settle` writes rewards and
-            ends into
-            the finished rollout; what a slot did after its success belongs to no episode.
+            ends into the finished rollout; what a slot did after its success belongs to no episode.
     """
 
     def __init__(self, judge: Judge, rewards: Rewards, later: bool = False):

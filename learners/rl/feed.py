@@ -2,9 +2,8 @@
 
 Synchronous: every iteration publishes, runs its jobs, joins them in order; any fleet gives the same bits.
 Asynchronous: jobs run on while the learner updates. What was submitted and not yet learned from is the one
-bounded
-buffer, and the only place where a policy can grow old; a job's rollout, and so a GRPO group, is of one
-version.
+bounded buffer, and the only place where a policy can grow old; a job's rollout, and so a GRPO group, is of
+one version.
 """
 
 from __future__ import annotations

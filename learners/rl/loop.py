@@ -2,12 +2,10 @@
 trouble.
 
 Rollouts come from a fleet (actors/fleet.py): this process or any number of Ray actors, in any world of this
-project;
-update.py learns from them. Every iteration starts fresh episodes and draws its randomness from (seed,
-iteration), so a
-run resumed from its checkpoint repeats what it would have done, and so do any number of actors. Of several
-workers that
-learn together (parallel.py), the first one has the fleet and shows the others what came.
+project; update.py learns from them. Every iteration starts fresh episodes and draws its randomness from
+(seed, iteration), so a run resumed from its checkpoint repeats what it would have done, and so do any number
+of actors. Of several workers that learn together (parallel.py), the first one has the fleet and shows the
+others what came.
 """
 
 from __future__ import annotations
@@ -54,8 +52,7 @@ def train_rl(
 
     Args:
         fleet: hosts of config.envs / config.shards episodes each; the policy's trained tensors are published
-            to it.
-            Of several workers only the leading one has one.
+            to it. Of several workers only the leading one has one.
         starts: number of start frames in imagination; None in physics, where `seed_pool` says which seeds may
             be used.
         folder: receives checkpoints, metrics.jsonl and learned.jsonl, the jobs that were learned from; a

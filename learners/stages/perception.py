@@ -2,8 +2,7 @@
 ones.
 
 Two questions whose answers hang on where things are, and which every recording answers: what did whoever
-acted do
-next, given whether the episode went on to succeed; and how soon is success, as its discounted time.
+acted do next, given whether the episode went on to succeed; and how soon is success, as its discounted time.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The one training loop: every supervised stage is a module, a loss and a FitConfig given to `fit`.
 
 Batches and noise are functions of (seed, step, microbatch), so a run that was killed and resumed has the loss
-stream of
-one that was not, and so have, up to rounding, several workers (parallel.py).
+stream of one that was not, and so have, up to rounding, several workers (parallel.py).
 """
 
 from __future__ import annotations

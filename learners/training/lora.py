@@ -18,8 +18,7 @@ def low_rank(module: nn.Module, rank: int) -> Iterator[None]:
     """Within it only adapters of a module's projections learn; after it they are part of its weights.
 
     Names of parameters are the old ones again afterwards. Rank 0 leaves all weights to learn. An exception
-    leaves
-    the adapters where they are: what follows is a new process that resumes from a checkpoint.
+    leaves the adapters where they are: what follows is a new process that resumes from a checkpoint.
 
     Args:
         module: with projections that are named as in TARGETS.

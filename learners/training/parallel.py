@@ -1,13 +1,10 @@
 """Training in one process or in many, with the same code and, up to rounding, the same result.
 
 Every worker runs the same stage with the same seeds. A batch is cut into microbatches, each with its own
-generator;
-a worker takes its share of them, and FSDP2 (torch.distributed.fsdp.fully_shard; Zhao et al. 2023) keeps
-parameters,
-gradients and optimiser state in shards, gathers what a forward pass needs and averages gradients. So results
-depend on
-the number of microbatches, not on who computes them. Worker processes are started by
-pipeline/graph/workers.py.
+generator; a worker takes its share of them, and FSDP2 (torch.distributed.fsdp.fully_shard; Zhao et al. 2023)
+keeps parameters, gradients and optimiser state in shards, gathers what a forward pass needs and averages
+gradients. So results depend on the number of microbatches, not on who computes them. Worker processes are
+started by pipeline/graph/workers.py.
 """
 
 from __future__ import annotations
@@ -25,8 +22,7 @@ from torch.distributed.tensor import DTensor
 T = TypeVar("T")
 
 # Parameters from which on a block of a module list is gathered by itself; below, a round of messages costs
-# more than
-# the memory it saves.
+# more than the memory it saves.
 BLOCK = 500_000
 
 

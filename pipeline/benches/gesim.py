@@ -2,8 +2,8 @@
 silicon would allow.
 
 On a GPU it is the 2B configuration at 3 x 384 x 512 and 25 frames; elsewhere the same code at a small size,
-and for
-the 2B one its floor: floating-point operations and bytes, counted on the network itself without computing it.
+and for the 2B one its floor: floating-point operations and bytes, counted on the network itself without
+computing it.
 """
 
 from __future__ import annotations

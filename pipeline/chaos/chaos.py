@@ -1,10 +1,9 @@
 """worldloop chaos: kill what a run is made of, by a seeded schedule, and check the ledger.
 
 A learner process runs GRPO or PPO on Ray actors and a judge service in an untrained world. Within it a thread
-kills
-hosts (as Ray does and as the kernel does) and the judge, and adds and removes hosts; from outside, the
-learner itself
-is killed and started again. Afterwards every episode must be accounted for, and nothing may be left behind.
+kills hosts (as Ray does and as the kernel does) and the judge, and adds and removes hosts; from outside, the
+learner itself is killed and started again. Afterwards every episode must be accounted for, and nothing may be
+left behind.
 """
 
 from __future__ import annotations

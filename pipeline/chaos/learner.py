@@ -29,8 +29,7 @@ def plague(fleet: RayFleet, section: dict[str, Any], seed: int, events: Path) ->
     """Kill parts of the fleet until the process ends; every event is a row of `events`.
 
     The schedule is in finished jobs, so that a slow machine is not killed faster than it can rebuild; now and
-    then
-    two events come at once.
+    then two events come at once.
     """
     chance = random.Random(seed)
     began = time.monotonic()

@@ -26,9 +26,9 @@ def object_error(store: ClipStore, episodes: Tensor, made: Replay, truth: Tensor
         truth: uint8 [N, T, V, 3, H, W], the true frames beside made.frames.
 
     Returns:
-        object_px and object_cm (median, 90th percentile over all frames), object_cm_at_end,
-        object_lost (share of frames), and locator_px, the locator's own error on true video; {} where this
-        cannot be measured.
+        object_px and object_cm (median, 90th percentile over all frames), object_cm_at_end, object_lost
+        (share of frames), and locator_px, the locator's own error on true video; {} where this cannot be
+        measured.
     """
     view = store.spec.embodiment.main_view
     if not store.spec.embodiment.calibrated or store.spec.embodiment.cameras[view].wrist is not None:

@@ -23,10 +23,9 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
             physics_after.
 
     Returns:
-        name, seed, simulator, algorithm, verdict; physics_before and physics_after (rate entries) with
-        paired (McNemar), None without physics; imagined_before, imagined_after; judge, rollout,
-        frames_per_second (see the measure stage); rounds (gaps); episodes used and held out; seconds per
-        stage; alarms.
+        name, seed, simulator, algorithm, verdict; physics_before and physics_after (rate entries) with paired
+        (McNemar), None without physics; imagined_before, imagined_after; judge, rollout, frames_per_second
+        (see the measure stage); rounds (gaps); episodes used and held out; seconds per stage; alarms.
     """
     finished = manifests(inputs)
     imagined, measured = (result_of(inputs.folder(role)) for role in ("imagined", "measured"))

@@ -53,9 +53,7 @@ def targets(section: Any) -> Iterable[str]:
 
 @cache
 def _closure(module: str) -> frozenset[str]:
-    """Modules that `module` imports, itself and packages on the way included; foreign ones are not
-    entered.
-    """
+    """Modules that `module` imports, itself and packages on the way included; foreign ones are not."""
     found: set[str] = set()
     waiting = [module]
     while waiting:

@@ -1,8 +1,8 @@
 """Stages elsewhere: those that learn in several processes, those that evaluate where launch.place.evaluator
 says.
 
-Ray Train starts the processes that learn; all of them run the stage, the leading one writes. Which parts of
-a stage are shared out is told in learners/training/parallel.py. A worker that dies takes the others with it;
+Ray Train starts the processes that learn; all of them run the stage, the leading one writes. Which parts of a
+stage are shared out is told in learners/training/parallel.py. A worker that dies takes the others with it;
 Ray Train starts all anew, and the stage goes on from its last checkpoint.
 """
 

@@ -38,8 +38,8 @@ class LeRobotDataset:
 
     Args:
         root: folder of the data set.
-        size: (height, width) to which all pictures are brought, intrinsics with them; None keeps the
-            recorded size.
+        size: (height, width) to which all pictures are brought, intrinsics with them; None keeps the recorded
+            size.
         privileged: whether to read what only physics knows, too.
         embodiment: the robot, where the reader knows more of it than the data set says; it must have the same
             cameras and as many numbers.

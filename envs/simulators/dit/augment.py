@@ -2,8 +2,7 @@
 (GE-Sim 2.0, appendix).
 
 Probabilities and strengths are the paper's. Where it leaves a law open, the simplest is taken: strengths are
-uniform,
-and the blurred region is a rectangle.
+uniform, and the blurred region is a rectangle.
 """
 
 from __future__ import annotations

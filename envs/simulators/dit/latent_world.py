@@ -203,8 +203,8 @@ class LatentWorld(Simulator):
         conditions: tuple[Tensor, Tensor | None],
         layers: list[Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """The network's output for future latents [B, V, C, T', h, w] at noise level [B], and features
-        [B, V, tokens, width].
+        """The network's output for future latents [B, V, C, T', h, w] at noise level [B], and features [B, V,
+        tokens, width].
         """
         channels, actions = conditions
         latents = torch.cat([torch.cat([memory, future], 3), channels], 2)

@@ -2,8 +2,8 @@
 by one path.
 
 Folder: model.safetensors (trunk and state expert), prompt_embeds.pt, norm_stats.json, vae/, scheduler/
-(diffusers'
-layout). Version 1 is one .safetensors file; vae/, scheduler/ and prompt_embeds.pt are looked for beside it.
+(diffusers' layout). Version 1 is one .safetensors file; vae/, scheduler/ and prompt_embeds.pt are looked for
+beside it.
 """
 
 from __future__ import annotations

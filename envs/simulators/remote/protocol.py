@@ -2,8 +2,7 @@
 beside them.
 
 Everything that comes from outside is checked here before it is believed: sizes against what was announced,
-pictures
-against their own headers before they are decoded, numbers for NaN.
+pictures against their own headers before they are decoded, numbers for NaN.
 """
 
 from __future__ import annotations

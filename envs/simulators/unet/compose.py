@@ -17,8 +17,7 @@ def compose(maps: Tensor, flow: Tensor, memory: Tensor) -> Tensor:
 
     Args:
         maps: [B, K, M + 1 + DRAWN, H, W]: logits of the M remembered frames, the moved and the drawn one,
-            then the drawn
-            colour in about -1..1.
+            then the drawn colour in about -1..1.
         flow: [B, K, 2, H, W] from a frame to the last remembered one (x, y).
         memory: [B, M, 3, H, W] remembered frames in 0..1, the last one last.
     """

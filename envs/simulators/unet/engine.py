@@ -1,14 +1,10 @@
 """The strong cheap engine: a U-Net that predicts a whole chunk of all views in one deterministic pass.
 
 Each view is folded into channels (all but the main one at half the detail); memory frames, and pose maps
-where there
-are any, ride along as channels, and actions modulate every block. A pixel of the output is a soft choice
-between
-sources (warp, mask and residual, as in Finn et al. 2016): each remembered frame as it is, the last one moved
-by a
-predicted flow, and a drawn colour. What moves is then copied instead of repainted, which is learned far
-faster than a
-residual.
+where there are any, ride along as channels, and actions modulate every block. A pixel of the output is a soft
+choice between sources (warp, mask and residual, as in Finn et al. 2016): each remembered frame as it is, the
+last one moved by a predicted flow, and a drawn colour. What moves is then copied instead of repainted, which
+is learned far faster than a residual.
 """
 
 from __future__ import annotations
