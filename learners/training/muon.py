@@ -74,16 +74,21 @@ class Muon(Optimizer):
 def orthogonal(matrices: Tensor, iterations: int) -> Tensor:
     """Nearly the orthogonal factors of matrices [N, rows, columns]: all singular values about 1.
 
-    Singular values that are much smaller than the largest rise towards 1 and may stay below it.
+    Singular values that are much smaller than the largest rise towards 1 and may stay below it. Every step of
+    the iteration is a polynomial in X X', so they are worked out on that small square and meet X only once.
     """
-    kind = torch.bfloat16 if matrices.is_cuda else torch.float32
     tall = matrices.shape[1] > matrices.shape[2]
-    x = (matrices.mT if tall else matrices).to(kind)
+    x = (matrices.mT if tall else matrices).float()
     x = x / (x.norm(dim=(1, 2), keepdim=True) + 1e-7)
     a, b, c = _QUINTIC
-    for _ in range(iterations):
-        square = x @ x.mT
-        x = a * x + (b * square + c * square @ square) @ x
+    square, whole = x @ x.mT, None
+    for number in range(iterations):
+        step = torch.baddbmm(square, square, square, beta=b, alpha=c)
+        step.diagonal(dim1=1, dim2=2).add_(a)
+        whole = step if whole is None else step @ whole
+        if number + 1 < iterations:
+            square = step @ square @ step
+    x = x if whole is None else whole @ x
     return (x.mT if tall else x).to(matrices.dtype)
 
 

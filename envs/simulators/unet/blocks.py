@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -58,9 +60,9 @@ class Embed(nn.Module):
         self.weight = nn.Parameter(torch.empty(width, channels, FOLD, FOLD).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.empty(width).uniform_(-bound, bound))
 
-    def forward(self, pictures: Tensor) -> Tensor:
-        """[B, width, h / 4, w / 4] of pictures uint8 [B, C, shrink h, shrink w]."""
-        dtype = working_dtype(pictures.device, self.weight.dtype)
+    def forward(self, pictures: Sequence[Tensor]) -> Tensor:
+        """[B, width, h / 4, w / 4] of pictures [B, C, shrink h, shrink w], bytes or floats in 0..255."""
+        dtype = working_dtype(self.weight.device, self.weight.dtype)
         weight: Tensor = self.weight
         if self.shrink > 1:
             weight = (
@@ -68,7 +70,7 @@ class Embed(nn.Module):
             )
         # Bytes stay what they are; that they are meant as -1..1 is left to the weights.
         weight = weight.flatten(1)
-        folded = fold(pictures, FOLD * self.shrink).to(dtype)
+        folded = torch.cat([fold(some, FOLD * self.shrink).to(dtype) for some in pictures], -1)
         return F.linear(folded, weight / 127.5, self.bias - weight.sum(1)).permute(0, 3, 1, 2)
 
 
@@ -145,7 +147,7 @@ def flow_head(width: int, chunk: int) -> nn.Sequential:
 
 def at_detail(pictures: Tensor, shrink: int) -> Tensor:
     """Bytes [B, 3, H, W] as float in 0..1, with shrink = 2 the mean of each four pixels."""
-    x = pictures.float().div_(255)
+    x = pictures.float().div(255)
     if shrink == 1:
         return x
     # Four sums are faster than torch's pooling.

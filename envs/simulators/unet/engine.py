@@ -108,8 +108,8 @@ class UNetSimulator(Simulator):
         _, deep, cond = self._encode(inputs)
         return torch.cat([deep.float().mean((-2, -1)), cond.float()], 1)
 
-    def _enlarge(self, views: list[Tensor]) -> Tensor:
-        """Frames uint8 [B, K, V, 3, H, W] of all views at full size."""
+    def _enlarge(self, views: list[Tensor], through: bool = False) -> Tensor:
+        """Frames uint8 [B, K, V, 3, H, W] of all views at full size; `through` are the same as floats whose gradient passes the rounding."""
         full = []
         for shrink, view in zip(self.shrink, views, strict=True):
             if shrink > 1:
@@ -117,7 +117,11 @@ class UNetSimulator(Simulator):
                     view.flatten(0, 1), self.spec.size, mode="bilinear", align_corners=False
                 )
                 view = large.unflatten(0, view.shape[:2])
-            full.append(to_bytes(view))
+            if through:
+                exact = view.clamp(0, 1) * 255
+                full.append(exact + (exact.detach().round() - exact.detach()))
+            else:
+                full.append(to_bytes(view))
         return torch.stack(full, 2)
 
     def _encode(self, inputs: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
@@ -129,8 +133,7 @@ class UNetSimulator(Simulator):
         if self.rays is not None:
             deep.append(self.rays(self._rays(inputs)))
         for view, (shrink, embed) in enumerate(zip(self.shrink, self.embed, strict=True)):
-            pictures = torch.cat([part[:, :, view].flatten(1, 2) for part in parts], 1)
-            (fine if shrink == 1 else deep).append(embed(pictures))
+            (fine if shrink == 1 else deep).append(embed([part[:, :, view].flatten(1, 2) for part in parts]))
         x = torch.stack(fine).sum(0).contiguous(memory_format=torch.channels_last)
         for block in self.fine_in:
             x = block(x, cond)
@@ -182,8 +185,7 @@ class UNetSimulator(Simulator):
             truth, valid = clip["future", "frames"][:, part], clip["future", "valid"][:, part]
             losses.append(self._error(views, truth, clip["memory", "frames"][:, number, -1], valid))
             if number + 1 < chunks:
-                with torch.no_grad():
-                    pictures = self._enlarge(views)
+                pictures = self._enlarge(views, through=True)
                 drawn = pictures if drawn is None else torch.cat([drawn, pictures], 1)
         return torch.stack(losses).mean(), {
             "first_chunk": losses[0].detach(),
