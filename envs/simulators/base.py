@@ -39,9 +39,12 @@ class Simulator(nn.Module):
 
     Attributes:
         feature_shape: of the features that state experts read, without the batch.
+        hidden: names of the layers that optimisers may take for hidden ones (learners/training/optimisers.py);
+            none for all.
     """
 
     feature_shape: tuple[int, ...]
+    hidden: tuple[str, ...] = ()
 
     def __init__(self, spec: WorldSpec, memory_frames: int):
         super().__init__()

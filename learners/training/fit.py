@@ -117,7 +117,8 @@ def fit(
     device = next(module.parameters()).device
     trainee, mine = Trainee(module), my_share(config.microbatches)
     trained = trainee.trained
-    optimisers = OPTIMISERS[config.optimiser](trained, config.lr, config.weight_decay)
+    hidden = getattr(module, "hidden", ())
+    optimisers = OPTIMISERS[config.optimiser](trained, config.lr, config.weight_decay, hidden)
     average = twin(trained)
     first, spent = 0, {"data": 0.0, "compute": 0.0}
 

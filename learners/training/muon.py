@@ -1,7 +1,7 @@
 """Muon (Jordan et al. 2024): momentum whose steps are made orthogonal, for matrices and convolutions.
 
-torch.optim.Muon takes neither convolutions nor parameters in shards, and iterates in bfloat16, which
-processors without bfloat16 units emulate slowly.
+torch.optim.Muon takes neither convolutions nor parameters in shards, iterates in bfloat16, which processors
+without bfloat16 units emulate slowly, and on whole matrices instead of their small squares.
 """
 
 from __future__ import annotations

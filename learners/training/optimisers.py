@@ -14,7 +14,7 @@ from learners.training.muon import Muon
 Parameters = Mapping[str, nn.Parameter]
 
 
-def adamw(trained: Parameters, lr: float, weight_decay: float) -> list[Optimizer]:
+def adamw(trained: Parameters, lr: float, weight_decay: float, hidden: Sequence[str] = ()) -> list[Optimizer]:
     """AdamW (Loshchilov & Hutter 2019) on all; norms, biases and other vectors do not decay."""
     groups = [
         {"params": [p for p in trained.values() if p.ndim >= 2], "weight_decay": weight_decay},
@@ -23,20 +23,26 @@ def adamw(trained: Parameters, lr: float, weight_decay: float) -> list[Optimizer
     return [AdamW([group for group in groups if group["params"]], lr=lr, betas=(0.9, 0.99), fused=True)]
 
 
-def muon(trained: Parameters, lr: float, weight_decay: float) -> list[Optimizer]:
-    """Muon on matrices and convolutions, AdamW on everything else, at one learning rate."""
-    matrices = orthogonalised(trained)
+def muon(trained: Parameters, lr: float, weight_decay: float, hidden: Sequence[str] = ()) -> list[Optimizer]:
+    """Muon on matrices and convolutions of hidden layers, AdamW on everything else, at one learning rate.
+
+    Args:
+        hidden: names of these layers, as one part of their parameters' names; all layers if there are none.
+    """
+    matrices = {
+        name: p
+        for name, p in trained.items()
+        if p.ndim >= 2 and (not hidden or not set(hidden).isdisjoint(name.split(".")))
+    }
     rest = {name: p for name, p in trained.items() if name not in matrices}
     out: list[Optimizer] = [Muon(matrices.values(), lr=lr, weight_decay=weight_decay)] if matrices else []
     return out + (adamw(rest, lr, weight_decay) if rest else [])
 
 
-def orthogonalised(trained: Parameters) -> dict[str, nn.Parameter]:
-    """The parameters whose steps Muon makes orthogonal: those of two dimensions and more."""
-    return {name: p for name, p in trained.items() if p.ndim >= 2}
-
-
-OPTIMISERS: dict[str, Callable[[Parameters, float, float], list[Optimizer]]] = {"adamw": adamw, "muon": muon}
+OPTIMISERS: dict[str, Callable[[Parameters, float, float, Sequence[str]], list[Optimizer]]] = {
+    "adamw": adamw,
+    "muon": muon,
+}
 
 
 def optimiser_state(optimisers: Sequence[Optimizer], trained: Parameters) -> dict[str, dict[str, Tensor]]:

@@ -149,12 +149,10 @@ def test_muon_steps_are_orthogonal_whatever_the_gradient(tmp_path: Path) -> None
 def test_muon_takes_matrices_and_adamw_the_rest() -> None:
     net = Net()
     trained = dict(net.named_parameters())
-    state = optimiser_state(OPTIMISERS["muon"](trained, 1e-3, 0.0), trained)
-    assert set(state) == set(trained)
-    assert {name for name, held in state.items() if "momentum_buffer" in held} == {
-        "line.weight",
-        "conv.weight",
-    }
+    for hidden, matrices in (((), {"line.weight", "conv.weight"}), (("conv",), {"conv.weight"})):
+        state = optimiser_state(OPTIMISERS["muon"](trained, 1e-3, 0.0, hidden), trained)
+        assert set(state) == set(trained)
+        assert {name for name, held in state.items() if "momentum_buffer" in held} == matrices
 
 
 def test_unknown_optimisers_are_refused() -> None:

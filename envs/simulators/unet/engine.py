@@ -1,10 +1,10 @@
 """The strong cheap engine: a U-Net that predicts a whole chunk of all views in one deterministic pass.
 
 Each view is folded into channels (all but the main one at half the detail); memory frames, and pose maps
-where there are any, ride along as channels, and actions modulate every block. A pixel of the output is a soft
-choice between sources (warp, mask and residual, as in Finn et al. 2016): each remembered frame as it is, the
-last one moved by a predicted flow, and a drawn colour. What moves is then copied instead of repainted, which
-is learned far faster than a residual.
+where there are any, ride along as channels, and actions modulate every block. A pixel of the output is one of
+its sources (compose.py): a remembered frame as it is, the last one moved by a predicted flow (warp, mask and
+residual, as in Finn et al. 2016), or a drawn colour. What moves is then copied instead of repainted, which is
+learned far faster than a residual.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from envs.conditioning import render_ray_map
 from envs.precision import working_dtype
-from envs.simulators.base import Simulator, to_bytes
+from envs.simulators.base import Simulator
 from envs.simulators.inputs import build_inputs
 from envs.simulators.unet.blocks import (
     FOLD,
@@ -27,12 +27,12 @@ from envs.simulators.unet.blocks import (
     flow_head,
     output_head,
 )
-from envs.simulators.unet.compose import DRAWN, changed, compose
+from envs.simulators.unet.compose import DRAWN, changed, choose, compose, surprise
 from envs.simulators.unet.folding import unfold
 from envs.specs import WorldSpec
 
 _COND = 256  # numbers of the action embedding
-_SQUARE = 50.0  # weight of squared errors beside absolute ones
+Sources = tuple[Tensor, Tensor]  # colours and log-probabilities of a view's pixels
 
 
 class UNetSimulator(Simulator):
@@ -49,6 +49,7 @@ class UNetSimulator(Simulator):
 
     mean: Tensor
     spread: Tensor
+    hidden = ("conv1", "conv2", "down")
 
     def __init__(
         self,
@@ -101,27 +102,27 @@ class UNetSimulator(Simulator):
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; features are the pooled bottleneck beside the action embedding."""
         views, features = self.views(inputs)
-        return self._enlarge(views), features
+        return self._frames(views).to(torch.uint8), features
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is drawn."""
         _, deep, cond = self._encode(inputs)
         return torch.cat([deep.float().mean((-2, -1)), cond.float()], 1)
 
-    def _enlarge(self, views: list[Tensor], through: bool = False) -> Tensor:
-        """Frames uint8 [B, K, V, 3, H, W] of all views at full size; `through` are the same as floats whose gradient passes the rounding."""
+    def _frames(self, views: list[Sources]) -> Tensor:
+        """Frames float [B, K, V, 3, H, W] of all views at full size, whole numbers in 0..255; gradients pass
+        the rounding.
+        """
         full = []
-        for shrink, view in zip(self.shrink, views, strict=True):
+        for shrink, sources in zip(self.shrink, views, strict=True):
+            view = choose(*sources)
             if shrink > 1:
                 large = F.interpolate(
                     view.flatten(0, 1), self.spec.size, mode="bilinear", align_corners=False
                 )
                 view = large.unflatten(0, view.shape[:2])
-            if through:
-                exact = view.clamp(0, 1) * 255
-                full.append(exact + (exact.detach().round() - exact.detach()))
-            else:
-                full.append(to_bytes(view))
+            exact = view.clamp(0, 1) * 255
+            full.append(exact + (exact.round() - exact).detach())
         return torch.stack(full, 2)
 
     def _encode(self, inputs: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
@@ -142,15 +143,13 @@ class UNetSimulator(Simulator):
             z = block(z, cond)
         return x, z, cond
 
-    def views(self, inputs: TensorDict) -> tuple[list[Tensor], Tensor]:
-        """Frames of each view float [B, K, 3, H / shrink, W / shrink] in 0..1, not yet enlarged, and the
-        features.
-        """
+    def views(self, inputs: TensorDict) -> tuple[list[Sources], Tensor]:
+        """What pixels of each view may be (compose), at the size it is predicted in, and the features."""
         x, z, cond = self._encode(inputs)
         x = self.fuse(torch.cat([x, F.pixel_shuffle(self.up(z), 2)], 1))
         for block in self.fine_out:
             x = block(x, cond)
-        views: list[Tensor] = []
+        views: list[Sources] = []
         chunk, frames = self.spec.chunk, inputs["memory", "frames"]
         for view, (shrink, head, flow) in enumerate(zip(self.shrink, self.heads, self.flows, strict=True)):
             y = x if shrink == 1 else z
@@ -174,7 +173,8 @@ class UNetSimulator(Simulator):
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """Weighted error over all chunks of the clip, each predicted from the model's own earlier chunks.
 
-        Gradients stay within a chunk; predictions are rounded to bytes in between, as they are in rollouts.
+        Predictions are rounded to bytes in between, as they are in rollouts. Gradients pass through them: a
+        chunk is also taught to leave what the next ones need, or things fade away that matter only later.
         """
         chunk, chunks = self.spec.chunk, clip["memory", "index"].shape[1]
         drawn: Tensor | None = None
@@ -185,30 +185,28 @@ class UNetSimulator(Simulator):
             truth, valid = clip["future", "frames"][:, part], clip["future", "valid"][:, part]
             losses.append(self._error(views, truth, clip["memory", "frames"][:, number, -1], valid))
             if number + 1 < chunks:
-                pictures = self._enlarge(views, through=True)
+                pictures = self._frames(views)
                 drawn = pictures if drawn is None else torch.cat([drawn, pictures], 1)
         return torch.stack(losses).mean(), {
             "first_chunk": losses[0].detach(),
             "last_chunk": losses[-1].detach(),
         }
 
-    def _error(self, views: list[Tensor], truth: Tensor, last: Tensor, valid: Tensor) -> Tensor:
-        """Mean weighted error of a chunk's views.
+    def _error(self, views: list[Sources], truth: Tensor, last: Tensor, valid: Tensor) -> Tensor:
+        """Mean weighted surprise at a chunk's true views, per channel.
 
         Args:
             truth: uint8 [B, K, V, 3, H, W]; last: uint8 [B, V, 3, H, W], the frame before; valid: [B, K].
         """
         error, norm = torch.zeros((), device=truth.device), torch.zeros((), device=truth.device)
-        for view, (frames, shrink, emphasis) in enumerate(
+        for view, (sources, shrink, emphasis) in enumerate(
             zip(views, self.shrink, self.emphasis, strict=True)
         ):
             wanted = at_detail(truth[:, :, view].flatten(0, 1), shrink).unflatten(0, truth.shape[:2])
             moved = changed(wanted, at_detail(last[:, view], shrink))
             weight = 1 + self.motion * torch.maximum(moved, self._unusual(wanted, view))
             weight = weight * valid[:, :, None, None, None] * emphasis
-            # An absolute error alone never leaves "nothing moves", the median of sparse change; squares do.
-            gap = frames - wanted
-            error = error + ((gap.abs() + _SQUARE * gap.square()) * weight).sum()
+            error = error + (surprise(*sources, wanted) * weight).sum()
             norm = norm + 3 * weight.sum()
         return error / norm.clamp(min=1)
 
