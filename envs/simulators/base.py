@@ -39,7 +39,7 @@ class Simulator(nn.Module):
 
     Attributes:
         feature_shape: of the features that state experts read, without the batch.
-        hidden: names of the layers that optimisers may take for hidden ones (learners/training/optimisers.py);
+        hidden: names of the layers that optimisers may take for hidden ones (training/optimisers.py);
             none for all.
     """
 

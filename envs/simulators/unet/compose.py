@@ -1,7 +1,7 @@
 """Each pixel is one of its sources: remembered, moved, or drawn.
 
-A mixture with one component a source, learned by its likelihood. A mean over sources would fade whatever it is
-not sure of, and what has faded once is gone for the rest of an episode; a choice keeps things sharp.
+A mixture with one component a source, learned by its likelihood. A mean over sources would fade whatever it
+is not sure of, and what has faded once is gone for the rest of an episode; a choice keeps things sharp.
 """
 
 from __future__ import annotations
