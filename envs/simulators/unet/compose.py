@@ -6,6 +6,9 @@ is not sure of, and what has faded once is gone for the rest of an episode; a ch
 
 from __future__ import annotations
 
+from itertools import combinations
+from typing import Any, NamedTuple
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -18,17 +21,25 @@ _SPREAD = 0.1  # of the mixture's Laplace densities, over the three channels' su
 _APART = 0.3  # summed difference from which two colours are simply different
 
 
-def compose(maps: Tensor, flow: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-    """What each pixel may be, and how likely.
+class Sources(NamedTuple):
+    """What the pixels of a chunk may be, and how likely.
+
+    colours: of each source float [B, K, 3, H, W] in about 0..1, or [B, 1, 3, H, W] if all frames share it;
+    logs: log-probabilities [B, K, len(colours), H, W].
+    """
+
+    colours: list[Tensor]
+    logs: Tensor
+
+
+def compose(maps: Tensor, flow: Tensor, memory: Tensor) -> Sources:
+    """The sources of a chunk's pixels.
 
     Args:
         maps: [B, K, M + 1 + DRAWN, H, W]: logits of the M remembered frames, the moved and the drawn one,
             then the drawn colour in about -1..1.
         flow: [B, K, 2, H, W] from a frame to the last remembered one (x, y).
         memory: [B, M, 3, H, W] remembered frames in 0..1, the last one last.
-
-    Returns:
-        Colours [B, K, M + 2, 3, H, W] in about 0..1, and their log-probabilities [B, K, M + 2, H, W].
     """
     count, chunk, height, width = memory.shape[1], maps.shape[1], *maps.shape[-2:]
     # Split, not sliced: the gradient of a slice is a full map of zeros.
@@ -38,33 +49,43 @@ def compose(maps: Tensor, flow: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]
     # All frames of a chunk are sampled from one picture: stack them as rows of one tall grid.
     moved = F.grid_sample(memory[:, -1], grid.flatten(1, 2), padding_mode="border", align_corners=False)
     moved = moved.unflatten(2, (chunk, height)).transpose(1, 2)
-    known = memory[:, None].expand(-1, chunk, -1, -1, -1, -1)
-    colours = torch.cat((known, moved[:, :, None], 0.5 + 0.5 * colour[:, :, None]), 2)
-    return colours, (LOGIT_GAIN * logits).log_softmax(2)
+    known = [memory[:, number, None] for number in range(count)]
+    return Sources([*known, moved, 0.5 + 0.5 * colour], (LOGIT_GAIN * logits).log_softmax(2))
 
 
-def surprise(colours: Tensor, logs: Tensor, frames: Tensor) -> Tensor:
+def surprise(sources: Sources, frames: Tensor) -> Tensor:
     """Negative log-likelihood [B, K, 1, H, W] of frames [B, K, 3, H, W] in nats, but for a constant."""
-    gap = (colours - frames[:, :, None]).abs().sum(3) / _SPREAD
-    return -(logs - gap).logsumexp(2, keepdim=True)
+    gaps = torch.stack([_apart(colour, frames) for colour in sources.colours], 2)
+    return -torch.sub(sources.logs, gaps, alpha=1 / _SPREAD).logsumexp(2, keepdim=True)
 
 
-def choose(colours: Tensor, logs: Tensor) -> Tensor:
+def choose(sources: Sources) -> Tensor:
     """Frames [B, K, 3, H, W]: of every pixel's sources the one that the others agree with most.
 
     The likeliest alone would be wrong: sources that say the same, as all do of a background, share their
     probability. Gradients are those of the mixture's mean.
     """
-    likely = logs.exp()
+    colours, likely = sources.colours, sources.logs.exp()
+    share = likely.unbind(2)
     with torch.no_grad():
-        frames, least = colours[:, :, 0], None
-        for colour in colours.unbind(2):
-            apart = (colours - colour[:, :, None]).abs_().sum(3).mul_(1 / _APART).clamp_(max=1)
-            cost = (likely * apart).sum(2, keepdim=True)  # torch's argmin takes longer than all of this
-            frames = colour if least is None else torch.where(cost < least, colour, frames)
-            least = cost if least is None else torch.minimum(cost, least)
-    mean = (colours * likely[:, :, :, None]).sum(2)
-    return frames.detach() + (mean - mean.detach())
+        cost: list[Any] = [0.0] * len(colours)
+        for one, other in combinations(range(len(colours)), 2):
+            apart = _apart(colours[one], colours[other]).mul_(1 / _APART).clamp_(max=1)
+            cost[one] = cost[one] + share[other] * apart
+            cost[other] = cost[other] + share[one] * apart
+        frames, least = colours[0].detach().expand(-1, likely.shape[1], -1, -1, -1), cost[0]
+        for colour, doubt in zip(colours[1:], cost[1:], strict=True):  # torch's argmin takes longer
+            frames = torch.where((doubt < least)[:, :, None], colour, frames)
+            least = torch.minimum(least, doubt)
+    if not torch.is_grad_enabled():
+        return frames
+    mean = torch.stack([p[:, :, None] * colour for p, colour in zip(share, colours, strict=True)]).sum(0)
+    return frames + (mean - mean.detach())
+
+
+def _apart(one: Tensor, other: Tensor) -> Tensor:
+    """Summed difference [B, K, H, W] of colours [B, K, 3, H, W]."""
+    return (one - other).abs().sum(2)
 
 
 def changed(frames: Tensor, last: Tensor) -> Tensor:

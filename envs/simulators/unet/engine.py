@@ -27,12 +27,11 @@ from envs.simulators.unet.blocks import (
     flow_head,
     output_head,
 )
-from envs.simulators.unet.compose import DRAWN, changed, choose, compose, surprise
+from envs.simulators.unet.compose import DRAWN, Sources, changed, choose, compose, surprise
 from envs.simulators.unet.folding import unfold
 from envs.specs import WorldSpec
 
 _COND = 256  # numbers of the action embedding
-Sources = tuple[Tensor, Tensor]  # colours and log-probabilities of a view's pixels
 
 
 class UNetSimulator(Simulator):
@@ -115,7 +114,7 @@ class UNetSimulator(Simulator):
         """
         full = []
         for shrink, sources in zip(self.shrink, views, strict=True):
-            view = choose(*sources)
+            view = choose(sources)
             if shrink > 1:
                 large = F.interpolate(
                     view.flatten(0, 1), self.spec.size, mode="bilinear", align_corners=False
@@ -144,7 +143,7 @@ class UNetSimulator(Simulator):
         return x, z, cond
 
     def views(self, inputs: TensorDict) -> tuple[list[Sources], Tensor]:
-        """What pixels of each view may be (compose), at the size it is predicted in, and the features."""
+        """The sources of each view, at the size it is predicted in, and the features."""
         x, z, cond = self._encode(inputs)
         x = self.fuse(torch.cat([x, F.pixel_shuffle(self.up(z), 2)], 1))
         for block in self.fine_out:
@@ -206,7 +205,7 @@ class UNetSimulator(Simulator):
             moved = changed(wanted, at_detail(last[:, view], shrink))
             weight = 1 + self.motion * torch.maximum(moved, self._unusual(wanted, view))
             weight = weight * valid[:, :, None, None, None] * emphasis
-            error = error + (surprise(*sources, wanted) * weight).sum()
+            error = error + (surprise(sources, wanted) * weight).sum()
             norm = norm + 3 * weight.sum()
         return error / norm.clamp(min=1)
 
