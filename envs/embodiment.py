@@ -8,7 +8,7 @@ torch, so physics workers start fast.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
 from math import prod
@@ -164,6 +164,21 @@ class Embodiment:
         if self.main_camera:
             return self.views.index(self.main_camera)
         return next((k for k, camera in enumerate(self.cameras) if camera.wrist is None), 0)
+
+    def views_of(self, cameras: str | Sequence[str]) -> tuple[int, ...]:
+        """Positions of the cameras that are meant: "all", "main", or some names.
+
+        Raises:
+            ValueError: if none is named, or one that the robot does not have.
+        """
+        if isinstance(cameras, str):
+            if cameras not in ("all", "main"):
+                raise ValueError(f"cameras={cameras!r} must be all, main or a list of {list(self.views)}")
+            return tuple(range(len(self.views))) if cameras == "all" else (self.main_view,)
+        unknown = [name for name in cameras if name not in self.views]
+        if unknown or not cameras:
+            raise ValueError(f"cameras={list(cameras)} must be some of {self.robot}'s {list(self.views)}")
+        return tuple(self.views.index(name) for name in cameras)
 
     @property
     def wrists(self) -> tuple[int | None, ...]:

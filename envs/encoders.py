@@ -5,6 +5,7 @@ alike.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -41,8 +42,10 @@ class MultiViewEncoder(nn.Module):
         blocks: residual blocks at the lowest resolution.
         grid: rows and columns of the coarse grid.
         look: features said of each key-point.
+        cameras: which are looked through (Embodiment.views_of); the others cost nothing.
 
-    Forward takes uint8, or float in -1..1, [B, V, 3 * pictures, H, W] and returns float32 [B, out_features].
+    Forward takes uint8, or float in -1..1, [B, V, 3 * pictures, H, W] of all cameras and returns float32
+    [B, out_features].
     """
 
     def __init__(
@@ -54,9 +57,11 @@ class MultiViewEncoder(nn.Module):
         blocks: int = 1,
         grid: int = 4,
         look: int = 4,
+        cameras: str | Sequence[str] = "all",
     ):
         super().__init__()
-        views, deep = spec.views, 2 * width
+        self.chosen = list(spec.embodiment.views_of(cameras))
+        views, deep = len(self.chosen), 2 * width
         self.stem = nn.Conv2d(3 * pictures, width, 5, stride=2, padding=2)
         self.halve = nn.Sequential()
         for _ in range(max(0, round(math.log2(min(spec.size) / _NATIVE)))):
@@ -80,6 +85,7 @@ class MultiViewEncoder(nn.Module):
         self.out_features = views * (points * (2 + look) + width * grid * grid)
 
     def forward(self, pictures: Tensor) -> Tensor:
+        pictures = pictures[:, self.chosen]
         batch, views = pictures.shape[:2]
         flat = to_signed(pictures).flatten(0, 1).contiguous(memory_format=torch.channels_last)
         x = self.halve(self.stem(flat))

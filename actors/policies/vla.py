@@ -7,7 +7,7 @@ perception as it is.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -31,12 +31,12 @@ class Perception(nn.Module):
 
     Args:
         spec: what the world shows.
-        points, width: of MultiViewEncoder.
+        points, width, cameras: of MultiViewEncoder.
     """
 
-    def __init__(self, spec: WorldSpec, points: int, width: int):
+    def __init__(self, spec: WorldSpec, points: int, width: int, cameras: str | Sequence[str]):
         super().__init__()
-        self.views = MultiViewEncoder(spec, points, width)
+        self.views = MultiViewEncoder(spec, points, width, cameras=cameras)
         self.text = TextEncoder(_TEXT_FEATURES)
         self.out_features = self.views.out_features + _TEXT_FEATURES
 
@@ -88,6 +88,7 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         head: config section of the action head (heads.py): `_target_` and its options.
         width: of the hidden vector.
         points, channels: key-points per view and width of the encoder.
+        cameras: which it looks through: "all", "main", or names.
 
     Reads image, state and the instruction's bytes; writes ("vla_action", "chunk") and its log-probability.
 
@@ -96,8 +97,16 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         ValueError: if it says chunks of another size than the robot takes.
     """
 
-    def __init__(self, spec: WorldSpec, head: Mapping[str, Any], width: int, points: int, channels: int):
-        eyes = Perception(spec, points, channels)
+    def __init__(
+        self,
+        spec: WorldSpec,
+        head: Mapping[str, Any],
+        width: int,
+        points: int,
+        channels: int,
+        cameras: str | Sequence[str],
+    ):
+        eyes = Perception(spec, points, channels, cameras)
         perception = TensorDictModule(eyes, in_keys=[IMAGE, INSTRUCTION_UTF8], out_keys=[VISUAL_FEATURES])
         fusion = TensorDictModule(
             Fusion(eyes.out_features, spec.state_dim, width),

@@ -6,6 +6,7 @@ or hid them (GE-Sim 2.0 judges video so, with a large vision-language model).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -26,6 +27,7 @@ class LearnedJudge(Judge):
 
     Args:
         spec: what frames show; any number of views of any size.
+        cameras: which it looks through: "all", "main", or names.
         hold: frames in a row that make an episode a success.
         margin: half-width of the band around the threshold in which a clip's best frame makes the judge
             abstain.
@@ -46,10 +48,11 @@ class LearnedJudge(Judge):
         points: int,
         text: int,
         hidden: int,
+        cameras: str | Sequence[str],
     ):
         super().__init__(hold)
         self.spec, self.margin, self.discount = spec, margin, discount
-        self.encoder = MultiViewEncoder(spec, points, width, pictures=2)
+        self.encoder = MultiViewEncoder(spec, points, width, pictures=2, cameras=cameras)
         self.words = TextEncoder(text)
         self.head = nn.Sequential(
             nn.Linear(self.encoder.out_features + text, hidden),
@@ -66,7 +69,9 @@ class LearnedJudge(Judge):
             frames, first: [N, V, 3, H, W], uint8 or float in -1..1.
             text: uint8 [N, TEXT_BYTES], the instructions (specs.text_to_bytes).
         """
-        seen = self.encoder(torch.cat((to_signed(frames), to_signed(first)), 2))
+        bytes_alone = frames.dtype == first.dtype == torch.uint8  # the encoder converts what it looks at
+        both = (frames, first) if bytes_alone else (to_signed(frames), to_signed(first))
+        seen = self.encoder(torch.cat(both, 2))
         success, progress = self.head(torch.cat((seen, self.words(text)), -1)).float().unbind(-1)
         return success, progress
 

@@ -45,7 +45,7 @@ def build(seed: int, envs: int) -> tuple[ChunkPolicy, LocalFleet]:
     torch.manual_seed(seed)
     env = ToyTrackingEnv(envs, seed=seed)
     head = {"_target_": "actors.policies.chunk_tokens.ChunkTokenHead", "bins": 64}
-    policy = ChunkPolicy(env.spec, head, width=128, points=8, channels=16)
+    policy = ChunkPolicy(env.spec, head, width=128, points=8, channels=16, cameras="all")
     return policy, LocalFleet(Host(env, policy, bootstrap=False))
 
 

@@ -8,7 +8,7 @@ import torch
 from envs.embodiment import Embodiment
 from envs.encoders import MultiViewEncoder, centres, to_signed
 from envs.specs import IMAGE
-from tests.embodiments import ARM_DELTAS, EMBODIMENTS, observations, world_spec
+from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, EMBODIMENTS, observations, world_spec
 
 
 @pytest.mark.parametrize("robot", EMBODIMENTS.values(), ids=list(EMBODIMENTS))
@@ -38,3 +38,21 @@ def test_centres_are_in_half_pictures_from_the_middle() -> None:
     share = torch.zeros(2, 4, 8)
     share[0, 0, 0] = share[1, 3, 7] = 1.0
     assert torch.allclose(centres(share), torch.tensor([[-0.875, -0.75], [0.875, 0.75]]))
+
+
+def test_cameras_that_are_not_looked_through_change_nothing() -> None:
+    robot = BIMANUAL_POSES
+    spec = world_spec(robot, (32, 32))
+    encoder = MultiViewEncoder(spec, points=4, width=8, cameras="main")
+    pictures = torch.randint(0, 256, (2, spec.views, 3, 32, 32), dtype=torch.uint8)
+    seen = encoder(pictures)
+    assert seen.shape[1] == encoder.out_features
+    others = [view for view in range(spec.views) if view != robot.main_view]
+    pictures[:, others] = 0
+    assert torch.equal(encoder(pictures), seen)
+
+
+@pytest.mark.parametrize("cameras", ["both", [], ["nose"]])
+def test_unknown_cameras_are_named_with_those_there_are(cameras: object) -> None:
+    with pytest.raises(ValueError, match=r"cameras=.* \['head'"):
+        BIMANUAL_POSES.views_of(cameras)  # type: ignore[arg-type]

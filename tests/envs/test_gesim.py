@@ -194,7 +194,9 @@ def test_rl_runs_inside_a_joint_world(tmp_path: Path) -> None:
     robot = replace(BIMANUAL_JOINTS, kinematics=two_arms(tmp_path))
     spec = WorldSpec(robot, (32, 48), 5, pose_map=True, ray_map=True)
     world = build(None, spec)
-    judge = LearnedJudge(spec, hold=99, margin=0.0, discount=0.9, width=8, points=8, text=8, hidden=16)
+    judge = LearnedJudge(
+        spec, hold=99, margin=0.0, discount=0.9, width=8, points=8, text=8, hidden=16, cameras="all"
+    )
     starts = InitialStates(first_of(spec, 3), ["pour"] * 3)
     base = WorldEnv(world, starts, 2, 10, ActionMode.RELATIVE, bf16=False)
     expert = GESimStateExpert(world, None).eval()

@@ -48,7 +48,6 @@ class UNetSimulator(Simulator):
 
     mean: Tensor
     spread: Tensor
-    hidden = ("conv1", "conv2", "down")
 
     def __init__(
         self,
