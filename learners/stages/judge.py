@@ -22,6 +22,10 @@ from learners.stages.pictures import augment
 from learners.stages.simulator import owners
 from learners.training.fit import FitConfig, fit
 
+_SHIFT = (
+    0.06  # largest shift of what a judge learns from, of the picture's size: it learns few frames by heart
+)
+
 
 class JudgeData:
     """Frames with their labels, half of them positive as far as there are any.
@@ -135,7 +139,7 @@ def train_judge(
 
     def loss(batch: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         views = batch["frames"].shape[1]  # the same colours for both, as one camera would give them
-        both = augment(torch.cat((batch["frames"], batch["first"]), 1), generator)
+        both = augment(torch.cat((batch["frames"], batch["first"]), 1), generator, _SHIFT)
         shown = batch.copy()
         shown["frames"], shown["first"] = both.split(views, 1)
         return judge.loss(shown, data.share)

@@ -48,6 +48,7 @@ class UNetSimulator(Simulator):
 
     mean: Tensor
     spread: Tensor
+    hidden = ("conv1", "conv2", "down")
 
     def __init__(
         self,
