@@ -62,11 +62,12 @@ class JudgeData:
                 "no episode of the data says whether it succeeded (next.success or next.reward), so a judge"
                 " cannot learn from them; label some, or use a judge that needs no labels"
             )
-        self.pools = [_Pool(self.labels, rows)]
+        when = torch.arange(len(self.labels)) - torch.repeat_interleave(store.start, store.length)
+        self.pools = [_Pool(self.labels, when, rows)]
         if generated is not None:
             known = generated[torch.isfinite(self.labels[generated["row"]])]
             if len(known):
-                self.pools.append(_Pool(self.labels, known["row"], known["frames"]))
+                self.pools.append(_Pool(self.labels, when, known["row"], known["frames"]))
         self.share = float(self.labels[rows].mean().clamp(0.02, 0.98))
         self._text = text_to_bytes(store.instructions)
 
@@ -91,23 +92,45 @@ class JudgeData:
 
 
 class _Pool:
-    """Frames to draw from: recorded rows [N], or generated frames and the rows that label them."""
+    """Frames to draw from: recorded rows [N], or generated frames and the rows that label them.
 
-    def __init__(self, labels: Tensor, rows: Tensor, frames: Tensor | None = None):
-        self.rows, self.frames = rows, frames
+    Args:
+        labels: of all rows.
+        when: of all rows, their number within the episode.
+    """
+
+    def __init__(self, labels: Tensor, when: Tensor, rows: Tensor, frames: Tensor | None = None):
+        self.rows, self.frames, self.when = rows, frames, when[rows]
         self.positive = (labels[rows] > 0.5).nonzero().flatten()
-        self.negative = (labels[rows] <= 0.5).nonzero().flatten()
+        negative = (labels[rows] <= 0.5).nonzero().flatten()
+        self.negative = negative[self.when[negative].argsort(stable=True)]
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor | None]:
-        """Rows [count], a third of them positive whatever the data's share is, and their frames if made."""
+        """Rows [count], a third of them positive whatever the data's share is, and their frames if made.
+
+        Another third fails at the same times as those succeed. Episodes end with success, so success has its
+        usual time, and generated frames show by their faults how late it is: judges would tell by that.
+        """
         wanted = count // 3 if len(self.positive) else 0
         wanted = wanted if len(self.negative) else count
-        parts = []
-        for pool, size in ((self.negative, count - wanted), (self.positive, wanted)):
-            if size:
-                parts.append(pool[torch.randint(len(pool), (size,), generator=generator)])
+        parts = [_pick(self.positive, wanted, generator)] if wanted else []
+        if wanted < count:
+            beside = self._alongside(parts[0], generator) if wanted else torch.zeros(0, dtype=torch.int64)
+            parts += [beside, _pick(self.negative, count - wanted - len(beside), generator)]
         at = torch.cat(parts)
         return self.rows[at], None if self.frames is None else self.frames[at]
+
+    def _alongside(self, positive: Tensor, generator: torch.Generator) -> Tensor:
+        """A negative frame of the same time for each positive one that has any."""
+        times, wanted = self.when[self.negative], self.when[positive]
+        low, high = torch.searchsorted(times, wanted), torch.searchsorted(times, wanted, right=True)
+        share = torch.rand(len(positive), generator=generator, dtype=torch.float64)
+        at = low + (share * (high - low)).long()
+        return self.negative[at[high > low]]
+
+
+def _pick(pool: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    return pool[torch.randint(len(pool), (count,), generator=generator)]
 
 
 def frame_targets(store: ClipStore, hold: int, discount: float) -> tuple[Tensor, Tensor]:

@@ -48,7 +48,7 @@ class UNetSimulator(Simulator):
 
     mean: Tensor
     spread: Tensor
-    hidden = ("conv1", "conv2", "down")
+    hidden = ("embed", "conv1", "conv2", "down", "flows")  # slow for what is wide, worse for heads
 
     def __init__(
         self,
@@ -101,7 +101,7 @@ class UNetSimulator(Simulator):
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; features are the pooled bottleneck beside the action embedding."""
         views, features = self.views(inputs)
-        return self._frames(views).to(torch.uint8), features
+        return self._frames(views).round().to(torch.uint8), features
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is drawn."""
