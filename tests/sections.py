@@ -19,10 +19,11 @@ def section(choice: str, mode: str = "relative", **changes: Any) -> dict[str, An
     """A choice such as "policy/chunk_gaussian" as plain containers, with keys changed.
 
     Args:
-        mode: stands for ${task.mode}.
+        mode: stands for ${task.mode}; ${cameras} is all.
         changes: values for keys of the section; of nested sections, dictionaries of what differs there.
     """
     text = (CONFIGS / f"{choice}.yaml").read_text().replace("${task.mode}", mode)
+    text = text.replace("${cameras}", "all")
     return merged(yaml.safe_load(text), changes)
 
 

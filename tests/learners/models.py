@@ -24,7 +24,7 @@ def section_of(kind: str, name: str, mode: ActionMode = ActionMode.RELATIVE) -> 
     own = OmegaConf.load(CONFIGS / kind / f"{name}.yaml")
     bases = [base for base in own.pop("defaults", []) if base != "_self_"]
     merged = OmegaConf.merge(*(OmegaConf.load(CONFIGS / kind / f"{base}.yaml") for base in bases), own)
-    whole = OmegaConf.create({"task": {"mode": mode.value}, kind: merged})
+    whole = OmegaConf.create({"task": {"mode": mode.value}, "cameras": "all", kind: merged})
     return dict(OmegaConf.to_container(whole, resolve=True)[kind])  # type: ignore[call-overload, index]
 
 

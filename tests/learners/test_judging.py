@@ -49,6 +49,19 @@ def test_batches_are_balanced_and_labelled_by_time_and_success(tiny_store: Store
     assert not bool(failed.sample(30, torch.Generator().manual_seed(0))["progress"].any())
 
 
+def test_failures_are_as_late_as_successes(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    data = JudgeData(store, torch.arange(20), hold=2, discount=0.5)
+    pool = data.pools[0]
+    rows, _ = pool.draw(300, torch.Generator().manual_seed(0))
+    won, beside = data.labels[rows[:100]], data.labels[rows[100:200]]
+    assert bool((won == 1).all()) and not bool(beside.any())
+    owner = torch.searchsorted(store.start, rows, right=True) - 1
+    when = rows - store.start[owner]
+    possible = torch.isin(when[:100], pool.when[pool.negative])
+    assert torch.equal(when[:100][possible], when[100 : 100 + int(possible.sum())])
+
+
 def test_generated_frames_are_labelled_by_what_truly_happened(tiny_store: Stores) -> None:
     store = tiny_store(ARM_DELTAS)
     rows = store.rows(torch.arange(20))
