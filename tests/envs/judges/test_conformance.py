@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
-import yaml
 from torch import Tensor
 
 from envs.embodiment import Embodiment
@@ -14,16 +11,15 @@ from envs.judges import Judge
 from envs.specs import Status, WorldSpec
 from envs.targets import build
 from tests.embodiments import EMBODIMENTS, INSTRUCTIONS, world_spec
+from tests.sections import offered, section
 
-CONFIGS = sorted((Path(__file__).resolve().parents[3] / "configs/judge").glob("*.yaml"))
 
-
-@pytest.fixture(params=CONFIGS, ids=lambda path: path.stem)
-def section(request: pytest.FixtureRequest) -> dict[str, object]:
+@pytest.fixture(params=offered("judge"))
+def options(request: pytest.FixtureRequest) -> dict[str, object]:
     """The options of a judge."""
-    options = yaml.safe_load(request.param.read_text())
+    options = section(f"judge/{request.param}")
     options.pop("rewards", None)  # of the environment that asks the judge
-    return dict(options)
+    return options
 
 
 @pytest.fixture(params=EMBODIMENTS.values(), ids=EMBODIMENTS)
@@ -34,10 +30,10 @@ def spec(request: pytest.FixtureRequest) -> WorldSpec:
 
 
 @pytest.fixture
-def judge(section: dict[str, object], spec: WorldSpec) -> Judge:
+def judge(options: dict[str, object], spec: WorldSpec) -> Judge:
     """The judge with random weights."""
     torch.manual_seed(0)
-    return build(section, "judge", spec=spec).eval()  # type: ignore[no-any-return]
+    return build(options, "judge", spec=spec).eval()  # type: ignore[no-any-return]
 
 
 def clips(spec: WorldSpec, batch: int, frames: int) -> tuple[Tensor, Tensor, list[str]]:
