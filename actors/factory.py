@@ -24,6 +24,7 @@ from envs.conditioning import PoseMapStyle
 from envs.embodiment import Embodiment, EmbodimentError, Robot
 from envs.episodes.clips import ClipStore
 from envs.geometry.kinematics import Kinematics, KinematicsError
+from envs.initial_states import InitialStates
 from envs.judges.base import Judge
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import TaskPool, available_cores
@@ -33,7 +34,7 @@ from envs.simulators.state_experts.base import StateDecoder
 from envs.specs import ActionMode, Rewards, WorldSpec
 from envs.targets import ConfigError, build, options, to_plain
 from envs.transforms import world_transforms
-from envs.world import InitialStates, WorldEnv
+from envs.world import WorldEnv
 
 __all__ = [
     "ConfigError",
@@ -272,20 +273,19 @@ def build_world(
     starts: InitialStates,
     batch: int,
     later: bool = False,
-    seed: int = 0,
+    horizon: int | None = None,
 ) -> TransformedEnv:
-    """The imagined world with its three transforms; `later` is JudgeReward's."""
+    """The imagined world with its three transforms; `later` is JudgeReward's, `horizon` overrides the task's."""
     task, section = cfg["task"], cfg["simulator"]
     simulator.eval(), decoder.eval(), judge.eval()
     base = WorldEnv(
         simulator,
         starts,
         batch,
-        task["horizon"],
+        horizon or task["horizon"],
         ActionMode(task["mode"]),
         section["shared_noise"],
         section["bf16"],
-        seed,
     )
     transforms = world_transforms(
         world_spec(cfg),

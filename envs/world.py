@@ -7,7 +7,6 @@ world_transforms(...)).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Composite, Unbounded
 
 from envs.chunked import ChunkedEnv
-from envs.episodes.clips import ClipStore
+from envs.initial_states import InitialStates
 from envs.precision import mixed_precision
 from envs.simulators import memory
 from envs.simulators.base import Simulator
@@ -34,28 +33,6 @@ from envs.specs import (
     SUCCESS,
     ActionMode,
 )
-
-
-@dataclass
-class InitialStates:
-    """Recorded frames from which imagined episodes begin.
-
-    Args:
-        first: TensorDict [N] as Simulator.reset takes it.
-        instructions: N texts.
-    """
-
-    first: TensorDict
-    instructions: list[str]
-
-    @classmethod
-    def of(cls, store: ClipStore, episodes: torch.Tensor | None = None) -> InitialStates:
-        """The first frames of the given episodes of a store, of all by default."""
-        chosen = torch.arange(len(store)) if episodes is None else episodes
-        return cls(store.first(chosen), [store.episodes[n]["instruction"] for n in chosen.tolist()])
-
-    def __len__(self) -> int:
-        return len(self.instructions)
 
 
 class WorldEnv(ChunkedEnv):
@@ -92,7 +69,7 @@ class WorldEnv(ChunkedEnv):
         seed: int = 0,
     ):
         spec, device = simulator.spec, simulator.device
-        shown, wanted = tuple(starts.first["frames"].shape[1:]), (spec.views, 3, *spec.size)
+        shown, wanted = starts.shown, (spec.views, 3, *spec.size)
         if shown != wanted:
             raise ValueError(f"initial states show {shown}, the simulator {wanted}; train it on these views")
         super().__init__(spec, batch, horizon, mode, device, seed)
@@ -117,12 +94,12 @@ class WorldEnv(ChunkedEnv):
         mask = self._reset_mask(tensordict)
         seeds = self._next_seeds(mask)[mask]
         start = seeds % len(self.starts)
-        first = self.starts.first[start].to(self.device)
+        past, length = self.starts.past(start)
         if self.session is not None:
             self.simulator.release(self.session, mask)
-        begun = self.simulator.reset(
-            first, (start if self.shared_noise else seeds).to(self.device), capacity=self.horizon + 1
-        )
+        noise = (start if self.shared_noise else seeds).to(self.device)
+        room = self.starts.longest + self.horizon
+        begun = self.simulator.resume(past.to(self.device), length.to(self.device), noise, room)
         if self.session is None or mask.all():
             self.session = begun
         else:
@@ -168,7 +145,15 @@ class WorldEnv(ChunkedEnv):
             out, [self.starts.instructions[int(s)] for s in self._seeds % len(self.starts)]
         )
 
+    @property
+    def opening(self) -> torch.Tensor:
+        """The frames with which episodes began, uint8 [B, V, 3, H, W], even where imagination took over
+        later.
+        """
+        assert self.session is not None
+        return self.session["history", "frames"][:, 0]
+
     def video(self, slot: int) -> torch.Tensor:
-        """All frames of the episode in a slot so far, uint8 [T, V, 3, H, W], the first being real."""
+        """All frames of the episode in a slot so far, uint8 [T, V, 3, H, W], the first ones real."""
         assert self.session is not None
         return self.session["history", "frames"][slot, : int(self.session["length"][slot])].cpu()

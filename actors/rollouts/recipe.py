@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from actors.factory import (
     build_judge,
     build_physics,
@@ -21,9 +23,9 @@ from actors.factory import (
 )
 from actors.policies.contract import freeze_perception
 from actors.rollouts.host import Host
+from envs.initial_states import DecisionPoints, InitialStates
 from envs.judges.base import Judge
 from envs.targets import ConfigError, options
-from envs.world import InitialStates
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,9 @@ class Recipe:
         episodes: side by side.
         policy: weights of the policy that RL starts from.
         simulator, decoder, judge: weights of the imagined world; without a simulator it is physics.
-        data: data sets in whose first frames imagination begins.
+        data: data sets in whose episodes imagination begins.
+        inside: numbers of the episodes anywhere inside which it begins; none for all first frames.
+        horizon: control steps of an imagined episode; 0 for the task's.
         freeze_perception, bootstrap: see RLConfig and Host.
         later: let rewards arrive after the episode, see JudgeReward.
         service: name of the judge service to ask instead of a judge of its own.
@@ -49,6 +53,8 @@ class Recipe:
     decoder: str = ""
     judge: str = ""
     data: tuple[str, ...] = ()
+    inside: tuple[int, ...] = ()
+    horizon: int = 0
     freeze_perception: bool = False
     bootstrap: bool = True
     later: bool = False
@@ -96,16 +102,16 @@ def build_host(recipe: Recipe) -> Host:
         )
     else:
         judge = build_judge(cfg, Path(recipe.judge))
-    starts = InitialStates.of(open_clips(cfg, [Path(folder) for folder in recipe.data]))
-    return Host(
-        build_world(cfg, simulator, decoder, judge, starts, recipe.episodes, recipe.later),
-        policy,
-        recipe.bootstrap,
+    store = open_clips(cfg, [Path(folder) for folder in recipe.data])
+    starts = DecisionPoints(store, torch.tensor(recipe.inside)) if recipe.inside else InitialStates.of(store)
+    world = build_world(
+        cfg, simulator, decoder, judge, starts, recipe.episodes, recipe.later, recipe.horizon or None
     )
+    return Host(world, policy, recipe.bootstrap)
 
 
 def build_host_process(plain: Mapping[str, Any]) -> Host:
     """build_host in a process of its own: from the wire's form of a recipe, with its threads."""
-    recipe = Recipe(**{**plain, "data": tuple(plain["data"])})
+    recipe = Recipe(**{**plain, **{name: tuple(plain[name]) for name in ("data", "inside")}})
     prepare_process(0, recipe.threads)
     return build_host(recipe)

@@ -116,7 +116,20 @@ class Simulator(nn.Module):
         Returns:
             The sessions' state, a TensorDict [B].
         """
-        return memory.new_sessions(first, seed, capacity)
+        return self.resume(first.unsqueeze(1), torch.ones(len(first), dtype=torch.int64), seed, capacity)
+
+    def resume(self, past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1) -> TensorDict:
+        """Begin sessions that go on from recorded frames.
+
+        Args:
+            past: TensorDict [B, P] with what `reset` takes of a first frame, of every frame so far.
+            length: int64 [B], how many of them there are, in 1..P.
+            seed, capacity: see reset.
+
+        Returns:
+            The sessions' state, a TensorDict [B].
+        """
+        return memory.new_sessions(past, length, seed, capacity)
 
     @torch.no_grad()
     def step(self, state: TensorDict, future: TensorDict) -> tuple[Tensor, Tensor, TensorDict]:

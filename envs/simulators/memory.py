@@ -27,21 +27,21 @@ def memory_indices(length: Tensor, count: int) -> Tensor:
     return ((length.unsqueeze(-1) - 1) * share).round().long()
 
 
-def new_sessions(first: TensorDict, seed: Tensor, capacity: int = 1) -> TensorDict:
-    """The state of sessions that begin with `first` [B]; see Simulator.reset."""
-    size, device = first.shape, first["frames"].device
-    rows = {_FIRST[name]: value[:, None] for name, value in first.items() if name in _FIRST}
+def new_sessions(past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1) -> TensorDict:
+    """The state of sessions that go on from `past` [B, P]; see Simulator.resume."""
+    size, device = past.shape[:1], past["frames"].device
+    rows = {_FIRST[name]: value for name, value in past.items() if name in _FIRST}
     state = TensorDict(
         {
-            "history": _with_capacity(TensorDict(rows, [*size, 1]), capacity),
-            "length": torch.ones(size, dtype=torch.int64, device=device),
+            "history": _with_capacity(TensorDict(rows, past.shape), capacity),
+            "length": length.to(device, copy=True),
             "seed": seed.reshape(size).to(device),
             "chunk_index": torch.zeros(size, dtype=torch.int64, device=device),
         },
         size,
     )
-    if "intrinsic" in first.keys():
-        state["intrinsic"] = first["intrinsic"].float()
+    if "intrinsic" in past.keys():
+        state["intrinsic"] = past["intrinsic"][:, 0].float()
     return state
 
 
@@ -130,8 +130,9 @@ def replace(state: TensorDict, mask: Tensor, begun: TensorDict) -> TensorDict:
     for name in state.keys():
         if name != "history":
             state[name][mask] = begun[name].to(state[name].dtype)
+    slots, known = mask.nonzero().flatten()[:, None], torch.arange(int(begun["length"].max()))
     for name in state["history"].keys():
-        state["history", name][mask.nonzero().flatten(), 0] = begun["history", name][:, 0]
+        state["history", name][slots, known] = begun["history", name][:, : len(known)]
     return state
 
 

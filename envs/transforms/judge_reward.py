@@ -91,16 +91,16 @@ class JudgeReward(Transform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         mask = tensordict.get("_reset", None)
-        image = tensordict_reset[IMAGE]
-        progress = self.judge.score(image.unsqueeze(1), image, self.parent.base_env.instructions).progress
+        image, world = tensordict_reset[IMAGE], self.parent.base_env
+        progress = self.judge.score(image.unsqueeze(1), world.opening, world.instructions).progress
         if mask is None or self._run.shape[0] != progress.shape[0]:
             self._run = torch.zeros(progress.shape[0], dtype=torch.int64, device=progress.device)
-            self._progress, self._first = progress, image.clone()
+            self._progress, self._first = progress, world.opening.clone()
         else:
             mask = mask.reshape(-1, 1)
             self._run = torch.where(mask.squeeze(-1), 0, self._run)
             self._progress = torch.where(mask, progress, self._progress)
-            self._first = torch.where(mask[..., None, None, None], image, self._first)
+            self._first = torch.where(mask[..., None, None, None], world.opening, self._first)
         tensordict_reset[PROGRESS] = self._progress
         tensordict_reset[JUDGE_STATUS] = torch.full_like(self._run, Status.OK.value).unsqueeze(-1)
         return tensordict_reset.exclude(FRAMES, FEATURES, "world")

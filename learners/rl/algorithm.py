@@ -24,6 +24,11 @@ class RLConfig:
         envs: episodes side by side over all hosts, and so the least number of episodes per iteration.
         shards: jobs an iteration is cut into, each of envs / shards episodes; results depend on this, not on
             who runs them.
+        starts: imagined episodes begin "inside" the newest recorded ones, at any of their chunks, or at the
+            "first" frames of all. A world errs more with every chunk it builds on its own; from inside, short
+            episodes meet every stage of the task.
+        horizon: control steps of an imagined episode, None for the task's; what a critic expects of the rest
+            stands in for it, and algorithms without one run whole episodes.
         schedule: "sync" learns from rollouts of the newest policy only; "async" lets hosts run on meanwhile.
         max_policy_lag: versions a rollout may be behind, if async.
         queue: jobs submitted and not yet learned from at most, if async.
@@ -49,6 +54,8 @@ class RLConfig:
     iterations: int
     envs: int
     shards: int
+    starts: str
+    horizon: int | None
     schedule: str
     max_policy_lag: int
     queue: int
@@ -67,6 +74,8 @@ class RLConfig:
     seed: int
 
     def __post_init__(self) -> None:
+        if self.starts not in ("inside", "first"):
+            raise ValueError(f"starts={self.starts!r} must be inside or first")
         if self.schedule not in ("sync", "async"):
             raise ValueError(f"schedule={self.schedule!r} must be sync or async")
         if self.envs % self.shards:

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 
 from actors.factory import build_judge, build_simulator, build_state_decoder, build_world, open_clips
 from envs.episodes.clips import ClipStore
+from envs.initial_states import InitialStates
 from envs.specs import ActionMode
 from envs.targets import ConfigError, options
-from envs.world import InitialStates
 from learners.rl.algorithm import RLConfig
 from learners.training.fit import FitConfig
 from pipeline.graph.stage import Inputs

@@ -12,6 +12,9 @@ from actors.fleets.launch import build_fleet
 from actors.policies.contract import freeze_perception
 from actors.rollouts.recipe import Recipe
 from envs.episodes.clips import ClipStore
+from envs.initial_states import decision_points
+from envs.targets import ConfigError
+from learners.rl.algorithm import Algorithm
 from learners.rl.dataset_rollout import dataset_rollout
 from learners.rl.loop import train_rl
 from learners.stages.imitation import Cloning
@@ -26,6 +29,7 @@ from pipeline.stages.given import (
     datasets,
     learning_episodes,
     mode_of,
+    newest_episodes,
     open_store,
     rl_options,
     successful_episodes,
@@ -52,6 +56,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         freeze_perception(policy)
         anchor.encode()
     algorithm = build_algorithm(cfg, policy)
+    inside = newest_episodes(store, learning_episodes(store)) if settings.starts == "inside" else None
     knew = _warm_up(cfg, policy, algorithm, store, settings.seed, number)
     recipe = Recipe(
         config=cfg.plain(),
@@ -61,19 +66,35 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         decoder=str(inputs.weights("state")),
         judge=str(inputs.weights("judge")),
         data=tuple(str(path) for path in datasets(inputs.folders("data"))),
+        inside=() if inside is None else tuple(inside.tolist()),
+        horizon=_horizon(cfg, settings.horizon, algorithm),
         freeze_perception=settings.freeze_perception,
         bootstrap=algorithm.bootstraps,
         later=settings.rewards_later,
     )
     fleet = build_fleet(recipe) if leads() else None
     try:
-        stats = train_rl(fleet, policy, algorithm, settings, folder, starts=len(store), anchor=anchor)
+        starts = len(store) if inside is None else len(decision_points(store, inside)[0])
+        stats = train_rl(fleet, policy, algorithm, settings, folder, starts=starts, anchor=anchor)
     finally:
         if fleet is not None:
             fleet.close()
     save_weights(policy, folder)
     last = {f"last_{key}": value for key, value in stats.pop("last").items()}
     return {**knew, **stats, **last}
+
+
+def _horizon(cfg: Cfg, wanted: int | None, algorithm: Algorithm) -> int:
+    """Control steps of an imagined episode: rl.horizon for algorithms with a critic, which stands in for the
+    rest; others value whole episodes.
+    """
+    whole, chunk = cfg["task"]["horizon"], cfg["task"]["chunk"]
+    if wanted is not None and (wanted % chunk or not chunk <= wanted <= whole):
+        raise ConfigError(
+            f"rl.horizon={wanted} must be a multiple of task.chunk={chunk}, at most task.horizon={whole}, or"
+            " null for that"
+        )
+    return int(wanted if wanted and algorithm.bootstraps else whole)
 
 
 def _warm_up(

@@ -17,6 +17,7 @@ from torchrl.envs.utils import check_env_specs
 
 from envs.conditioning import render_ray_map
 from envs.geometry.kinematics import Kinematics
+from envs.initial_states import InitialStates
 from envs.judges.learned import LearnedJudge
 from envs.simulators import memory
 from envs.simulators.gesim.checkpoint import CheckpointError, load_released, load_state_network
@@ -27,7 +28,7 @@ from envs.simulators.samplers import EDM, Distilled
 from envs.simulators.state_experts.flow import StateExpert
 from envs.specs import CHUNK, STATE, ActionMode, Rewards, WorldSpec
 from envs.transforms import world_transforms
-from envs.world import InitialStates, WorldEnv
+from envs.world import WorldEnv
 from tests.arms import two_arms
 from tests.embodiments import BIMANUAL_JOINTS, BIMANUAL_POSES
 from tests.envs.clips_of import clip_of, first_of, future_of

@@ -7,6 +7,7 @@ import torch
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from envs.initial_states import InitialStates
 from envs.judges.base import Judge, Verdict
 from envs.specs import (
     CHUNK,
@@ -24,7 +25,7 @@ from envs.specs import (
     bytes_to_text,
 )
 from envs.transforms import world_transforms
-from envs.world import InitialStates, WorldEnv
+from envs.world import WorldEnv
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, EMBODIMENTS, world_spec
 from tests.envs.simulators.clips import clip, first_of
 from tests.envs.simulators.test_engines import build_engine

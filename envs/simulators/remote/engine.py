@@ -69,13 +69,16 @@ class RemoteSimulator(Simulator):
         self._pool = ThreadPoolExecutor(_PARALLEL)
         self._end = weakref.finalize(self, _close_all, self._connections)
 
-    def reset(self, first: TensorDict, seed: Tensor, capacity: int = 1) -> TensorDict:
-        """See Simulator.reset; opens a session for every row, or for none.
+    def resume(self, past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1) -> TensorDict:
+        """See Simulator.resume; opens a session for every row, or for none.
 
         Raises:
-            RemoteError: if the servers do not have that many places, or refuse.
+            RemoteError: if the servers do not have that many places, or refuse; if more than one frame is
+                given, which the protocol has no word for.
         """
-        state = super().reset(first, seed, capacity)
+        if bool((length > 1).any()):
+            raise RemoteError("a server's sessions begin with one frame; set rl.starts=first")
+        state, first = super().resume(past, length, seed, capacity), past[:, 0]
         places, free = self._free()
         if len(free) < len(first):
             raise RemoteError(
