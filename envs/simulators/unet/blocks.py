@@ -14,7 +14,8 @@ from envs.simulators.row_linear import RowLinear
 from envs.simulators.unet.folding import fold
 from envs.specs import WorldSpec
 
-FOLD = 4  # pixels folded into channels, both ways
+FOLD = 2  # pixels of the main view folded into channels, both ways
+SIDE_FOLD = 4  # of the other views, at half the detail
 _MAPS = 16  # channels of the action map before it is lifted
 
 
@@ -51,17 +52,18 @@ class Embed(nn.Module):
         channels: of the pictures, which are bytes.
         width: of what comes out.
         shrink: 2 looks at the mean of each four pixels, 1 at all.
+        edge: of a square.
     """
 
-    def __init__(self, channels: int, width: int, shrink: int):
+    def __init__(self, channels: int, width: int, shrink: int, edge: int):
         super().__init__()
-        self.shrink = shrink
-        bound = channels**-0.5 / FOLD
-        self.weight = nn.Parameter(torch.empty(width, channels, FOLD, FOLD).uniform_(-bound, bound))
+        self.shrink, self.edge = shrink, edge
+        bound = channels**-0.5 / edge
+        self.weight = nn.Parameter(torch.empty(width, channels, edge, edge).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.empty(width).uniform_(-bound, bound))
 
     def forward(self, pictures: Sequence[Tensor]) -> Tensor:
-        """[B, width, h / 4, w / 4] of pictures [B, C, shrink h, shrink w], bytes or floats in 0..255."""
+        """[B, width, h / edge, w / edge] of pictures [B, C, shrink h, shrink w], bytes or floats in 0..255."""
         dtype = working_dtype(self.weight.device, self.weight.dtype)
         weight: Tensor = self.weight
         if self.shrink > 1:
@@ -70,7 +72,7 @@ class Embed(nn.Module):
             )
         # Bytes stay what they are; that they are meant as -1..1 is left to the weights.
         weight = weight.flatten(1)
-        folded = torch.cat([fold(some, FOLD * self.shrink).to(dtype) for some in pictures], -1)
+        folded = torch.cat([fold(some, self.edge * self.shrink).to(dtype) for some in pictures], -1)
         return F.linear(folded, weight / 127.5, self.bias - weight.sum(1)).permute(0, 3, 1, 2)
 
 
@@ -118,7 +120,7 @@ class ActionEncoder(nn.Module):
         return cond, self.lift(self.map(cond))
 
 
-def output_head(width: int, chunk: int, maps: int, memory: int) -> nn.Sequential:
+def output_head(width: int, chunk: int, maps: int, memory: int, edge: int) -> nn.Sequential:
     """Output maps of one view; it starts from the last frame, for random output takes hundreds of steps to
     unlearn.
 
@@ -127,9 +129,10 @@ def output_head(width: int, chunk: int, maps: int, memory: int) -> nn.Sequential
         chunk: frames per chunk.
         maps: per frame; the first are logits of the `memory` remembered frames, of which the last is the
             newest.
+        edge: of the square that each place says.
     """
-    last = nn.Conv2d(width, maps * chunk * FOLD**2, 1)
-    bias = torch.zeros(chunk, maps, FOLD**2)
+    last = nn.Conv2d(width, maps * chunk * edge**2, 1)
+    bias = torch.zeros(chunk, maps, edge**2)
     bias[:, memory - 1 : memory + 1] = 1.0
     nn.init.zeros_(last.weight)
     last.bias = nn.Parameter(bias.flatten())
@@ -137,7 +140,7 @@ def output_head(width: int, chunk: int, maps: int, memory: int) -> nn.Sequential
 
 
 def flow_head(width: int, chunk: int) -> nn.Sequential:
-    """Flow of one view, [B, 2 * chunk, h / 4, w / 4]: one vector per square and frame keeps it smooth."""
+    """Flow of one view, [B, 2 * chunk, h, w] of features [B, width, h, w]: one vector per square and frame keeps it smooth."""
     last = nn.Conv2d(width, 2 * chunk, 3, padding=1)
     nn.init.zeros_(last.weight)
     assert last.bias is not None

@@ -20,6 +20,7 @@ from envs.simulators.base import Simulator
 from envs.simulators.inputs import build_inputs
 from envs.simulators.unet.blocks import (
     FOLD,
+    SIDE_FOLD,
     ActionEncoder,
     Embed,
     FilmBlock,
@@ -32,6 +33,7 @@ from envs.simulators.unet.folding import unfold
 from envs.specs import WorldSpec
 
 _COND = 256  # numbers of the action embedding
+_DEEP = 8  # pixels of the main view, each way, of a place at the coarsest level
 
 
 class UNetSimulator(Simulator):
@@ -40,8 +42,10 @@ class UNetSimulator(Simulator):
     Args:
         spec: what it shows; sizes must be multiples of 16.
         memory_frames: sparse memory frames, the first and the last among them.
-        width: channels at a quarter of the resolution, a multiple of 8; at an eighth twice as many.
-        fine_blocks, deep_blocks: residual blocks per fine half, and in the bottleneck.
+        width: channels at half the resolution, a multiple of 8; twice as many at a quarter, and again at an
+            eighth.
+        fine_blocks, mid_blocks: residual blocks on the way down, and on the way up, at a half and a quarter.
+        deep_blocks: residual blocks at an eighth.
         motion: extra loss weight of pixels that change, or look unusual for their place.
         side_weight: loss weight of every view but the main one.
     """
@@ -56,6 +60,7 @@ class UNetSimulator(Simulator):
         memory_frames: int,
         width: int,
         fine_blocks: int,
+        mid_blocks: int,
         deep_blocks: int,
         motion: float,
         side_weight: float,
@@ -67,23 +72,32 @@ class UNetSimulator(Simulator):
         self.motion = motion
         self.shrink = tuple(1 if view == main else 2 for view in range(spec.views))
         self.emphasis = tuple(1.0 if view == main else side_weight for view in range(spec.views))
-        wide, cells = 2 * width, (spec.size[0] // (2 * FOLD), spec.size[1] // (2 * FOLD))
+        half, wide, cells = 2 * width, 4 * width, (spec.size[0] // _DEEP, spec.size[1] // _DEEP)
         self.feature_shape = (wide + _COND,)
         self.actions = ActionEncoder(spec, _COND, wide, cells)
         pictures = 3 * (memory_frames + (memory_frames + spec.chunk if spec.pose_map else 0))
-        self.embed = nn.ModuleList(Embed(pictures, width if s == 1 else wide, s) for s in self.shrink)
-        self.where = nn.Parameter(0.02 * torch.randn(1, width, 2 * cells[0], 2 * cells[1]))
+        self.embed = nn.ModuleList(
+            Embed(pictures, width, s, FOLD) if s == 1 else Embed(pictures, wide, s, SIDE_FOLD)
+            for s in self.shrink
+        )
+        self.where = nn.Parameter(0.02 * torch.randn(1, half, 2 * cells[0], 2 * cells[1]))
         self.rays = nn.Conv2d(12 * spec.views, wide, 1) if spec.ray_map else None
-        self.down = nn.Conv2d(width, wide, 2, stride=2)
-        self.up = nn.Conv2d(wide, width * 4, 1)
-        self.fuse = nn.Conv2d(2 * width, width, 1)
+        self.down = nn.ModuleList((nn.Conv2d(width, half, 2, stride=2), nn.Conv2d(half, wide, 2, stride=2)))
+        self.up = nn.ModuleList((nn.Conv2d(half, width * 4, 1), nn.Conv2d(wide, half * 4, 1)))
+        self.fuse = nn.ModuleList((nn.Conv2d(2 * width, width, 1), nn.Conv2d(2 * half, half, 1)))
         self.fine_in = nn.ModuleList(FilmBlock(width, _COND) for _ in range(fine_blocks))
+        self.mid_in = nn.ModuleList(FilmBlock(half, _COND) for _ in range(mid_blocks))
         self.deep = nn.ModuleList(FilmBlock(wide, _COND) for _ in range(deep_blocks))
+        self.mid_out = nn.ModuleList(FilmBlock(half, _COND) for _ in range(mid_blocks))
         self.fine_out = nn.ModuleList(FilmBlock(width, _COND) for _ in range(fine_blocks))
         self.maps = memory_frames + 1 + DRAWN  # logits of the sources, and drawn colour
-        widths = [width if s == 1 else wide for s in self.shrink]
-        self.heads = nn.ModuleList(output_head(w, spec.chunk, self.maps, memory_frames) for w in widths)
-        self.flows = nn.ModuleList(flow_head(w, spec.chunk) for w in widths)
+        self.heads = nn.ModuleList(
+            output_head(width, spec.chunk, self.maps, memory_frames, FOLD)
+            if s == 1
+            else output_head(wide, spec.chunk, self.maps, memory_frames, SIDE_FOLD)
+            for s in self.shrink
+        )
+        self.flows = nn.ModuleList(flow_head(half if s == 1 else wide, spec.chunk) for s in self.shrink)
         self.register_buffer("mean", torch.zeros(spec.views, 3, *spec.size))
         self.register_buffer("spread", torch.ones(spec.views, 3, *spec.size))
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -105,7 +119,7 @@ class UNetSimulator(Simulator):
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is drawn."""
-        _, deep, cond = self._encode(inputs)
+        *_, deep, cond = self._encode(inputs)
         return torch.cat([deep.float().mean((-2, -1)), cond.float()], 1)
 
     def _frames(self, views: list[Sources]) -> Tensor:
@@ -124,36 +138,45 @@ class UNetSimulator(Simulator):
             full.append(exact + (exact.round() - exact).detach())
         return torch.stack(full, 2)
 
-    def _encode(self, inputs: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
-        """Fine maps, coarse maps and the action embedding."""
+    def _encode(self, inputs: TensorDict) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Maps at a half, a quarter and an eighth of the resolution, and the action embedding."""
         memory, future, now = inputs["memory"], inputs["future"], inputs["now"]
         cond, action_map = self.actions(future["commands"], now["command"], now["state"])
         parts = [memory["frames"], *([memory["pose_map"], future["pose_map"]] if self.spec.pose_map else [])]
-        fine, deep = [self.where.expand(len(cond), -1, -1, -1)], [action_map]
+        deep = [action_map]
         if self.rays is not None:
             deep.append(self.rays(self._rays(inputs)))
         for view, (shrink, embed) in enumerate(zip(self.shrink, self.embed, strict=True)):
-            (fine if shrink == 1 else deep).append(embed([part[:, :, view].flatten(1, 2) for part in parts]))
-        x = torch.stack(fine).sum(0).contiguous(memory_format=torch.channels_last)
+            seen = embed([part[:, :, view].flatten(1, 2) for part in parts])
+            if shrink == 1:
+                x = seen.contiguous(memory_format=torch.channels_last)
+            else:
+                deep.append(seen)
         for block in self.fine_in:
             x = block(x, cond)
-        z = (self.down(x) + torch.stack(deep).sum(0)).contiguous(memory_format=torch.channels_last)
+        y = (self.down[0](x) + self.where).contiguous(memory_format=torch.channels_last)
+        for block in self.mid_in:
+            y = block(y, cond)
+        z = (self.down[1](y) + torch.stack(deep).sum(0)).contiguous(memory_format=torch.channels_last)
         for block in self.deep:
             z = block(z, cond)
-        return x, z, cond
+        return x, y, z, cond
 
     def views(self, inputs: TensorDict) -> tuple[list[Sources], Tensor]:
         """The sources of each view, at the size it is predicted in, and the features."""
-        x, z, cond = self._encode(inputs)
-        x = self.fuse(torch.cat([x, F.pixel_shuffle(self.up(z), 2)], 1))
+        x, y, z, cond = self._encode(inputs)
+        y = self.fuse[1](torch.cat([y, F.pixel_shuffle(self.up[1](z), 2)], 1))
+        for block in self.mid_out:
+            y = block(y, cond)
+        x = self.fuse[0](torch.cat([x, F.pixel_shuffle(self.up[0](y), 2)], 1))
         for block in self.fine_out:
             x = block(x, cond)
         views: list[Sources] = []
         chunk, frames = self.spec.chunk, inputs["memory", "frames"]
         for view, (shrink, head, flow) in enumerate(zip(self.shrink, self.heads, self.flows, strict=True)):
-            y = x if shrink == 1 else z
-            drawn = unfold(head(y).permute(0, 2, 3, 1).float(), FOLD).unflatten(1, (chunk, self.maps))
-            moves = F.interpolate(flow(y).float(), scale_factor=FOLD, mode="bilinear").unflatten(
+            said, edge, still = (x, FOLD, y) if shrink == 1 else (z, SIDE_FOLD, z)
+            drawn = unfold(head(said).permute(0, 2, 3, 1).float(), edge).unflatten(1, (chunk, self.maps))
+            moves = F.interpolate(flow(still).float(), scale_factor=4, mode="bilinear").unflatten(
                 1, (chunk, 2)
             )
             known = at_detail(frames[:, :, view].flatten(0, 1), shrink).unflatten(0, frames.shape[:2])
@@ -166,7 +189,7 @@ class UNetSimulator(Simulator):
         """
         # [B, V, 2, 4, 4]
         c2w = torch.stack([inputs["memory", "c2w"][:, -1], inputs["future", "c2w"][:, -1]], 2)
-        rays = render_ray_map(inputs["intrinsic"], c2w, self.spec.size, stride=2 * FOLD)
+        rays = render_ray_map(inputs["intrinsic"], c2w, self.spec.size, stride=_DEEP)
         return rays.flatten(1, 3).to(working_dtype(rays.device, rays.dtype))
 
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-_WIDE = {4: torch.int32, 8: torch.int64, 16: torch.complex128}  # by bytes
+_WIDE = {2: torch.int16, 4: torch.int32, 8: torch.int64, 16: torch.complex128}  # by bytes
 
 
 def fold(pictures: Tensor, edge: int) -> Tensor:
