@@ -275,7 +275,14 @@ def build_world(
     later: bool = False,
     horizon: int | None = None,
 ) -> TransformedEnv:
-    """The imagined world with its three transforms; `later` is JudgeReward's, `horizon` overrides the task's."""
+    """The imagined world with its three transforms.
+
+    Args:
+        starts: where episodes begin.
+        batch: of them side by side.
+        later: see JudgeReward.
+        horizon: control steps of an episode, the task's by default.
+    """
     task, section = cfg["task"], cfg["simulator"]
     simulator.eval(), decoder.eval(), judge.eval()
     base = WorldEnv(

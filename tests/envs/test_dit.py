@@ -60,7 +60,9 @@ def test_rows_depend_on_seed_and_commands_and_on_no_other_row(robot: str) -> Non
         assert frames.shape == (3, spec.chunk, spec.views, 3, *spec.size) and frames.dtype == torch.uint8
         assert states.shape == (3, spec.chunk, spec.state_dim) and torch.isfinite(states).all()
         one, own, alone = world.step(alone, future[1:2])
-        assert torch.equal(frames[0], frames[2]) and not torch.equal(frames[0], frames[1])
+        # Matrices' last rows may be rounded otherwise, so another slot may differ by a grey level.
+        assert (frames[0].int() - frames[2].int()).abs().max() <= 1
+        assert (frames[0].int() - frames[1].int()).abs().max() > 1
         assert (frames[1].int() - one[0].int()).abs().max() <= 1
         assert torch.allclose(states[1], expert.follow(alone, spec.chunk, own)[0], atol=1e-3)
     # Another command, other frames: the action vector tells, whether or not there is a pose map.

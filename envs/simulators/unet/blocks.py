@@ -63,7 +63,7 @@ class Embed(nn.Module):
         self.bias = nn.Parameter(torch.empty(width).uniform_(-bound, bound))
 
     def forward(self, pictures: Sequence[Tensor]) -> Tensor:
-        """[B, width, h / edge, w / edge] of pictures [B, C, shrink h, shrink w], bytes or floats in 0..255."""
+        """[B, width, h / edge, w / edge] of bytes or floats in 0..255 [B, C, shrink h, shrink w]."""
         dtype = working_dtype(self.weight.device, self.weight.dtype)
         weight: Tensor = self.weight
         if self.shrink > 1:
@@ -140,7 +140,9 @@ def output_head(width: int, chunk: int, maps: int, memory: int, edge: int) -> nn
 
 
 def flow_head(width: int, chunk: int) -> nn.Sequential:
-    """Flow of one view, [B, 2 * chunk, h, w] of features [B, width, h, w]: one vector per square and frame keeps it smooth."""
+    """Flow of one view, [B, 2 * chunk, h, w] of features [B, width, h, w]; one vector for a whole square of
+    pixels keeps it smooth.
+    """
     last = nn.Conv2d(width, 2 * chunk, 3, padding=1)
     nn.init.zeros_(last.weight)
     assert last.bias is not None
