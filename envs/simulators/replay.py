@@ -35,10 +35,12 @@ def replay(
     decoder: StateDecoder | None = None,
     batch: int = 32,
     bf16: bool = True,
+    alone: int | None = None,
 ) -> Replay:
     """Generate the given episodes from their first frames on, to the end of the longest.
 
     Args:
+        alone: chunks after which it goes on from true frames again; None for never.
         decoder: decodes the robot's states along the way; without one `states` repeats the first.
         batch: episodes generated side by side.
     """
@@ -53,6 +55,12 @@ def replay(
         state = simulator.reset(first.to(device), ids.to(device), capacity=1 + steps * chunk)
         made: list[tuple[Tensor, ...]] = []
         for step in range(steps):
+            if alone and step and step % alone == 0:
+                past = store.at(ids[:, None].expand(-1, 1 + step * chunk), torch.arange(1 + step * chunk))
+                length = torch.full_like(ids, 1 + step * chunk)
+                state = simulator.resume(
+                    past.to(device), length.to(device), ids.to(device), past.shape[1] + chunk * alone
+                )
             ahead = step * chunk + torch.arange(1, chunk + 1)[None]
             rows = start[:, None] + torch.minimum(ahead.expand(len(ids), -1), last)
             with mixed_precision(device, bf16):

@@ -27,8 +27,8 @@ class RLConfig:
         starts: imagined episodes begin "inside" the newest recorded ones, at any of their chunks, or at the
             "first" frames of all. A world errs more with every chunk it builds on its own; from inside, short
             episodes meet every stage of the task.
-        horizon: control steps of an imagined episode, None for the task's; what a critic expects of the rest
-            stands in for it, and algorithms without one run whole episodes.
+        horizon: control steps of an imagined episode, None for the task's. What the judge's progress, and a
+            critic if there is one, expect of the rest stands in for it.
         schedule: "sync" learns from rollouts of the newest policy only; "async" lets hosts run on meanwhile.
         max_policy_lag: versions a rollout may be behind, if async.
         queue: jobs submitted and not yet learned from at most, if async.

@@ -11,11 +11,16 @@ from envs.simulators.base import Simulator
 from envs.simulators.replay import replay
 
 
-def generated_frames(simulator: Simulator, store: ClipStore, episodes: Tensor, bf16: bool) -> TensorDict:
+def generated_frames(
+    simulator: Simulator, store: ClipStore, episodes: Tensor, bf16: bool, alone: int | None = None
+) -> TensorDict:
     """Frames that a simulator generates under the recorded actions of some episodes.
 
     Judges learn from them what generated video looks like, labelled by what truly happened; policies learn to
     act on them as on recorded ones.
+
+    Args:
+        alone: see replay.
 
     Returns:
         TensorDict [N] with frames uint8 [V, 3, H, W], row int64, that of the recorded frame, and episode
@@ -26,7 +31,7 @@ def generated_frames(simulator: Simulator, store: ClipStore, episodes: Tensor, b
         none = torch.zeros(0, dtype=torch.int64)
         frames = torch.zeros(views, dtype=torch.uint8)
         return TensorDict({"frames": frames, "row": none, "episode": none}, [0])
-    made = replay(simulator, store, episodes, bf16=bf16)
+    made = replay(simulator, store, episodes, bf16=bf16, alone=alone)
     keep = (made.valid & store.arrays["present"][made.rows]).flatten()
     owner = episodes.repeat_interleave(made.valid.shape[1])
     return TensorDict(

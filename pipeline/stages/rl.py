@@ -85,8 +85,10 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 
 def _horizon(cfg: Cfg, wanted: int | None, algorithm: Algorithm) -> int:
-    """Control steps of an imagined episode: rl.horizon for algorithms with a critic, which stands in for the
-    rest; others value whole episodes.
+    """Control steps of an imagined episode.
+
+    Raises:
+        ConfigError: if rl.horizon is no number of chunks, or cuts off what nothing else values.
     """
     whole, chunk = cfg["task"]["horizon"], cfg["task"]["chunk"]
     if wanted is not None and (wanted % chunk or not chunk <= wanted <= whole):
@@ -94,7 +96,12 @@ def _horizon(cfg: Cfg, wanted: int | None, algorithm: Algorithm) -> int:
             f"rl.horizon={wanted} must be a multiple of task.chunk={chunk}, at most task.horizon={whole}, or"
             " null for that"
         )
-    return int(wanted if wanted and algorithm.bootstraps else whole)
+    if wanted and wanted < whole and not algorithm.bootstraps and not rewards_of(cfg).progress:
+        raise ConfigError(
+            f"rl.horizon={wanted} cuts episodes short, and neither a critic (algorithm={algorithm.name}) nor"
+            " judge.rewards.progress=0 says what the rest is worth; set rl.horizon=null"
+        )
+    return int(wanted or whole)
 
 
 def _warm_up(

@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
+from torch import Tensor
 from tqdm import tqdm
 
 from actors.factory import build_judge, build_simulator, build_state_decoder, prepare_process
 from envs.episodes.clips import ClipStore
+from envs.simulators.base import Simulator
 from envs.targets import ConfigError, options
 from learners.stages.generated import generated_frames
 from learners.stages.judge import calibrate, judge_recordings, train_judge
@@ -90,7 +93,7 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return stats
 
 
-@stage(reads=(*WORLD, "judge_fit.{phase}", "microbatches"), place=Place.LEARNERS)
+@stage(reads=(*WORLD, "judge_fit.{phase}", "rl.starts", "rl.horizon", "microbatches"), place=Place.LEARNERS)
 def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The judge on recorded and on generated frames; its threshold on recorded video that no judge learns
     from. A judge without weights is only calibrated.
@@ -113,13 +116,26 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         shuffled = torch.randperm(len(train), generator=torch.Generator().manual_seed(cfg["seed"]))
         pick = train[shuffled[: section["imagined"]]]
         world = build_simulator(cfg, inputs.weights("simulator"))
-        generated = generated_frames(world, store, pick, cfg["simulator"]["bf16"])
+        generated = _as_imagined(cfg, world, store, pick)
         fit = fit_options(cfg, section["fit"], f"judge_fit.{phase}.fit")
         stats = dict(train_judge(model, store, train, fit, folder, generated))
         stats["generated_frames"] = len(generated)
     _calibrate(model, store)
     save_weights(model, folder)
     return {**stats, "threshold": float(model.threshold)}
+
+
+def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor) -> TensorDict:
+    """Generated frames of episodes: of half of them as RL will see them, if it begins inside recorded ones
+    and does not go far; of the others whole episodes, by which the world is measured.
+    """
+    rl, bf16 = cfg["rl"], cfg["simulator"]["bf16"]
+    if rl["starts"] == "first" or rl["horizon"] is None:
+        return generated_frames(world, store, episodes, bf16)
+    near, far = episodes[::2], episodes[1::2]
+    alone = rl["horizon"] // cfg["task"]["chunk"]
+    parts = [generated_frames(world, store, near, bf16, alone), generated_frames(world, store, far, bf16)]
+    return torch.cat(parts)
 
 
 def _calibrate(model: Any, store: ClipStore) -> None:

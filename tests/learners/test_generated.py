@@ -8,6 +8,7 @@ import torch
 
 from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
+from envs.simulators.replay import future_of, replay
 from learners.stages.generated import generated_frames
 from tests.embodiments import ARM_JOINTS, BIMANUAL_POSES
 from tests.learners.models import simulator_of
@@ -38,3 +39,20 @@ def test_frames_without_a_picture_and_no_episodes_at_all_are_left_out(tiny_store
     assert len(made) == int(store.length[2]) - 2 and int(store.start[2]) + 5 not in made["row"].tolist()
     none = generated_frames(simulator, store, torch.zeros(0, dtype=torch.int64), bf16=False)
     assert len(none) == 0 and none["frames"].shape[1:] == made["frames"].shape[1:]
+
+
+def test_frames_may_go_on_from_true_ones_again(tiny_store: Stores) -> None:
+    store = tiny_store(BIMANUAL_POSES)
+    simulator, some, chunk = simulator_of("unet_small", store.spec), torch.tensor([3, 1]), store.spec.chunk
+    for parameter in simulator.parameters():  # an untrained one repeats its last frame
+        torch.nn.init.normal_(parameter, std=0.05, generator=torch.Generator().manual_seed(0))
+    whole = replay(simulator, store, some, bf16=False)
+    short = replay(simulator, store, some, bf16=False, alone=1)
+    assert torch.equal(whole.rows, short.rows)
+    assert torch.equal(whole.frames[:, :chunk], short.frames[:, :chunk])
+    assert not torch.equal(whole.frames[:, chunk:], short.frames[:, chunk:])
+    # Each chunk is what a session would show that had only seen true frames.
+    past = store.at(some[:, None].expand(-1, 1 + chunk), torch.arange(1 + chunk))
+    state = simulator.resume(past, torch.full_like(some, 1 + chunk), some)
+    frames = simulator.step(state, future_of(simulator, store, short.rows[:, chunk : 2 * chunk]))[0]
+    assert torch.equal(frames, short.frames[:, chunk : 2 * chunk])
