@@ -80,12 +80,13 @@ def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
         made = _refresh(graph, cfg, data, made, number)
         inputs = {"data": data, **made.roles()}
         graph.add(f"gap-{number}", prove.gap, {**inputs, "policy": policy}, number=number)
-        policy = graph.add(
-            f"clone-{number}",
-            imitation.clone,
-            {"data": data, "policy": policy, "simulator": made.simulator},
-            number=number,
-        )
+        if number <= cfg["rounds"]["clone"]:
+            policy = graph.add(
+                f"clone-{number}",
+                imitation.clone,
+                {"data": data, "policy": policy, "simulator": made.simulator},
+                number=number,
+            )
         if with_rl:
             policy = _learn(graph, cfg, data, made, policy, number)
     before = graph.add("evaluate-before", prove.evaluate_physics, {"policy": first})

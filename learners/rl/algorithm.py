@@ -27,7 +27,7 @@ class RLConfig:
         starts: imagined episodes begin "inside" the newest recorded ones, at any of their chunks, or at the
             "first" frames of all. A world errs more with every chunk it builds on its own; from inside, short
             episodes meet every stage of the task.
-        horizon: control steps of an imagined episode, None for the task's. What the judge's progress, and a
+        chunks: of an imagined episode, None for as many as the task has. What the judge's progress, and a
             critic if there is one, expect of the rest stands in for it.
         schedule: "sync" learns from rollouts of the newest policy only; "async" lets hosts run on meanwhile.
         max_policy_lag: versions a rollout may be behind, if async.
@@ -55,7 +55,7 @@ class RLConfig:
     envs: int
     shards: int
     starts: str
-    horizon: int | None
+    chunks: int | None
     schedule: str
     max_policy_lag: int
     queue: int
@@ -74,6 +74,8 @@ class RLConfig:
     seed: int
 
     def __post_init__(self) -> None:
+        if self.chunks is not None and self.chunks < 1:
+            raise ValueError(f"chunks={self.chunks} must be at least 1, or null for whole episodes")
         if self.starts not in ("inside", "first"):
             raise ValueError(f"starts={self.starts!r} must be inside or first")
         if self.schedule not in ("sync", "async"):

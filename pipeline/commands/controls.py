@@ -84,7 +84,11 @@ def control_rows(cfg: Cfg, root: Path, loop: Graph) -> list[Row]:
     iterations = sum(of_round(cfg["rounds"]["iterations"], n) for n in rounds)
     envs = cfg["rl"]["envs"]
     few = max(1, round(deployed / envs))
-    # Imagined and physical episodes have the same length, so equal iterations of equal size are equal steps.
+    whole = cfg["task"]["horizon"] // cfg["task"]["chunk"]
+    share = min(
+        1.0, (cfg["rl"]["chunks"] or whole) / whole
+    )  # of a physical episode's steps has an imagined one
+    iterations = max(1, round(iterations * share))
     learned = {
         "RL in physics, equal episodes": _rl_in_physics(loop, "equal-episodes", few),
         "RL in physics, equal steps": _rl_in_physics(loop, "equal-steps", iterations),

@@ -67,7 +67,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         judge=str(inputs.weights("judge")),
         data=tuple(str(path) for path in datasets(inputs.folders("data"))),
         inside=() if inside is None else tuple(inside.tolist()),
-        horizon=_horizon(cfg, settings.horizon, algorithm),
+        horizon=_horizon(cfg, settings.chunks, algorithm),
         freeze_perception=settings.freeze_perception,
         bootstrap=algorithm.bootstraps,
         later=settings.rewards_later,
@@ -84,24 +84,20 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return {**knew, **stats, **last}
 
 
-def _horizon(cfg: Cfg, wanted: int | None, algorithm: Algorithm) -> int:
+def _horizon(cfg: Cfg, chunks: int | None, algorithm: Algorithm) -> int:
     """Control steps of an imagined episode.
 
     Raises:
-        ConfigError: if rl.horizon is no number of chunks, or cuts off what nothing else values.
+        ConfigError: if rl.chunks cuts off what nothing else values.
     """
-    whole, chunk = cfg["task"]["horizon"], cfg["task"]["chunk"]
-    if wanted is not None and (wanted % chunk or not chunk <= wanted <= whole):
+    whole = int(cfg["task"]["horizon"])
+    short = whole if chunks is None else min(whole, chunks * int(cfg["task"]["chunk"]))
+    if short < whole and not algorithm.bootstraps and not rewards_of(cfg).progress:
         raise ConfigError(
-            f"rl.horizon={wanted} must be a multiple of task.chunk={chunk}, at most task.horizon={whole}, or"
-            " null for that"
+            f"rl.chunks={chunks} cuts episodes short, and neither a critic (algorithm={algorithm.name}) nor"
+            " judge.rewards.progress=0 says what the rest is worth; set rl.chunks=null"
         )
-    if wanted and wanted < whole and not algorithm.bootstraps and not rewards_of(cfg).progress:
-        raise ConfigError(
-            f"rl.horizon={wanted} cuts episodes short, and neither a critic (algorithm={algorithm.name}) nor"
-            " judge.rewards.progress=0 says what the rest is worth; set rl.horizon=null"
-        )
-    return int(wanted or whole)
+    return short
 
 
 def _warm_up(

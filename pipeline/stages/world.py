@@ -93,7 +93,7 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return stats
 
 
-@stage(reads=(*WORLD, "judge_fit.{phase}", "rl.starts", "rl.horizon", "microbatches"), place=Place.LEARNERS)
+@stage(reads=(*WORLD, "judge_fit.{phase}", "rl.starts", "rl.chunks", "microbatches"), place=Place.LEARNERS)
 def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The judge on recorded and on generated frames; its threshold on recorded video that no judge learns
     from. A judge without weights is only calibrated.
@@ -130,12 +130,10 @@ def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor)
     and does not go far; of the others whole episodes, by which the world is measured.
     """
     rl, bf16 = cfg["rl"], cfg["simulator"]["bf16"]
-    if rl["starts"] == "first" or rl["horizon"] is None:
+    if rl["starts"] == "first" or rl["chunks"] is None:
         return generated_frames(world, store, episodes, bf16)
-    near, far = episodes[::2], episodes[1::2]
-    alone = rl["horizon"] // cfg["task"]["chunk"]
-    parts = [generated_frames(world, store, near, bf16, alone), generated_frames(world, store, far, bf16)]
-    return torch.cat(parts)
+    near = generated_frames(world, store, episodes[::2], bf16, rl["chunks"])
+    return torch.cat([near, generated_frames(world, store, episodes[1::2], bf16)])
 
 
 def _calibrate(model: Any, store: ClipStore) -> None:
