@@ -1,5 +1,5 @@
-"""The whole loop as a graph: collect, imitate, then rounds of deploy -> refresh the world -> RL in it, then
-the proof.
+"""The whole loop as a graph: collect, imitate, then rounds of deploy -> refresh the world -> RL in it, from
+the policy that did best in physics, then the proof.
 
 Reading this file top to bottom is reading the method. What each stage does is in pipeline/stages.
 """
@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from pipeline.graph.graph import Graph
 from pipeline.graph.workers import learners_of
-from pipeline.stages import collect, imitation, prove, rl, show, world
+from pipeline.stages import collect, imitation, keep, prove, rl, show, world
 
 Cfg = Mapping[str, Any]
 T = TypeVar("T")
@@ -70,16 +70,16 @@ def of_round(values: Sequence[T], number: int) -> T:
 
 def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
     data: list[str] = [graph.add("collect", collect.collect)]
-    first = policy = graph.add("imitation", imitation.imitation, {"data": data})
-    made = World()
+    first = policy = best = graph.add("imitation", imitation.imitation, {"data": data})
+    made, known = World(), ""
     for number in range(1, last_round(cfg) + 1):
-        episodes = of_round(cfg["rounds"]["deploy"], number)
-        data = [*data, graph.add(
-            f"deploy-{number}", collect.deploy, {"policy": policy}, number=number, episodes=episodes
-        )]  # fmt: skip
+        deployed = _deploy(graph, cfg, policy, number)
+        data = [*data, deployed]
         made = _refresh(graph, cfg, data, made, number)
         inputs = {"data": data, **made.roles()}
         graph.add(f"gap-{number}", prove.gap, {**inputs, "policy": policy}, number=number)
+        policy, known = _keep(graph, policy, deployed, best, known, number)
+        best = policy
         if number <= cfg["rounds"]["clone"]:
             policy = graph.add(
                 f"clone-{number}",
@@ -89,9 +89,25 @@ def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
             )
         if with_rl:
             policy = _learn(graph, cfg, data, made, policy, number)
+    last = last_round(cfg) + 1
+    policy, _ = _keep(graph, policy, _deploy(graph, cfg, policy, last), best, known, last)
     before = graph.add("evaluate-before", prove.evaluate_physics, {"policy": first})
     after = graph.add("evaluate-after", prove.evaluate_physics, {"policy": policy})
     _conclude(graph, data, made, first, policy, {"physics_before": before, "physics_after": after})
+
+
+def _deploy(graph: Graph, cfg: Cfg, policy: str, number: int) -> str:
+    episodes = of_round(cfg["rounds"]["deploy"], number)
+    return graph.add(f"deploy-{number}", collect.deploy, {"policy": policy}, number=number, episodes=episodes)
+
+
+def _keep(graph: Graph, policy: str, deployed: str, best: str, known: str, number: int) -> tuple[str, str]:
+    """The better of the policy just deployed and the best before, and what says how good it is."""
+    if not known:
+        return policy, deployed
+    roles = {"candidate": policy, "tried": deployed, "incumbent": best, "known": known}
+    kept = graph.add(f"keep-{number}", keep.keep, roles)
+    return kept, kept
 
 
 def _data_loop(graph: Graph, cfg: Cfg) -> None:

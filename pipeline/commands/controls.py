@@ -78,10 +78,10 @@ def run_controls(cfg: Cfg, root: Path, tracker: Tracker | None = None) -> dict[s
 
 def control_rows(cfg: Cfg, root: Path, loop: Graph) -> list[Row]:
     """The run itself and its controls, whose stages are added to the run's graph or have one of their own."""
-    rounds = range(1, last_round(cfg) + 1)
+    rounds = range(1, last_round(cfg) + 2)  # the last deployment is of what the last round has learned
     deploys = tuple(f"deploy-{n}" for n in rounds)
     deployed = sum(of_round(cfg["rounds"]["deploy"], n) for n in rounds)
-    iterations = sum(of_round(cfg["rounds"]["iterations"], n) for n in rounds)
+    iterations = sum(of_round(cfg["rounds"]["iterations"], n) for n in rounds[:-1])
     envs = cfg["rl"]["envs"]
     few = max(1, round(deployed / envs))
     whole = cfg["task"]["horizon"] // cfg["task"]["chunk"]

@@ -41,7 +41,7 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     table = worldloop("compare", str(run), str(run)).stdout
     assert "| algorithm; seed | PPO; 0 | PPO; 0 |" in table
     again = worldloop("run", *words)
-    assert (again.stdout + again.stderr).count("is finished, reused") == 22
+    assert (again.stdout + again.stderr).count("is finished, reused") == 24
     controls = worldloop("controls", *words)
     assert controls.returncode == 0, controls.stderr[-3000:]
     rows = json.loads((run / "controls.json").read_text())
