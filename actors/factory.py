@@ -74,6 +74,11 @@ def prepare_process(seed: int, threads: int = 0) -> None:
     # threads started later inherit the setting.
     torch.set_flush_denormal(True)
     torch.manual_seed(seed)
+    # Threads sum gradients of indexing in any order otherwise: the same seed would give other weights, the
+    # sooner the busier the machine is. Where a GPU has no such kernel, torch warns and goes on.
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    torch.utils.deterministic.fill_uninitialized_memory = False
     # Processes that train together on a machine share its cores; Ray Train and torchrun say how many they
     # are.
     torch.set_num_threads(

@@ -94,3 +94,11 @@ def test_processes_are_prepared_alike() -> None:
         prepare_process(5, 1)
         drawn.append(torch.rand(3).tolist())
     assert drawn[0] == drawn[1] and torch.get_num_threads() == 1
+
+
+def test_gradients_of_indexing_are_the_same_every_time() -> None:
+    prepare_process(0)
+    table, place = torch.randn(64, 32, requires_grad=True), torch.randint(64, (20000,))
+    weight = torch.randn(20000, 32)
+    once, *again = [torch.autograd.grad((table[place] * weight).sum(), table)[0] for _ in range(20)]
+    assert all(torch.equal(once, other) for other in again)
