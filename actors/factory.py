@@ -78,7 +78,7 @@ def prepare_process(seed: int, threads: int = 0) -> None:
     # sooner the busier the machine is. Where a GPU has no such kernel, torch warns and goes on.
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     torch.use_deterministic_algorithms(True, warn_only=True)
-    torch.utils.deterministic.fill_uninitialized_memory = False
+    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
     # Processes that train together on a machine share its cores; Ray Train and torchrun say how many they
     # are.
     torch.set_num_threads(
