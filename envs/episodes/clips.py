@@ -20,7 +20,7 @@ from envs.episodes.cache import CachedSet, open_cached
 from envs.episodes.episode import EpisodeError
 from envs.episodes.splits import episodes_of
 from envs.simulators.memory import memory_indices
-from envs.specs import WorldSpec
+from envs.specs import WorldSpec, text_to_bytes
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class ClipStore:
         arrays: commands float32 [N, A], states float32 [N, S], present bool [N], labelled bool [E]; success
             bool [N] if any episode is labelled; c2w float32 [N, V, 4, 4] if the robot is calibrated.
         intrinsic: float32 [E, V, 3, 3] in pixels; only of calibrated robots.
-        instructions: one per episode.
+        instructions, text: one per episode, and as uint8 [E, TEXT_BYTES].
         episodes: per episode its length, instruction, source, seed, success (None if nobody labelled it) and
             the number of its data set.
 
@@ -85,6 +85,7 @@ class ClipStore:
             for row in part.info["episodes"]
         ]
         self.instructions = [str(row["instruction"]) for row in self.episodes]
+        self.text = text_to_bytes(self.instructions)
         self.length = torch.tensor([row["length"] for row in self.episodes])
         self.start = self.length.cumsum(0) - self.length
         self.arrays = {

@@ -40,6 +40,10 @@ class RLConfig:
         lr: learning rate of the policy.
         clip: largest gradient norm.
         kl_stop: mean KL to the behaviour policy at which an iteration's epochs end early.
+        imagined: weight of the algorithm's loss on imagined decisions; 0 leaves them out, as a control.
+        recorded: decisions of the deployed policy in physics per iteration, learned from beside the imagined
+            ones by the same loss; 0 for none. Algorithms without a critic, and policies that are scored on
+            action tokens, learn from imagined ones only.
         anchor: weight of cloning what is known to have worked in physics (the newest deployed policy's true
             successes) beside the algorithm's loss; it keeps RL from wandering where only the simulator says
             it works.
@@ -66,6 +70,8 @@ class RLConfig:
     lr: float
     clip: float
     kl_stop: float
+    imagined: float
+    recorded: int
     anchor: float
     anchor_batch: int
     rewards_later: bool

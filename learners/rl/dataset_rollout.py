@@ -13,7 +13,8 @@ from tensordict.nn import TensorDictModuleBase
 from actors.policies.contract import VISUAL_FEATURES, feature_part, inputs_for, writes_features
 from envs.episodes.clips import ClipStore
 from envs.judges.labels import progress_to_success
-from envs.specs import IMAGE, INSTRUCTION_UTF8, STATE, Rewards, text_to_bytes
+from envs.specs import IMAGE, INSTRUCTION_UTF8, STATE, Rewards
+from learners.stages.observed import observe
 
 _AT_ONCE = 512  # frames per pass
 
@@ -34,8 +35,9 @@ def dataset_rollout(
         discount: per frame, of progress towards success; the judge's.
 
     Returns:
-        TensorDict [N, T] with what critics read of each decision and of what followed, reward, ends, and
-        `valid` bool [N, T], false past an episode's end.
+        TensorDict [N, T] with what critics read of each decision and of what followed, reward, ends, `row`
+        int64 [N, T], the decision's frame, `valid` bool [N, T], false past an episode's end, and `whole` bool
+        [N, T], true where the chunk was carried out to its end.
 
     Raises:
         ValueError: if nobody said whether an episode succeeded.
@@ -46,13 +48,14 @@ def dataset_rollout(
     steps = int((last.max() + chunk - 1) // chunk)
     at = torch.minimum(torch.arange(steps + 1) * chunk, last[:, None])  # past the end the last frame stays
     rows = store.start[episodes][:, None] + at
-    seen = _observed(policy, store, rows, episodes)
+    seen = _observed(policy, store, rows)
     success, progress = _labels(store, episodes, discount)
     success, progress = success.gather(1, at), progress.gather(1, at)
     over = at[:, 1:] == last[:, None]
     won = (success[:, 1:] > 0.5) & over
     out = seen[:, :-1].copy()
-    out["valid"] = at[:, :-1] < last[:, None]
+    out["row"], out["valid"] = rows[:, :-1], at[:, :-1] < last[:, None]
+    out["whole"] = at[:, :-1] + chunk <= last[:, None]
     out["next"] = seen[:, 1:].copy()
     out["next", "reward"] = rewards(progress[:, :-1, None], progress[:, 1:, None], won[..., None])
     out["next", "done"], out["next", "terminated"] = over[..., None], won[..., None]
@@ -67,21 +70,16 @@ def _labels(store: ClipStore, episodes: torch.Tensor, discount: float) -> tuple[
     return success, progress_to_success(success, discount)
 
 
-def _observed(
-    policy: TensorDictModuleBase, store: ClipStore, rows: torch.Tensor, episodes: torch.Tensor
-) -> TensorDict:
+def _observed(policy: TensorDictModuleBase, store: ClipStore, rows: torch.Tensor) -> TensorDict:
     """What critics read of frames [N, T], as a TensorDict [N, T]."""
-    text = text_to_bytes([store.instructions[n] for n in episodes.tolist()])[:, None].expand(
-        -1, rows.shape[1], -1
-    )
     parts = []
-    for some, words in zip(rows.flatten().split(_AT_ONCE), text.flatten(0, 1).split(_AT_ONCE), strict=True):
-        part = TensorDict({}, [len(some)])
-        part[IMAGE], part[INSTRUCTION_UTF8] = store.frames(some), words
-        part[STATE] = store.arrays["states"][some]
+    for some in rows.flatten().split(_AT_ONCE):
+        part = observe(store, some)
         if writes_features(policy):
             features = feature_part(policy)(inputs_for(part, policy))[VISUAL_FEATURES].cpu()
             part = part.select(STATE)
             part[VISUAL_FEATURES] = features
+        else:
+            part = part.select(IMAGE, INSTRUCTION_UTF8, STATE)
         parts.append(part)
     return torch.cat(parts).reshape(*rows.shape)

@@ -28,8 +28,9 @@ from actors.fleets.fleet import EpisodeLedger, Fleet
 from actors.rollouts.host import Weights, trained_weights
 from envs.rng import iteration_generator, sampling_seed, update_seed
 from learners.rl.alarms import Alarms
-from learners.rl.algorithm import Algorithm, Anchor, RLConfig
+from learners.rl.algorithm import Algorithm, RLConfig
 from learners.rl.feed import AsyncFeed, Feed
+from learners.rl.recorded import TrueExperience
 from learners.rl.update import update
 from learners.training.checkpoint import Checkpoints, adam_moments, buffers_of, truncate_log
 from learners.training.interrupt import deferred_sigterm
@@ -42,10 +43,9 @@ def train_rl(
     algorithm: Algorithm,
     config: RLConfig,
     folder: Path,
-    starts: int | None = None,
+    starts: int | Sequence[int],
     name: str = "rl",
-    seed_pool: Sequence[int] | None = None,
-    anchor: Anchor | None = None,
+    true: TrueExperience | None = None,
     until: Callable[[int], bool] | None = None,
 ) -> dict[str, Any]:
     """Improve `policy` in place.
@@ -53,11 +53,10 @@ def train_rl(
     Args:
         fleet: hosts of config.envs / config.shards episodes each; the policy's trained tensors are published
             to it. Of several workers only the leading one has one.
-        starts: number of start frames in imagination; None in physics, where `seed_pool` says which seeds may
-            be used.
+        starts: number of start frames in imagination; in physics, the seeds that may be used.
         folder: receives checkpoints, metrics.jsonl and learned.jsonl, the jobs that were learned from; a
             checkpoint found there is resumed.
-        anchor: what RLConfig.anchor speaks of.
+        true: what RLConfig.recorded and RLConfig.anchor speak of.
         until: asked after every iteration, with its number; true ends the run early.
 
     Returns:
@@ -96,9 +95,9 @@ def train_rl(
             truncate_log(learned, first)
 
     def seeds(iteration: int) -> list[int]:
-        pool = starts or len(seed_pool or ())
-        drawn = algorithm.seeds(pool, config.envs, iteration_generator(config.seed, iteration))
-        return drawn if seed_pool is None else [seed_pool[s % pool] for s in drawn]
+        pool = range(starts) if isinstance(starts, int) else starts
+        drawn = algorithm.seeds(len(pool), config.envs, iteration_generator(config.seed, iteration))
+        return [pool[s % len(pool)] for s in drawn]
 
     def sampling(iteration: int, shard: int) -> int:
         return sampling_seed(config.seed, iteration, shard)
@@ -146,7 +145,7 @@ def train_rl(
             batch, supply = from_leader(partial(gather, iteration, trainee(trained_weights, policy)))
             collected = time.perf_counter()
             seed = update_seed(config.seed, iteration)
-            figures = update(batch, algorithm, trainee, optimiser, config, seed, anchor)
+            figures = update(batch, algorithm, trainee, optimiser, config, seed, true)
             updated = time.perf_counter()
             spent["rollout"] += collected - began
             spent["update"] += updated - collected

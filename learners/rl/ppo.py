@@ -120,13 +120,14 @@ class PPO:
             part["state_value"] = self.critic(part.select(*self.critic.in_keys))["state_value"]
         self.gae(batch)
 
-    def warm_up(self, rollout: TensorDict, seed: int, minibatch: int = 256) -> float:
+    def warm_up(self, rollout: TensorDict, seed: int, minibatch: int = 256) -> tuple[TensorDict, float]:
         """Let the critic learn from a rollout [N, T] of learners.rl.dataset_rollout.
 
         A critic that begins from nothing spoils the first iterations.
 
         Returns:
-            The share of the targets' variance that it explains before the last pass.
+            The rollout on the critic's device, with advantage, value_target and state_value [N, T, 1], and
+            the share of the targets' variance that the critic explains before the last pass.
         """
         rollout = rollout.to(device_of(self.critic))
         optimiser = torch.optim.Adam(self.critic.parameters(), lr=self.config.critic_lr)
@@ -142,7 +143,8 @@ class PPO:
                 value = self.critic(data[pick].select(*self.critic.in_keys))["state_value"]
                 F.smooth_l1_loss(value, targets[pick]).backward()
                 optimiser.step()
-        return explained
+        self._advantages(rollout)
+        return rollout, explained
 
     def loss(self, minibatch: TensorDict) -> tuple[Tensor, dict[str, float]]:
         """The clipped objective, the value loss and the entropy bonus."""

@@ -13,7 +13,8 @@ from torch import Tensor
 from actors.policies.contract import device_of
 from envs.rng import step_generator
 from envs.specs import SUCCESS
-from learners.rl.algorithm import Algorithm, Anchor, RLConfig, finite, first_episode, judged
+from learners.rl.algorithm import Algorithm, RLConfig, finite, first_episode, judged
+from learners.rl.recorded import TrueExperience
 from learners.training.fit import TrainingDiverged
 from learners.training.parallel import Trainee, averaged, clip_gradients, my_share
 
@@ -25,19 +26,22 @@ def update(
     optimiser: torch.optim.Optimizer,
     config: RLConfig,
     seed: int,
-    anchor: Anchor | None = None,
+    true: TrueExperience | None = None,
 ) -> dict[str, float]:
     """One iteration's optimisation on a rollout [B, T]; returns its figures.
 
     Args:
         trainee: algorithm.modules() in training.
-        seed: of minibatches and of what the anchor draws.
+        seed: of minibatches and of what is drawn of true experience.
     """
     figures = outcome(batch)
     batch = batch.to(device_of(algorithm.modules()))
     data, extra = trainee(algorithm.prepare, batch)
     figures |= extra
     shuffle = torch.Generator().manual_seed(seed)
+    known = None
+    if true is not None and true.decisions is not None and config.recorded:
+        known = trainee(true.decisions.sample, config.recorded, data, shuffle)
     sums: dict[str, float] = {}
     count, stopped = 0, False
     for _ in range(config.epochs):
@@ -49,7 +53,7 @@ def update(
             rows, parts, mine = [], pick.tensor_split(config.microbatches), my_share(config.microbatches)
             for part in mine:
                 generator = step_generator(seed, count, part)
-                loss, row = trainee(_loss, algorithm, data[parts[part]], config, generator, anchor)
+                loss, row = trainee(_loss, algorithm, data[parts[part]], config, generator, true, known)
                 (loss / len(mine)).backward()
                 rows.append(row)
             means = averaged(rows)
@@ -76,11 +80,19 @@ def _loss(
     minibatch: TensorDict,
     config: RLConfig,
     generator: torch.Generator,
-    anchor: Anchor | None,
+    true: TrueExperience | None,
+    known: TensorDict | None,
 ) -> tuple[Tensor, dict[str, float]]:
     loss, row = algorithm.loss(minibatch)
-    if anchor is not None and config.anchor:
-        pull = anchor.loss(anchor.sample(config.anchor_batch // config.microbatches, generator), generator)
+    loss = config.imagined * loss
+    if known is not None:  # by itself, for its likelihood ratios do not say how far the policy has come
+        pick = torch.randint(len(known), (len(minibatch),), generator=generator)
+        beside, told = algorithm.loss(known[pick])
+        loss = loss + beside
+        row["recorded_clip_fraction"] = told.get("clip_fraction", 0.0)
+    if true is not None and true.anchor is not None and config.anchor:
+        drawn = true.anchor.sample(config.anchor_batch // config.microbatches, generator)
+        pull = true.anchor.loss(drawn, generator)
         loss = loss + config.anchor * pull
         row["anchor"] = float(pull.detach())
     return loss, {**row, "loss": float(loss.detach())}

@@ -14,19 +14,15 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from actors.policies.contract import VISUAL_FEATURES, feature_part, imitation_loss, inputs_for, with_text
 from envs.episodes.clips import ClipStore
 from envs.specs import (
-    C2W,
     CHUNK,
-    COMMAND,
     IMAGE,
-    INSTRUCTION_UTF8,
-    INTRINSIC,
     STATE,
     ActionMode,
-    text_to_bytes,
     to_chunk,
 )
+from learners.stages.observed import observe
 from learners.stages.pictures import augment
-from learners.stages.simulator import last_rows, owners
+from learners.stages.simulator import last_rows
 from learners.training.fit import FitConfig, fit
 
 _STATE_NOISE = 0.05  # of each number's spread
@@ -60,7 +56,6 @@ class Cloning:
         self.targets = chunks_ahead(store, self.rows, mode)
         self.states = store.arrays["states"][self.rows]
         self.state_noise = _STATE_NOISE * self.states.std(0)
-        self._text = text_to_bytes(store.instructions)
         self._features: Tensor | None = None
 
     def encode(self) -> None:
@@ -76,21 +71,10 @@ class Cloning:
         encoder = feature_part(self.policy)
         with torch.no_grad():
             parts = [
-                encoder(inputs_for(self.observe(some), self.policy))[VISUAL_FEATURES].cpu()
+                encoder(inputs_for(observe(self.store, some), self.policy))[VISUAL_FEATURES].cpu()
                 for some in self.rows.split(_AT_ONCE)
             ]
         self._features = torch.cat(parts)
-
-    def observe(self, rows: Tensor, pictures: bool = True) -> TensorDict:
-        """What the policy would have observed at frames `rows` [N], under the keys of envs/specs.py."""
-        store, owner = self.store, owners(self.store, rows)
-        out = TensorDict({STATE: store.arrays["states"][rows]}, [len(rows)])
-        if pictures:
-            out[IMAGE] = store.frames(rows)
-        out[COMMAND], out[INSTRUCTION_UTF8] = store.arrays["commands"][rows], self._text[owner]
-        if store.spec.embodiment.calibrated:
-            out[INTRINSIC], out[C2W] = store.intrinsic[owner], store.arrays["c2w"][rows]
-        return out
 
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
         """Random observations and the chunks that followed, and generated frames beside recorded ones.
@@ -100,14 +84,14 @@ class Cloning:
             and generated [count // 2] observations.
         """
         pick = torch.randint(len(self.rows), (count,), generator=generator)
-        observed = self.observe(self.rows[pick], pictures=self._features is None)
+        observed = observe(self.store, self.rows[pick], pictures=self._features is None)
         if self._features is not None:
             observed[VISUAL_FEATURES] = self._features[pick]
         out = TensorDict({"observed": observed, "target": self.targets[pick]}, [])
         if self.generated is not None:
             some = torch.randint(len(self.generated), (max(1, count // 2),), generator=generator)
             made = self.generated[some]
-            out["recorded"] = self.observe(made["row"])
+            out["recorded"] = observe(self.store, made["row"])
             out["generated"] = out["recorded"].clone(recurse=False)
             out["generated", IMAGE] = made["frames"]
         return out

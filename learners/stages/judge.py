@@ -17,7 +17,6 @@ from envs.judges.base import Judge
 from envs.judges.labels import progress_to_success, success_labels
 from envs.judges.learned import LearnedJudge
 from envs.precision import mixed_precision
-from envs.specs import text_to_bytes
 from learners.stages.pictures import augment
 from learners.stages.simulator import owners
 from learners.training.fit import FitConfig, fit
@@ -69,7 +68,6 @@ class JudgeData:
             if len(known):
                 self.pools.append(_Pool(self.labels, when, known["row"], known["frames"]))
         self.share = float(self.labels[rows].mean().clamp(0.02, 0.98))
-        self._text = text_to_bytes(store.instructions)
 
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
         """A batch [count] for LearnedJudge.loss, with uint8 frames."""
@@ -83,7 +81,7 @@ class JudgeData:
             {
                 "frames": torch.cat(frames),
                 "first": self.store.frames(self.store.start[owner]),
-                "text": self._text[owner],
+                "text": self.store.text[owner],
                 "label": self.labels[rows],
                 "progress": self.progress[rows],
             },

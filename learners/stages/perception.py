@@ -20,6 +20,7 @@ from envs.episodes.clips import ClipStore
 from envs.specs import ActionMode
 from learners.stages.imitation import Cloning
 from learners.stages.judge import frame_targets
+from learners.stages.observed import observe
 from learners.training.fit import FitConfig, fit
 
 _SPREAD = 1e-3  # of a number of the chunk below which it is a constant that nobody need predict
@@ -107,7 +108,7 @@ def train_perception(
     def batch(step: int, generator: torch.Generator) -> TensorDict:
         pick = torch.randint(len(frames.rows), (options.part,), generator=generator)
         data = {"target": frames.targets[pick], "progress": progress[pick]}
-        return TensorDict({"observed": frames.observe(frames.rows[pick]), **data}, [])
+        return TensorDict({"observed": observe(store, frames.rows[pick]), **data}, [])
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         observed = frames.disturbed(data["observed"], generator)

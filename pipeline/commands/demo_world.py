@@ -64,5 +64,5 @@ def demo_recipe(cfg: Mapping[str, Any], folder: Path, episodes: int, starts: int
         paths[2],
         paths[3],
         (str(data.resolve()),),
-        cfg["rl"]["freeze_perception"],
+        freeze_perception=cfg["rl"]["freeze_perception"],
     )

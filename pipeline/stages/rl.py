@@ -9,14 +9,16 @@ import torch
 
 from actors.factory import build_algorithm, build_policy, prepare_process, rewards_of
 from actors.fleets.launch import build_fleet
-from actors.policies.contract import freeze_perception
+from actors.policies.contract import action_key, freeze_perception
 from actors.rollouts.recipe import Recipe
 from envs.episodes.clips import ClipStore
 from envs.initial_states import decision_points
+from envs.specs import CHUNK
 from envs.targets import ConfigError
 from learners.rl.algorithm import Algorithm
 from learners.rl.dataset_rollout import dataset_rollout
 from learners.rl.loop import train_rl
+from learners.rl.recorded import RecordedDecisions, TrueExperience
 from learners.stages.imitation import Cloning
 from learners.training.parallel import leads
 from pipeline.graph.artefact import save_weights
@@ -57,7 +59,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         anchor.encode()
     algorithm = build_algorithm(cfg, policy)
     inside = newest_episodes(store, learning_episodes(store)) if settings.starts == "inside" else None
-    knew = _warm_up(cfg, policy, algorithm, store, settings.seed, number)
+    knew, decisions = _warm_up(cfg, policy, algorithm, store, settings.seed, number)
     recipe = Recipe(
         config=cfg.plain(),
         episodes=settings.envs // settings.shards,
@@ -75,7 +77,8 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     fleet = build_fleet(recipe) if leads() else None
     try:
         starts = len(store) if inside is None else len(decision_points(store, inside)[0])
-        stats = train_rl(fleet, policy, algorithm, settings, folder, starts=starts, anchor=anchor)
+        true = TrueExperience(anchor, decisions)
+        stats = train_rl(fleet, policy, algorithm, settings, folder, starts, true=true)
     finally:
         if fleet is not None:
             fleet.close()
@@ -101,18 +104,22 @@ def _horizon(cfg: Cfg, chunks: int | None, algorithm: Algorithm) -> int:
 
 
 def _warm_up(
-    cfg: Cfg, policy: Any, algorithm: Any, store: ClipStore, seed: int, number: int
-) -> dict[str, float]:
+    cfg: Cfg, policy: Any, algorithm: Algorithm, store: ClipStore, seed: int, number: int
+) -> tuple[dict[str, float], RecordedDecisions | None]:
     """Let a critic, if the algorithm has one, learn from the deployed policy's true episodes first; one that
-    begins from nothing spoils the first iterations.
+    begins from nothing spoils the first iterations. What it says of their decisions RL learns from, too.
     """
     past = store.select([f"policy-{number}"])
     past = past[torch.isin(past, learning_episodes(store)) & store.arrays["labelled"][past]]
     discount = cfg["judge"].get("discount")
     if not hasattr(algorithm, "warm_up") or discount is None or not len(past):
-        return {}
+        return {}, None
     rollout = dataset_rollout(policy, store, past, rewards_of(cfg), discount)
-    return {"critic_knew": algorithm.warm_up(rollout, seed)}
+    rollout, knew = algorithm.warm_up(rollout, seed)
+    if action_key(policy) != CHUNK:
+        return {"critic_knew": knew}, None
+    decisions = RecordedDecisions(policy, store, rollout, mode_of(cfg))
+    return {"critic_knew": knew, "recorded_decisions": float(len(decisions))}, decisions
 
 
 @stage(reads=(*PHYSICS, *LEARNING))
@@ -138,7 +145,7 @@ def rl_in_physics(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, An
     pool = episode_seeds(cfg["seed"], Purpose.PRACTICE, 4 * settings.envs * iterations)
     fleet = build_fleet(recipe)
     try:
-        stats = train_rl(fleet, policy, algorithm, settings, folder, name="rl", seed_pool=pool)
+        stats = train_rl(fleet, policy, algorithm, settings, folder, pool)
     finally:
         fleet.close()
     save_weights(policy, folder)

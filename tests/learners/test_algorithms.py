@@ -28,7 +28,14 @@ from tests.sections import offered, section
 RL = {
     **{"iterations": 2, "envs": 8, "shards": 1, "schedule": "sync", "max_policy_lag": 2, "queue": 8},
     **{"max_dropped": 0.05, "epochs": 2, "minibatch": 16, "microbatches": 1, "lr": 1e-3, "clip": 1.0},
-    **{"kl_stop": 10.0, "anchor": 0.0, "anchor_batch": 8, "rewards_later": False},
+    **{
+        "kl_stop": 10.0,
+        "imagined": 1.0,
+        "recorded": 0,
+        "anchor": 0.0,
+        "anchor_batch": 8,
+        "rewards_later": False,
+    },
     **{"starts": "first", "chunks": None, "freeze_perception": False, "checkpoint_every": 5, "seed": 0},
 }
 POLICIES = [name for name in offered("policy") if name != "openpi"]  # that one needs a server

@@ -59,5 +59,5 @@ def test_a_warmed_up_critic_explains_returns(tiny_store: Stores, name: str) -> N
         ppo = build(
             section("algorithm/ppo", warmup_passes=passes), "algorithm", policy=policy, spec=store.spec
         )
-        explained.append(ppo.warm_up(rollout, 0, minibatch=16))
+        explained.append(ppo.warm_up(rollout, 0, minibatch=16)[1])
     assert explained[1] > max(0.5, explained[0])

@@ -31,7 +31,7 @@ def test_unfolding_passes_gradients_on() -> None:
 @pytest.mark.parametrize("shrink", [1, 2])
 def test_looking_at_bytes_is_a_convolution_of_pictures(shrink: int) -> None:
     torch.manual_seed(0)
-    embed = Embed(6, 8, shrink)
+    embed = Embed(6, 8, shrink, 4)
     pictures = torch.randint(0, 256, (2, 6, 16 * shrink, 24 * shrink), dtype=torch.uint8)
     small = at_detail(pictures, shrink) * 2 - 1
     wanted = F.conv2d(small, embed.weight, embed.bias, stride=4)

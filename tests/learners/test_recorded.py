@@ -1,0 +1,145 @@
+"""True decisions beside imagined ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+
+from actors.policies.contract import distribution, inputs_for
+from envs.embodiment import Embodiment
+from envs.episodes.clips import ClipStore
+from envs.specs import C2W, CHUNK, COMMAND, IMAGE, INTRINSIC, LOG_PROB, STATE, ActionMode, Rewards
+from learners.rl.algorithm import Algorithm
+from learners.rl.dataset_rollout import dataset_rollout
+from learners.rl.recorded import RecordedDecisions, TrueExperience
+from learners.rl.update import update
+from learners.stages.imitation import chunks_ahead
+from learners.stages.observed import observe
+from learners.training.parallel import Trainee
+from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES
+from tests.learners.models import policy_of
+from tests.learners.test_algorithms import algorithm_of, settings
+
+Stores = Callable[[Embodiment], ClipStore]
+KEYS = ("advantage", "value_target", "state_value")
+
+
+def known(store: ClipStore, policy: TensorDictModuleBase) -> tuple[Algorithm, RecordedDecisions]:
+    """PPO whose critic has seen all labelled episodes, and their decisions."""
+    ppo = algorithm_of("ppo", policy, store.spec)
+    rollout = dataset_rollout(policy, store, _labelled(store), Rewards(1.0, 1.0), 0.9)
+    rollout, _ = ppo.warm_up(rollout, 0)  # type: ignore[attr-defined]
+    return ppo, RecordedDecisions(policy, store, rollout, ActionMode.ABSOLUTE)
+
+
+def _labelled(store: ClipStore) -> torch.Tensor:
+    return store.arrays["labelled"].nonzero().flatten()
+
+
+def like(policy: TensorDictModuleBase, algorithm: Any) -> TensorDict:
+    """The keys that transitions of an iteration have."""
+    keys = {*policy.in_keys, *algorithm.critic.in_keys, CHUNK, LOG_PROB, *KEYS}
+    return TensorDict({key: torch.zeros(1, 1) for key in keys}, [1])
+
+
+@pytest.mark.parametrize("robot", [ARM_DELTAS, BIMANUAL_POSES], ids=lambda robot: robot.robot)
+def test_frames_are_seen_as_they_were_recorded(tiny_store: Stores, robot: Embodiment) -> None:
+    store = tiny_store(robot)
+    rows = store.start[3] + torch.tensor([0, 2])
+    seen = observe(store, rows)
+    assert torch.equal(seen[STATE], store.arrays["states"][rows])
+    assert torch.equal(seen[COMMAND], store.arrays["commands"][rows])
+    assert torch.equal(seen[IMAGE], store.frames(rows))
+    assert (C2W in seen.keys(True, True)) == (INTRINSIC in seen.keys(True, True)) == robot.calibrated
+
+
+def test_whole_chunks_that_the_policy_might_have_said(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    policy = policy_of("chunk_gaussian", store.spec, ActionMode.ABSOLUTE)
+    _, every = known(store, policy)
+    ends = store.start + store.length - 1
+    last = ends[torch.searchsorted(store.start, every.known["row"], right=True) - 1]
+    assert len(every) and bool((every.known["row"] + store.spec.chunk <= last).all())
+    with torch.no_grad():
+        for value in trained(policy):
+            value.fill_(-4.0)  # a policy this sure would hardly have said any of them
+    assert len(known(store, policy)[1]) < len(every)
+
+
+def trained(policy: TensorDictModuleBase) -> list[torch.Tensor]:
+    """The log of the policy's spread."""
+    return [value for name, value in policy.named_parameters() if name.endswith("log_std")]
+
+
+def test_a_sample_repeats_itself_and_is_scored_by_the_policy_of_now(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    policy = policy_of("chunk_gaussian", store.spec, ActionMode.ABSOLUTE)
+    ppo, decisions = known(store, policy)
+    keys = like(policy, ppo)
+    one, two = (decisions.sample(6, keys, torch.Generator().manual_seed(3)) for _ in range(2))
+    assert set(one.keys(True, True)) == set(keys.keys(True, True))
+    assert bool((one == two).all())
+    with torch.no_grad():
+        for value in trained(policy):
+            value.sub_(0.3)
+    later = decisions.sample(6, keys, torch.Generator().manual_seed(3))
+    assert torch.equal(later[CHUNK], one[CHUNK]) and torch.equal(later["advantage"], one["advantage"])
+    expected = distribution(policy, inputs_for(later, policy)).log_prob(later[CHUNK])
+    assert torch.allclose(later[LOG_PROB], expected, atol=1e-4)
+    assert not torch.allclose(later[LOG_PROB], one[LOG_PROB], atol=1e-2)
+
+
+def test_chunks_are_the_recorded_commands(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    policy = policy_of("chunk_gaussian", store.spec, ActionMode.ABSOLUTE)
+    _, decisions = known(store, policy)
+    rows = decisions.known["row"]
+    assert torch.equal(decisions.known[CHUNK], chunks_ahead(store, rows, ActionMode.ABSOLUTE))
+
+
+def test_policies_scored_on_tokens_are_refused(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    policy = policy_of("tiny_vla", store.spec, ActionMode.ABSOLUTE)
+    with pytest.raises(ValueError, match="tokens"):
+        known(store, policy)
+
+
+@pytest.mark.parametrize("imagined", [0.0, 1.0])
+def test_updates_learn_from_both_and_without_imagination_from_true_ones_alone(
+    tiny_store: Stores, tmp_path: Path, imagined: float
+) -> None:
+    store = tiny_store(ARM_DELTAS)
+
+    def learned(count: int, flip: float) -> tuple[torch.Tensor, dict[str, float]]:
+        policy = policy_of("chunk_gaussian", store.spec, ActionMode.ABSOLUTE)
+        ppo, decisions = known(store, policy)
+        batch = dataset_rollout(policy, store, _labelled(store), Rewards(1.0, 1.0), 0.9)
+        batch["next", "reward"] *= flip
+        rows = batch["row"].flatten()
+        batch[IMAGE] = store.frames(rows).unflatten(0, batch.shape)
+        batch.update(observe(store, rows, pictures=False).reshape(batch.shape))
+        batch[CHUNK] = chunks_ahead(store, rows, ActionMode.ABSOLUTE).unflatten(0, batch.shape)
+        with torch.no_grad():
+            seen = distribution(policy, inputs_for(batch.flatten(0, 1), policy))
+            batch[LOG_PROB] = seen.log_prob(batch[CHUNK].flatten(0, 1)).reshape(batch.shape)
+        batch["next", "success"] = batch["next", "terminated"]
+        optimiser = torch.optim.Adam(ppo.groups(1e-3))
+        config = settings(recorded=count, imagined=imagined, epochs=1)
+        figures = update(
+            batch, ppo, Trainee(ppo.modules()), optimiser, config, 0, TrueExperience(None, decisions)
+        )
+        return torch.nn.utils.parameters_to_vector(policy.parameters()).detach(), figures
+
+    with_true, figures = learned(16, 1.0)
+    assert "recorded_clip_fraction" in figures
+    without, figures = learned(0, 1.0)
+    assert "recorded_clip_fraction" not in figures
+    assert not torch.equal(with_true, without)
+    other, _ = learned(16, -1.0)  # imagined rewards turned round
+    assert torch.equal(with_true, other) == (imagined == 0.0)
