@@ -240,18 +240,8 @@ def build_physics(cfg: Mapping[str, Any], batch: int, record: bool = False, seed
     if task.get("suite") is None:
         raise ConfigError("task.suite is empty: this task is known from data alone and has no physics")
     try:
-        return PhysicsEnv(
-            task["suite"],
-            task["name"],
-            world_spec(cfg),
-            batch,
-            task["horizon"],
-            ActionMode(task["mode"]),
-            rewards_of(cfg),
-            cfg["launch"]["workers"],
-            record,
-            seed,
-        )
+        pool = TaskPool(task["suite"], task["name"], batch, task["horizon"], cfg["launch"]["workers"])
+        return PhysicsEnv(pool, world_spec(cfg), ActionMode(task["mode"]), rewards_of(cfg), record, seed)
     except (SuiteError, EmbodimentError) as error:
         raise ConfigError(str(error)) from error
 

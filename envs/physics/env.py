@@ -33,40 +33,36 @@ class PhysicsEnv(ChunkedEnv):
     """A batch of true episodes of one task; rewards and success come from the suite.
 
     Args:
-        suite: config section of the task suite; its cameras must have the spec's size.
-        task: a name of the suite's tasks.
+        pool: a slot per episode side by side, B of them, which this world then owns; the suite's cameras must
+            have the spec's size, and the pool's horizon be a multiple of K.
         spec: robot, size of the views, actions per step K.
-        batch: episodes side by side, B.
-        horizon: actions per episode, a multiple of K.
         mode: meaning of the chunk's numbers.
         rewards: weights of true progress and success.
-        workers: processes; 0 means one per core, 1 runs in this process.
         record: keep every frame of every episode, for `pop_tracks`.
         seed: of the stream of episode seeds.
 
     Examples:
-        >>> env = PhysicsEnv(cfg.task.suite, "push", spec, batch=2, horizon=40, mode=ActionMode.RELATIVE,
-        ...     rewards=Rewards(progress=1.0, success=1.0))
+        >>> pool = TaskPool(cfg.task.suite, "push", slots=2, horizon=40, workers=1)
+        >>> env = PhysicsEnv(pool, spec, ActionMode.RELATIVE, Rewards(progress=1.0, success=1.0))
         >>> env.rollout(2)[IMAGE].shape  # [B, T, V, 3, H, W]
         torch.Size([2, 2, 3, 3, 64, 64])
     """
 
     def __init__(
         self,
-        suite: Mapping[str, Any],
-        task: str,
+        pool: TaskPool,
         spec: WorldSpec,
-        batch: int,
-        horizon: int,
         mode: ActionMode,
         rewards: Rewards,
-        workers: int = 0,
         record: bool = False,
         seed: int = 0,
     ):
-        super().__init__(spec, batch, horizon, mode, seed=seed)
-        self.rewards, self.record = rewards, record
-        self.pool = TaskPool(suite, task, batch, horizon, workers)
+        try:
+            super().__init__(spec, pool.slots, pool.horizon, mode, seed=seed)
+        except BaseException:
+            pool.close()
+            raise
+        self.pool, self.rewards, self.record = pool, rewards, record
         self.tracks: deque[Track] = deque()
         self._rows: dict[int, dict[str, Any]] = {}
 

@@ -172,6 +172,7 @@ class TaskPool:
     """
 
     def __init__(self, suite: Mapping[str, Any], task: str, slots: int, horizon: int, workers: int):
+        self.slots, self.horizon = slots, horizon
         spec = WorkerSpec(to_plain(suite), task, horizon)
         count = min(workers or available_cores(), slots)
         self.owner = [slot % count for slot in range(slots)]

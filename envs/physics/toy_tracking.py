@@ -17,9 +17,11 @@ from envs.chunked import ChunkedEnv
 from envs.embodiment import ActionKind, Camera, Embodiment
 from envs.specs import CHUNK, COMMAND, IMAGE, PROGRESS, STATE, SUCCESS, ActionMode, WorldSpec
 
+_SIZE = 16  # pixels a side
 
-def toy_embodiment(actions: int, size: int) -> Embodiment:
-    """A robot of `actions` nameless numbers whose one camera of `size` pixels a side shows noise."""
+
+def toy_embodiment(actions: int) -> Embodiment:
+    """A robot of `actions` nameless numbers whose one camera shows noise."""
     names = tuple(f"action_{k}" for k in range(actions))
     return Embodiment(
         robot="toy_tracking",
@@ -28,7 +30,7 @@ def toy_embodiment(actions: int, size: int) -> Embodiment:
         delta=False,
         arms=(),
         state_names=(*names, *(f"target_{k}" for k in range(actions))),
-        cameras=(Camera("noise", (size, size)),),
+        cameras=(Camera("noise", (_SIZE, _SIZE)),),
         fps=10.0,
     )
 
@@ -44,7 +46,6 @@ class ToyTrackingEnv(ChunkedEnv):
         actions: numbers of an action; the state holds the last action, then the target.
         success_steps: consecutive actions near the target that make a success.
         tolerance: how near, in every number.
-        size: side of the picture, which is noise.
         starts: different targets; an episode's is that of its seed modulo this.
         targets: seed of all targets; another gives targets never seen.
         seed: of the stream of episode seeds.
@@ -58,17 +59,16 @@ class ToyTrackingEnv(ChunkedEnv):
         actions: int = 2,
         success_steps: int = 2,
         tolerance: float = 0.35,
-        size: int = 16,
         starts: int = 4096,
         targets: int = 0,
         seed: int = 0,
     ):
-        spec = WorldSpec(toy_embodiment(actions, size), (size, size), chunk)
+        spec = WorldSpec(toy_embodiment(actions), (_SIZE, _SIZE), chunk)
         super().__init__(spec, batch, chunk * decisions, ActionMode.ABSOLUTE, seed=seed)
         self.toy = ToyVLAEnv(
             actions,
             2 * actions,
-            (3, size, size),
+            (3, _SIZE, _SIZE),
             success_steps=success_steps,
             success_tol=tolerance,
             batch_size=torch.Size([batch]),

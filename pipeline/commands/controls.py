@@ -3,6 +3,7 @@
 Beside a finished run stand, on the same evaluation seeds:
 
 - the loop without its RL iterations: deploy, refresh the world, clone what worked, as many physics episodes;
+- the loop whose RL learns from the true decisions alone (rl.imagined=0): the rest is as it was;
 - RL in physics with as many episodes as the loop deployed;
 - RL in physics with as many environment steps as the loop imagined;
 - filtered BC on everything that the loop recorded.
@@ -96,9 +97,11 @@ def control_rows(cfg: Cfg, root: Path, loop: Graph) -> list[Row]:
     loop.add("filtered-bc", only_here.filtered_bc, {"data": ["collect", *deploys]})
     loop.add("evaluate-filtered-bc", prove.evaluate_physics, {"policy": "filtered-bc"})
     without = build_loop(cfg, root, with_rl=False)
+    blind = build_loop({**cfg, "rl": {**cfg["rl"], "imagined": 0.0}}, root)
     return [
         Row("loop", loop, "evaluate-after", deploys),
         Row("loop without RL iterations", without, "evaluate-after", deploys),
+        Row("loop without imagined decisions", blind, "evaluate-after", deploys),
         *(Row(title, loop, f"evaluate-{name}", (name,)) for title, name in learned.items()),
         Row("filtered BC", loop, "evaluate-filtered-bc", deploys),
     ]

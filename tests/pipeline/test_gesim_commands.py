@@ -16,7 +16,7 @@ from pipeline.benches.gesim_floor import count_flops
 from pipeline.commands.finetune import build_finetune
 from pipeline.commands.serving import build_session_host
 from pipeline.config import load_config
-from tests.envs.gesim_tiny import write_checkpoint
+from tests.envs.simulators.gesim_tiny import write_checkpoint
 
 WORDS = [
     "simulator=gesim",

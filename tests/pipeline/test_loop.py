@@ -45,7 +45,7 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     controls = worldloop("controls", *words)
     assert controls.returncode == 0, controls.stderr[-3000:]
     rows = json.loads((run / "controls.json").read_text())
-    assert set(rows) > {"before", "loop", "loop without RL iterations", "filtered BC"}
+    assert set(rows) > {"before", "loop", "loop without imagined decisions", "filtered BC"}
     assert "equal steps" in (run / "report.html").read_text()
 
 

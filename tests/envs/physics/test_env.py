@@ -19,16 +19,8 @@ SPEC = WorldSpec(build_suite(PUSH["suite"]).embodiment, (24, 32), 4)
 
 
 def env_of(batch: int, horizon: int, mode: str = "relative", **changes: Any) -> PhysicsEnv:
-    given: dict[str, Any] = {"spec": SPEC, "workers": 1, **changes}
-    return PhysicsEnv(
-        PUSH["suite"],
-        PUSH["name"],
-        batch=batch,
-        horizon=horizon,
-        mode=mode,
-        rewards=Rewards(1.0, 1.0),
-        **given,
-    )
+    pool = TaskPool(PUSH["suite"], PUSH["name"], batch, horizon, changes.pop("workers", 1))
+    return PhysicsEnv(pool, mode=mode, rewards=Rewards(1.0, 1.0), **{"spec": SPEC, **changes})
 
 
 def on_target(env_or_pool: Any) -> None:

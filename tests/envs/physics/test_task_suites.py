@@ -33,9 +33,8 @@ def suite(task: dict[str, Any]) -> TaskSuite:
 
 def env_of(task: dict[str, Any], suite: TaskSuite, batch: int, horizon: int) -> PhysicsEnv:
     spec = WorldSpec(suite.embodiment, tuple(task["size"]), 2)
-    return PhysicsEnv(
-        task["suite"], task["name"], spec, batch, horizon, task["mode"], Rewards(1.0, 1.0), workers=1
-    )
+    pool = TaskPool(task["suite"], task["name"], batch, horizon, workers=1)
+    return PhysicsEnv(pool, spec, task["mode"], Rewards(1.0, 1.0))
 
 
 def act(suite: TaskSuite, task: str, seed: int, noise_level: float, steps: int) -> list[Observation]:

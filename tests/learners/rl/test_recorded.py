@@ -24,7 +24,7 @@ from learners.stages.observed import observe
 from learners.training.parallel import Trainee
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES
 from tests.learners.models import policy_of
-from tests.learners.test_algorithms import algorithm_of, settings
+from tests.learners.rl.test_algorithms import algorithm_of, settings
 
 Stores = Callable[[Embodiment], ClipStore]
 KEYS = ("advantage", "value_target", "state_value")

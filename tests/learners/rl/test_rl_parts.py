@@ -11,7 +11,7 @@ from envs.targets import ConfigError, options
 from learners.rl.alarms import Alarms
 from learners.rl.algorithm import RLConfig, finite, first_episode, judged, sound
 from learners.training.fit import TrainingDiverged
-from tests.learners.test_algorithms import RL
+from tests.learners.rl.test_algorithms import RL
 
 DONE = torch.tensor([[False, True, False, True], [False, False, False, True]])
 

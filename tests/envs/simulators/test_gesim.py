@@ -32,7 +32,7 @@ from envs.world import WorldEnv
 from tests.arms import two_arms
 from tests.embodiments import BIMANUAL_JOINTS, BIMANUAL_POSES
 from tests.envs.clips_of import clip_of, first_of, future_of
-from tests.envs.gesim_tiny import NET, SPEC, VAE, build, write_checkpoint
+from tests.envs.simulators.gesim_tiny import NET, SPEC, VAE, build, write_checkpoint
 
 
 @pytest.fixture(scope="module")
