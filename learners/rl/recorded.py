@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from actors.policies.contract import action_key, device_of, distribution, inputs_for, trained_part
 from envs.episodes.clips import ClipStore
-from envs.specs import CHUNK, LOG_PROB, ActionMode
+from envs.specs import CHUNK, IMAGE, LOG_PROB, ActionMode
 from learners.rl.algorithm import Anchor
 from learners.stages.imitation import chunks_ahead
 from learners.stages.observed import observe
@@ -56,16 +56,20 @@ class RecordedDecisions:
     @torch.no_grad()
     def _usual(self, some: TensorDict) -> torch.Tensor:
         """Whether the policy might well have said the chunks of decisions [N]: bool [N]."""
-        seen = distribution(self.policy, inputs_for(observe(self.store, some["row"]), self.policy))
+        seen = distribution(self.policy, inputs_for(self._seen(some), self.policy))
         said = torch.stack([seen.log_prob(seen.sample()) for _ in range(_SAMPLES)]).mean(0)
         return (seen.log_prob(some[CHUNK].to(said.device)) > said - _UNLIKELY).cpu()
+
+    def _seen(self, some: TensorDict) -> TensorDict:
+        """Decisions [N] with what the policy reads: no pictures if it was left its features alone."""
+        seen = observe(self.store, some["row"], pictures=IMAGE in self.policy.in_keys)
+        return seen.update(some)
 
     @torch.no_grad()
     def sample(self, count: int, like: TensorDict, generator: torch.Generator) -> TensorDict:
         """Random ones, with the keys and on the device of the transitions `like`."""
         some = self.known[torch.randperm(len(self.known), generator=generator)[:count]]
-        seen = observe(self.store, some["row"])
-        seen.update(some)
+        seen = self._seen(some)
         device = device_of(self.policy)
         likely = [
             distribution(self.policy, inputs_for(part, self.policy)).log_prob(part[CHUNK].to(device)).cpu()

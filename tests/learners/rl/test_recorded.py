@@ -11,7 +11,13 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 
-from actors.policies.contract import distribution, inputs_for
+from actors.policies.contract import (
+    VISUAL_FEATURES,
+    distribution,
+    freeze_perception,
+    inputs_for,
+    trained_part,
+)
 from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
 from envs.specs import C2W, CHUNK, COMMAND, IMAGE, INTRINSIC, LOG_PROB, STATE, ActionMode, Rewards
@@ -93,6 +99,17 @@ def test_a_sample_repeats_itself_and_is_scored_by_the_policy_of_now(tiny_store: 
     expected = distribution(policy, inputs_for(later, policy)).log_prob(later[CHUNK])
     assert torch.allclose(later[LOG_PROB], expected, atol=1e-4)
     assert not torch.allclose(later[LOG_PROB], one[LOG_PROB], atol=1e-2)
+
+
+def test_with_frozen_perception_features_stand_for_pictures(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    policy = policy_of("chunk_gaussian", store.spec, ActionMode.ABSOLUTE)
+    whole, _ = (known(store, policy)[1], freeze_perception(policy))
+    ppo, decisions = known(store, policy)
+    keys = like(trained_part(policy), ppo)
+    assert VISUAL_FEATURES in keys.keys(True, True) and IMAGE not in keys.keys(True, True)
+    some = decisions.sample(4, keys, torch.Generator().manual_seed(3))
+    assert len(decisions) == len(whole) and set(some.keys(True, True)) == set(keys.keys(True, True))
 
 
 def test_chunks_are_the_recorded_commands(tiny_store: Stores) -> None:
