@@ -37,8 +37,9 @@ class RLConfig:
         minibatch: transitions per update.
         microbatches: parts a minibatch is cut into, each with a backward pass of its own, to save memory or
             to be shared out to workers.
-        lr: learning rate of the policy.
-        clip: largest gradient norm.
+        lr: learning rate of the policy at first; all rates fall to zero over the iterations, so that what is
+            deployed is not one moment of a random walk.
+        clip: largest gradient norm of the policy, and of the critic.
         kl_stop: mean KL to the behaviour policy at which an iteration's epochs end early.
         imagined: weight of the algorithm's loss on imagined decisions; 0 leaves them out, as a control.
         recorded: decisions of the deployed policy in physics per iteration, learned from beside the imagined

@@ -73,6 +73,7 @@ def train_rl(
     checkpoints, log, learned = Checkpoints(folder), folder / "metrics.jsonl", folder / "learned.jsonl"
     trainee = Trainee(algorithm.modules())
     optimiser = torch.optim.Adam(algorithm.groups(config.lr), lr=config.lr, eps=1e-5)
+    rates = [group["lr"] for group in optimiser.param_groups]
     alarms, ledger, first, episodes, wave = Alarms(), EpisodeLedger(), 0, 0, 0
     spent = {"rollout": 0.0, "update": 0.0}
 
@@ -142,6 +143,8 @@ def train_rl(
     ):
         for iteration in range(first, config.iterations):
             began = time.perf_counter()
+            for group, lr in zip(optimiser.param_groups, rates, strict=True):
+                group["lr"] = lr * (1 - iteration / config.iterations)
             batch, supply = from_leader(partial(gather, iteration, trainee(trained_weights, policy)))
             collected = time.perf_counter()
             seed = update_seed(config.seed, iteration)

@@ -60,9 +60,8 @@ def update(
             if means.get("kl", 0.0) > config.kl_stop:
                 stopped = True
                 break
-            norm = clip_gradients(
-                [p for group in optimiser.param_groups for p in group["params"]], config.clip
-            )
+            # each group by itself: a critic's large gradients must not make the policy's small
+            norm = max(clip_gradients(group["params"], config.clip) for group in optimiser.param_groups)
             if not math.isfinite(norm):
                 raise TrainingDiverged(f"rl: gradient norm {norm}; lower rl.lr; the last checkpoint is kept")
             optimiser.step()
