@@ -18,13 +18,14 @@ Words = list[str]
 
 def run(words: Words) -> None:
     """run the whole loop of an experiment; finished stages are reused, interrupted ones resume"""
+    from pipeline.graph.owner import owning
     from pipeline.loop import build_loop
     from pipeline.track import tracking
 
     cfg, root = _prepared(words)
     graph = build_loop(cfg, root)
     print(f"{len(graph.nodes)} stages in {root}; each says how long it will take after its first steps")
-    with tracking(cfg, root) as tracker:
+    with owning(root, "run"), tracking(cfg, root) as tracker:
         manifests = graph.run(tracker=tracker)
         result = json.loads((root / "result.json").read_text())
         tracker.summarise(result)
@@ -92,10 +93,11 @@ def evaluate(words: Words) -> None:
 def controls(words: Words) -> None:
     """whose gain is it: beside a finished run the loop without RL iterations, RL in physics, filtered BC"""
     from pipeline.commands.controls import run_controls, table_text
+    from pipeline.graph.owner import owning
     from pipeline.track import tracking
 
     cfg, root = _prepared(words)
-    with tracking(cfg, root) as tracker:
+    with owning(root, "controls"), tracking(cfg, root) as tracker:
         table = run_controls(cfg, root, tracker)
     print(f"{table_text(table)}\n{root}/controls.json, {root}/report.html")
 
@@ -114,11 +116,12 @@ def finetune(words: Words) -> None:
     finetune.data=[<folder>]
     """
     from pipeline.commands.finetune import build_finetune
+    from pipeline.graph.owner import owning
     from pipeline.track import tracking
 
     cfg, root = _prepared(words)
     graph = build_finetune(cfg, root)
-    with tracking(cfg, root / "finetune") as tracker:
+    with owning(root, "finetune"), tracking(cfg, root / "finetune") as tracker:
         graph.run(tracker=tracker)
     print(f"weights in {graph.folder('simulator')} and {graph.folder('state')}")
 
@@ -268,6 +271,7 @@ def _prepared(words: Words) -> tuple[dict[str, Any], Path]:
 
 def _run_until(name: str, words: Words) -> Path:
     """Run a stage and what it needs; returns its folder."""
+    from pipeline.graph.owner import owning
     from pipeline.loop import build_loop
     from pipeline.track import tracking
 
@@ -275,7 +279,7 @@ def _run_until(name: str, words: Words) -> Path:
     graph = build_loop(cfg, root)
     if name not in graph.nodes:
         raise ConfigError(f"no stage {name}{nearest(name, graph.nodes)}")
-    with tracking(cfg, root) as tracker:
+    with owning(root, f"stage {name}"), tracking(cfg, root) as tracker:
         graph.run(name, tracker)
     return graph.folder(name)
 

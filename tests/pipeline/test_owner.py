@@ -1,0 +1,84 @@
+"""One run, one owner: a second command in the same run is refused, whatever ended lets go."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pipeline.graph.owner import RunInUse, owning
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from pipeline.graph.owner import owning
+with owning(Path(sys.argv[1]), "run"):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.fixture
+def holder(tmp_path: Path) -> subprocess.Popen[str]:
+    """Another process that holds the run."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True, env=dict(os.environ)
+    )
+    assert process.stdout is not None and process.stdout.readline() == "held\n"
+    yield process
+    process.kill()
+    process.wait()
+
+
+def test_a_second_owner_is_told_who_works_there(holder: subprocess.Popen[str], tmp_path: Path) -> None:
+    with pytest.raises(RunInUse) as told, owning(tmp_path, "controls"):
+        pass
+    words = str(told.value)
+    assert str(tmp_path) in words and "worldloop run" in words
+    assert f"process {holder.pid} on {socket.gethostname()}, since 2" in words and "name=" in words
+    assert json.loads((tmp_path / ".owner.json").read_text())["pid"] == holder.pid  # still its own
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_what_a_dead_owner_held_is_taken_over(
+    holder: subprocess.Popen[str], tmp_path: Path, number: signal.Signals
+) -> None:
+    holder.send_signal(number)
+    holder.wait()
+    with owning(tmp_path, "run"):
+        assert json.loads((tmp_path / ".owner.json").read_text())["pid"] == os.getpid()
+    assert not (tmp_path / ".owner.json").exists()
+
+
+def test_two_commands_in_one_run_leave_one_good_run(tmp_path: Path) -> None:
+    words = ["stage", "collect", "experiment=smoke", f"runs={tmp_path}", "track=disabled"]
+    words.append("collect.episodes.train=120")
+    first = _worldloop(words)
+    lock = tmp_path / "smoke/.owner.json"
+    deadline = time.monotonic() + 60
+    while not lock.exists() and time.monotonic() < deadline and first.poll() is None:
+        time.sleep(0.02)
+    second = _worldloop(words)
+    said = second.communicate()[1]
+    assert first.wait() == 0 and second.returncode == 1, said
+    assert "belongs to `worldloop stage collect`, process" in said and "Traceback" not in said
+    (folder,) = (tmp_path / "smoke/stages").glob("collect-*")
+    info = json.loads((folder / "dataset/meta/info.json").read_text())
+    assert info["total_episodes"] == json.loads((folder / "manifest.json").read_text())["result"]["episodes"]
+
+
+def _worldloop(words: list[str]) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "pipeline", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).resolve().parents[2],
+    )
