@@ -17,6 +17,7 @@ from torch import Tensor
 from torchrl.data.vla import ACTION_CHUNK_KEY, IMAGE_KEY, INSTRUCTION_KEY, STATE_KEY
 
 from envs.embodiment import ActionKind, Embodiment
+from envs.ranges import NonNegative
 
 CHUNK = ACTION_CHUNK_KEY  # ("vla_action", "chunk") float32 [B, K, A]
 LOG_PROB = ("vla_action", "log_probs")  # float32 [B]
@@ -176,8 +177,8 @@ class Rewards:
         success: bonus at success.
     """
 
-    progress: float
-    success: float
+    progress: NonNegative
+    success: NonNegative
 
     def __call__(self, before: Tensor, after: Tensor, success: Tensor) -> Tensor:
         """Reward float32 [..., 1] from progress before and after [..., 1] and success bool [..., 1]."""

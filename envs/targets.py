@@ -11,10 +11,19 @@ import difflib
 import importlib
 import inspect
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, TypeVar
+from dataclasses import dataclass, is_dataclass
+from functools import lru_cache, partial
+from typing import Any, TypeVar, get_type_hints
 
 T = TypeVar("T")
 TARGET = "_target_"
+
+
+@dataclass(frozen=True)
+class OptionsOf:
+    """Marks a mapping as the options of a class: Annotated[Mapping[str, Any], OptionsOf(Denoising)]."""
+
+    kind: Callable[..., Any]
 
 
 class ConfigError(ValueError):
@@ -83,10 +92,135 @@ def options(kind: type[T], section: Mapping[str, Any], key: str) -> T:
     """
     given = {str(name): to_plain(value) for name, value in section.items()}
     _check_names(kind, kind.__name__, given, {}, key)
+    if wrong := value_faults(kind, given, key):
+        raise ConfigError("; ".join(wrong))
     try:
         return kind(**given)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{key}: {error}") from error
+
+
+def section_faults(section: Mapping[str, Any], key: str, around: Iterable[str] = ()) -> list[str]:
+    """What can be seen to be wrong with a section of `_target_` before it is built, and with those in it.
+
+    Args:
+        section: of the config.
+        key: where it stands, for messages.
+        around: keys that belong to whoever builds it, not to the class.
+
+    Returns:
+        A sentence for each.
+    """
+    try:
+        factory = target(section, key)
+    except ConfigError as error:
+        return [str(error)]
+    given = {name: value for name, value in section.items() if name != TARGET and name not in around}
+    kind = getattr(factory, "config_type", factory)
+    out = unknown_names(kind, given, str(section[TARGET]), key) + value_faults(kind, given, key)
+    for name, value in section.items():
+        if isinstance(value, Mapping) and TARGET in value:
+            out += section_faults(value, f"{key}.{name}")
+    return out
+
+
+def unknown_names(kind: Callable[..., Any], given: Iterable[str], name: str, key: str) -> list[str]:
+    """A sentence for each option that a class does not take."""
+    try:
+        parameters = inspect.signature(kind).parameters
+    except (TypeError, ValueError):  # built in C
+        return []
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+        return []
+    return [
+        f"{key}.{option} is not an option of {name}{nearest(option, parameters)}"
+        for option in given
+        if option not in parameters
+    ]
+
+
+def value_faults(kind: Callable[..., Any], given: Mapping[str, Any], key: str) -> list[str]:
+    """What is wrong with values, by the types and ranges (envs/ranges.py) that a class says at their names.
+
+    Args:
+        kind: a dataclass, or any class or function with annotations.
+        given: values by name; names that it does not have are not looked at.
+        key: where they stand, for messages.
+
+    Returns:
+        A sentence for each, naming key, value and what is allowed.
+    """
+    from pydantic import ValidationError  # physics workers do without it
+
+    out = []
+    checks, within = _checks(kind), _within(kind)
+    for name, value in given.items():
+        if name in within and isinstance(value, Mapping):
+            inner = within[name]
+            out += unknown_names(inner, value, getattr(inner, "__name__", name), f"{key}.{name}")
+            out += value_faults(inner, value, f"{key}.{name}")
+        if name not in checks:
+            continue
+        try:
+            checks[name](to_plain(value))
+        except ValidationError as error:
+            out += _sentences(error.errors(include_url=False), value, f"{key}.{name}".lstrip("."))
+    return out
+
+
+@lru_cache
+def _within(kind: Callable[..., Any]) -> dict[str, Callable[..., Any]]:
+    """The classes whose options a class takes as mappings, by the names that it takes them under."""
+    return {
+        name: mark.kind
+        for name, hint in _hints(kind).items()
+        for mark in getattr(hint, "__metadata__", ())
+        if isinstance(mark, OptionsOf)
+    }
+
+
+@lru_cache
+def _checks(kind: Callable[..., Any]) -> dict[str, Callable[[Any], Any]]:
+    """What raises pydantic's ValidationError for values that do not fit, by the names that a class takes."""
+    from pydantic import ConfigDict, PydanticUserError, TypeAdapter
+
+    out: dict[str, Callable[[Any], Any]] = {}
+    for name, hint in _hints(kind).items():
+        plain = is_dataclass(hint)  # its own type has no configuration of ours
+        how = None if plain else ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
+        try:
+            adapter: TypeAdapter[Any] = TypeAdapter(hint, config=how)
+        except (PydanticUserError, TypeError):  # a type that cannot be checked
+            continue
+        out[name] = partial(adapter.validate_python, strict=not plain)
+    return out
+
+
+def _sentences(found: Iterable[Mapping[str, Any]], value: Any, key: str) -> list[str]:
+    """What pydantic found wrong with a value, one sentence for each place in it."""
+    places: dict[str, tuple[Any, list[str]]] = {}
+    for error in found:
+        path, inner = key, value
+        for part in error["loc"]:  # names of a union's branches stand between those of places
+            named = isinstance(inner, Mapping) and part in inner
+            if named or (isinstance(part, int) and _has(inner, part)):
+                path, inner = f"{path}.{part}", inner[part]
+        said = error["msg"].replace("Input should be ", "").replace("an instance of Sequence", "a list")
+        places.setdefault(path, (inner, []))[1].append(said)
+    return [f"{path}={wrong!r} should be {' or '.join(said)}" for path, (wrong, said) in places.items()]
+
+
+def _has(value: Any, position: int) -> bool:
+    return isinstance(value, (list, tuple)) and position < len(value)
+
+
+def _hints(kind: Callable[..., Any]) -> dict[str, Any]:
+    """Types of what a class or function takes, by name."""
+    made = inspect.isclass(kind) and not is_dataclass(kind)
+    try:
+        return get_type_hints(kind.__init__ if made else kind, include_extras=True)  # type: ignore[misc]
+    except (NameError, TypeError):  # types that only type checkers see
+        return {}
 
 
 def nearest(name: str, names: Iterable[str]) -> str:

@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from envs.targets import ConfigError, nearest
+from pipeline.checks import faults
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 
@@ -35,7 +36,8 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
             hint
             or f"{text}\nGroups are {', '.join(groups())}; `worldloop config` prints every key and its value."
         ) from error
-    check(cfg)
+    if wrong := faults(cfg):
+        raise ConfigError("\n".join(wrong))
     return cfg
 
 
@@ -47,41 +49,6 @@ def groups() -> list[str]:
 def choices(group: str) -> list[str]:
     """What can be chosen for a group, such as policy."""
     return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
-
-
-def check(cfg: Mapping[str, Any]) -> None:
-    """Refuse what can be seen to fail before anything starts.
-
-    Raises:
-        ConfigError: naming the key and the fix.
-    """
-    task, rounds = cfg["task"], cfg["rounds"]
-    if task["horizon"] % task["chunk"]:
-        raise ConfigError(f"task.horizon={task['horizon']} must be a multiple of task.chunk={task['chunk']}")
-    if task["mode"] not in ("relative", "absolute"):
-        raise ConfigError(f"task.mode={task['mode']!r} must be relative or absolute")
-    if any(side % 16 for side in task["size"]):
-        raise ConfigError(f"task.size={task['size']} must be multiples of 16 in both directions")
-    if not task.get("suite") and not task.get("data"):
-        raise ConfigError(
-            "task has neither a suite (physics) nor data (recordings): task.data=[folder of a LeRobot data"
-            " set], or another task"
-        )
-    if abs(sum(cfg["collect"]["mix"].values()) - 1) > 1e-6:
-        raise ConfigError(f"collect.mix={cfg['collect']['mix']} must add up to 1")
-    if rounds["count"] < 1:
-        raise ConfigError("rounds.count must be at least 1")
-    for key in ("deploy", "iterations"):
-        if not rounds[key]:
-            raise ConfigError(f"rounds.{key} must hold at least one number")
-    if sum(rounds["splits"].values()) >= 1:
-        raise ConfigError(
-            f"rounds.splits={rounds['splits']} must add up to less than 1; the rest is for learning"
-        )
-    if cfg["rl"]["envs"] % cfg["rl"]["shards"]:
-        raise ConfigError(
-            f"rl.envs={cfg['rl']['envs']} must be a multiple of rl.shards={cfg['rl']['shards']}"
-        )
 
 
 def _compose(overrides: Sequence[str]) -> dict[str, Any]:

@@ -34,6 +34,7 @@ from tqdm import tqdm
 from actors.fleets.fleet import EpisodeLedger, FleetError, Result
 from actors.rollouts.host import Host, Job, Stopwatch, Weights, pack, size_of, unpack
 from actors.rollouts.recipe import Recipe, build_host_process
+from envs.ranges import Natural, Positive
 from envs.targets import options
 
 
@@ -89,11 +90,11 @@ class Patience:
             meanwhile counts a tenth.
     """
 
-    job: float
-    start: float
-    stage: float
-    retries: int
-    rebuilds: int
+    job: Positive
+    start: Positive
+    stage: Positive
+    retries: Natural
+    rebuilds: Natural
 
 
 class RayFleet:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution, constraints, register_kl
 
 from actors.policies.heads import Head
+from envs.ranges import Count, Positive
 from envs.specs import ActionMode
 
 
@@ -129,7 +130,7 @@ class ChunkGaussianHead(Head):
     gain: Tensor
     offset: Tensor
 
-    def __init__(self, width: int, chunk: int, actions: int, knots: int, std: float, mode: str):
+    def __init__(self, width: int, chunk: int, actions: int, knots: Count, std: Positive, mode: str):
         super().__init__()
         if not 1 <= knots <= chunk:
             raise ValueError(f"knots={knots} must be between 1 and task.chunk={chunk}")

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution, constraints, register_kl
 
 from actors.policies.heads import Head
+from envs.ranges import Count
 
 
 class ChunkTokens(Distribution):
@@ -100,7 +101,7 @@ class ChunkTokenHead(Head):
     low: Tensor
     high: Tensor
 
-    def __init__(self, width: int, chunk: int, actions: int, bins: int):
+    def __init__(self, width: int, chunk: int, actions: int, bins: Count):
         super().__init__()
         self.chunk, self.bins, self.actions = chunk, bins, actions
         self.logits = nn.Linear(width, chunk * actions * bins)

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data.vla import UniformActionTokenizer
 
+from envs.ranges import Count
 from envs.specs import CHUNK, IMAGE, INSTRUCTION, STATE, WorldSpec
 from envs.targets import build
 
@@ -28,7 +29,7 @@ class MainViewPolicy(TensorDictModuleBase):
         bins: tokens per number of an action; they span -1..1 until `normalise` finds another range.
     """
 
-    def __init__(self, spec: WorldSpec, policy: Mapping[str, Any], bins: int):
+    def __init__(self, spec: WorldSpec, policy: Mapping[str, Any], bins: Count):
         super().__init__()
         self.view = spec.embodiment.main_view
         self.policy = build(

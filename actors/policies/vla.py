@@ -19,6 +19,7 @@ from actors.policies.contract import POLICY_FEATURES, VISUAL_FEATURES
 from actors.policies.heads import RESOLUTION, Head, varying
 from envs.encoders import MultiViewEncoder
 from envs.language import TextEncoder
+from envs.ranges import Count
 from envs.specs import CHUNK, IMAGE, INSTRUCTION_UTF8, LOG_PROB, STATE, WorldSpec
 from envs.targets import build
 
@@ -101,9 +102,9 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         self,
         spec: WorldSpec,
         head: Mapping[str, Any],
-        width: int,
-        points: int,
-        channels: int,
+        width: Count,
+        points: Count,
+        channels: Count,
         cameras: str | Sequence[str],
     ):
         eyes = Perception(spec, points, channels, cameras)

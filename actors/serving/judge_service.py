@@ -28,6 +28,7 @@ from torch import Tensor
 from actors.factory import build_judge, prepare_process
 from actors.policies.contract import device_of
 from envs.judges.base import Judge, Verdict
+from envs.ranges import Count, Natural, NonNegative, Positive
 from envs.specs import Status
 from envs.targets import ConfigError
 
@@ -48,13 +49,13 @@ class ServiceConfig:
         pause: seconds before the first of these; doubles each time.
     """
 
-    batch: int
-    wait_ms: float
-    cache: int
-    budget: int
-    deadline: float
-    retries: int
-    pause: float
+    batch: Count
+    wait_ms: NonNegative
+    cache: Natural
+    budget: Natural
+    deadline: Positive
+    retries: Natural
+    pause: NonNegative
 
 
 class JudgeServer:

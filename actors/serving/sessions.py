@@ -19,6 +19,7 @@ from envs.conditioning.joint_commands import JointCommands
 from envs.embodiment import ActionKind
 from envs.geometry.cameras import resize_intrinsics
 from envs.precision import mixed_precision
+from envs.ranges import Count, Natural, NonNegative, Port, Positive
 from envs.simulators import memory
 from envs.simulators.base import Simulator
 from envs.simulators.remote.protocol import ProtocolError
@@ -51,13 +52,13 @@ class ServeConfig:
     """
 
     host: str
-    port: int
-    sessions: int
-    batch: int
-    linger_ms: float
-    idle_s: float
-    body_mb: float
-    seed: int
+    port: Port
+    sessions: Count
+    batch: Count
+    linger_ms: NonNegative
+    idle_s: Positive
+    body_mb: Positive
+    seed: Natural
     fixed_seed: bool
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor
 
 from envs.geometry.rotations import pose_transforms
+from envs.ranges import Positive
 
 CANVAS = 50  # of 255, where nothing is drawn
 _AXIS = 0.1  # m
@@ -38,13 +40,9 @@ class PoseMapStyle:
     """
 
     tool_offset: float = 0.15
-    radius_law: str = "released"
+    radius_law: Literal["released", "paper"] = "released"
     cull_behind: bool = False
-    scale: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.radius_law not in ("released", "paper"):
-            raise ValueError(f"radius_law={self.radius_law!r} must be 'released' or 'paper'")
+    scale: Positive | None = None
 
 
 @lru_cache(maxsize=1)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from envs.encoders import MultiViewEncoder, to_signed
 from envs.judges.base import Judge, Verdict, verdict_status
 from envs.language import TextEncoder
+from envs.ranges import Count, Discount, Share
 from envs.specs import Status, WorldSpec, text_to_bytes
 
 _AT_ONCE = 512  # frames per forward pass of `score`, so that long clips of many episodes fit into memory
@@ -41,13 +42,13 @@ class LearnedJudge(Judge):
     def __init__(
         self,
         spec: WorldSpec,
-        hold: int,
-        margin: float,
-        discount: float,
-        width: int,
-        points: int,
-        text: int,
-        hidden: int,
+        hold: Count,
+        margin: Share,
+        discount: Discount,
+        width: Count,
+        points: Count,
+        text: Count,
+        hidden: Count,
         cameras: str | Sequence[str],
     ):
         super().__init__(hold)

@@ -28,6 +28,7 @@ from envs.physics.suite import (
     check_noise_level,
     check_task,
 )
+from envs.ranges import NonNegative, Positive
 
 SIM_HZ = 80.0  # at which Meta-World's own step takes actions
 STRIDE = 0.01  # m the hand's target moves in one such step by an action of 1
@@ -106,8 +107,8 @@ class MetaWorld(TaskSuite):
 
     def __init__(
         self,
-        control_hz: float,
-        hold: float,
+        control_hz: Positive,
+        hold: NonNegative,
         size: tuple[int, int],
         cameras: tuple[str, ...],
         calibrated: bool,

@@ -6,12 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
 
+from envs.ranges import Count, Natural, NonNegative, Positive, Share
 from envs.specs import CHUNK, INVALID_ACTION, JUDGE_STATUS, LOG_PROB, Status
 
 
@@ -56,37 +57,31 @@ class RLConfig:
         seed: of start frames, exploration and minibatches.
     """
 
-    iterations: int
-    envs: int
-    shards: int
-    starts: str
-    chunks: int | None
-    schedule: str
-    max_policy_lag: int
-    queue: int
-    max_dropped: float
-    epochs: int
-    minibatch: int
-    microbatches: int
-    lr: float
-    clip: float
-    kl_stop: float
-    imagined: float
-    recorded: int
-    anchor: float
-    anchor_batch: int
+    iterations: Count
+    envs: Count
+    shards: Count
+    starts: Literal["inside", "first"]
+    chunks: Count | None
+    schedule: Literal["sync", "async"]
+    max_policy_lag: Natural
+    queue: Count
+    max_dropped: Share
+    epochs: Count
+    minibatch: Count
+    microbatches: Count
+    lr: Positive
+    clip: Positive
+    kl_stop: Positive
+    imagined: NonNegative
+    recorded: Natural
+    anchor: NonNegative
+    anchor_batch: Count
     rewards_later: bool
     freeze_perception: bool
-    checkpoint_every: int
-    seed: int
+    checkpoint_every: Count
+    seed: Natural
 
     def __post_init__(self) -> None:
-        if self.chunks is not None and self.chunks < 1:
-            raise ValueError(f"chunks={self.chunks} must be at least 1, or null for whole episodes")
-        if self.starts not in ("inside", "first"):
-            raise ValueError(f"starts={self.starts!r} must be inside or first")
-        if self.schedule not in ("sync", "async"):
-            raise ValueError(f"schedule={self.schedule!r} must be sync or async")
         if self.envs % self.shards:
             raise ValueError(f"envs={self.envs} must be a multiple of shards={self.shards}")
 

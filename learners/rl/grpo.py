@@ -20,6 +20,7 @@ from torch.distributions import kl_divergence
 from torchrl.objectives import ClipPPOLoss
 
 from actors.policies.contract import action_key, distribution, input_keys, trained_part, with_text
+from envs.ranges import Count, NonNegative, Positive
 from envs.specs import EPISODE, LOG_PROB, WorldSpec
 from envs.targets import options
 from learners.rl.algorithm import first_episode, sound, transitions
@@ -39,12 +40,12 @@ class GRPOConfig:
         shaped: credit each chunk with the reward that is still to come instead of the whole episode's.
     """
 
-    group: int
+    group: Count
     normalise: bool
-    clip_low: float
-    clip_high: float
-    kl: float
-    entropy: float
+    clip_low: Positive
+    clip_high: Positive
+    kl: NonNegative
+    entropy: NonNegative
     shaped: bool
 
 
@@ -57,6 +58,7 @@ class GRPO:
         settings: see GRPOConfig.
     """
 
+    config_type = GRPOConfig  # by which its section is checked before anything is built
     name = "grpo"
     supports_delayed_reward = True
     bootstraps = False

@@ -20,6 +20,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from actors.policies.contract import action_key, device_of, input_keys, trained_part, with_text
+from envs.ranges import Count, Discount, Natural, NonNegative, Positive, Share
 from envs.specs import LOG_PROB, WorldSpec
 from envs.targets import options
 from learners.rl.algorithm import sound, transitions
@@ -40,14 +41,14 @@ class PPOConfig:
             PPO.warm_up.
     """
 
-    gamma: float
-    lam: float
-    clip: float
-    entropy: float
-    critic: float
-    critic_width: int
-    critic_lr: float
-    warmup_passes: int
+    gamma: Discount
+    lam: Share
+    clip: Positive
+    entropy: NonNegative
+    critic: NonNegative
+    critic_width: Count
+    critic_lr: Positive
+    warmup_passes: Natural
 
 
 class PPO:
@@ -59,6 +60,7 @@ class PPO:
         settings: see PPOConfig.
     """
 
+    config_type = PPOConfig  # by which its section is checked before anything is built
     name = "ppo"
     supports_delayed_reward = False
     bootstraps = True

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import torch
+from annotated_types import MinLen
 from tensordict import TensorDict
 from torch import Tensor
 
 from envs.episodes.clips import ClipSpec, ClipStore
+from envs.ranges import Count, Natural, Share
 from envs.rng import step_generator
 from envs.simulators.base import Simulator
 from learners.training.fit import FitConfig, fit
@@ -32,23 +35,13 @@ class SimulatorFitConfig:
             seen often; 0 draws by size.
         lora: rank of the adapters that learn instead of all weights (transformers only); 0 trains all
             weights.
-
-    Raises:
-        ValueError: if a share is not in 0..1, or unroll or a stride is less than 1.
     """
 
-    single_chunk_fraction: float
-    unroll: int
-    strides: tuple[int, ...]
-    recent_fraction: float
-    lora: int
-
-    def __post_init__(self) -> None:
-        for name in ("single_chunk_fraction", "recent_fraction"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name}={getattr(self, name)} must be in 0..1")
-        if self.unroll < 1 or not self.strides or min(self.strides) < 1:
-            raise ValueError(f"unroll={self.unroll} and strides={list(self.strides)} must be at least 1")
+    single_chunk_fraction: Share
+    unroll: Count
+    strides: Annotated[tuple[Count, ...], MinLen(1)]
+    recent_fraction: Share
+    lora: Natural
 
 
 def train_simulator(

@@ -21,6 +21,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from tqdm import tqdm
 
 from envs.precision import mixed_precision
+from envs.ranges import Count, Decay, Natural, NonNegative, Positive
 from envs.rng import step_generator
 from learners.training.checkpoint import Checkpoints, buffers_of, truncate_log
 from learners.training.optimisers import OPTIMISERS, optimiser_state
@@ -55,17 +56,17 @@ class FitConfig:
         ValueError: if batch is no multiple of microbatches, or the optimiser is unknown.
     """
 
-    steps: int
-    batch: int = 32
-    lr: float = 1e-3
-    warmup: int = 50
-    weight_decay: float = 1e-4
-    ema: float = 0.995
-    clip: float = 1.0
+    steps: Count
+    batch: Count = 32
+    lr: Positive = 1e-3
+    warmup: Natural = 50
+    weight_decay: NonNegative = 1e-4
+    ema: Decay = 0.995
+    clip: Positive = 1.0
     bf16: bool = True
-    checkpoint_every: int = 200
-    seed: int = 0
-    microbatches: int = 1
+    checkpoint_every: Count = 200
+    seed: Natural = 0
+    microbatches: Count = 1
     optimiser: str = "adamw"
 
     def __post_init__(self) -> None:

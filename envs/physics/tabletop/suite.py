@@ -20,6 +20,7 @@ from envs.physics.tabletop.actions import ACTIONS, JointActions
 from envs.physics.tabletop.bench import Bench
 from envs.physics.tabletop.scene import CAMERAS
 from envs.physics.tabletop.tasks import TASKS
+from envs.ranges import NonNegative, Positive
 
 
 class Tabletop(TaskSuite):
@@ -42,8 +43,8 @@ class Tabletop(TaskSuite):
     def __init__(
         self,
         actions: str,
-        control_hz: float,
-        hold: float,
+        control_hz: Positive,
+        hold: NonNegative,
         size: tuple[int, int],
         cameras: tuple[str, ...],
     ):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated, Any
 
 import torch
 import torch.nn.functional as F
@@ -10,12 +11,14 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.conditioning import ActionVector, render_ray_map
+from envs.ranges import Count, Natural, NonNegative, Positive, Share
 from envs.simulators.dit.latent_world import Diffusion, LatentWorld
 from envs.simulators.dit.network import DiTShape, MultiViewDiT
 from envs.simulators.dit.prediction import PREDICTIONS
 from envs.simulators.samplers import Euler
 from envs.simulators.tokenizers.autoencoder import STRIDE, Autoencoder
 from envs.specs import WorldSpec
+from envs.targets import OptionsOf
 
 # The public network embeds levels as they are; at thousandfold they span the sinusoids' range.
 TIME_SCALE = 1000.0
@@ -32,12 +35,12 @@ class Trunk:
         stem: channels of the convolutional stem; 0 is without.
     """
 
-    layers: int
-    heads: int
-    head_dim: int
-    adaln_rank: int
-    patch: int
-    stem: int
+    layers: Count
+    heads: Count
+    head_dim: Count
+    adaln_rank: Count
+    patch: Count
+    stem: Natural
 
     def shape(self, spec: WorldSpec, channels: int, action_size: int) -> DiTShape:
         """The network for latents of so many channels, of what `spec` is conditioned on."""
@@ -71,18 +74,16 @@ class Denoising:
     """
 
     prediction: str
-    steps: int
-    shift: float
-    foreground: float
-    augment: float
+    steps: Count
+    shift: Positive
+    foreground: NonNegative
+    augment: Share
 
     def __post_init__(self) -> None:
         if self.prediction not in PREDICTIONS:
             raise ValueError(
                 f"simulator.denoising.prediction={self.prediction!r} must be one of {list(PREDICTIONS)}"
             )
-        if self.steps < 1:
-            raise ValueError(f"simulator.denoising.steps={self.steps} must be at least 1")
 
     def diffusion(self) -> Diffusion:
         """The same for LatentWorld."""
@@ -113,14 +114,14 @@ class DiTSimulator(LatentWorld):
     def __init__(
         self,
         spec: WorldSpec,
-        memory_frames: int,
-        net: dict[str, int],
-        codec: dict[str, int],
-        denoising: dict[str, float | str],
+        memory_frames: Count,
+        net: Annotated[dict[str, int], OptionsOf(Trunk)],
+        codec: dict[str, Count],
+        denoising: Annotated[dict[str, Any], OptionsOf(Denoising)],
     ):
         vector, tokenizer = ActionVector(spec.embodiment), Autoencoder(**codec)
         trunk = MultiViewDiT(Trunk(**net).shape(spec, tokenizer.channels, vector.size))
-        options = Denoising(**denoising)  # type: ignore[arg-type]
+        options = Denoising(**denoising)
         super().__init__(spec, memory_frames, trunk, tokenizer, options.diffusion())
         self.action_vector = vector
         with torch.no_grad():

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -19,6 +19,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.conditioning import render_ray_map
+from envs.ranges import Count, Natural, NonNegative, Positive, Share
 from envs.simulators.dit.latent_world import Diffusion, LatentWorld
 from envs.simulators.dit.network import DiTShape, MultiViewDiT
 from envs.simulators.dit.prediction import Velocity
@@ -26,6 +27,7 @@ from envs.simulators.gesim.checkpoint import CheckpointError, load_released
 from envs.simulators.samplers import DISTILLED, EDM, Distilled, Sampler
 from envs.simulators.tokenizers.wan import WanCodec
 from envs.specs import WorldSpec
+from envs.targets import OptionsOf
 
 _CONDITIONING = 3 + 6 + 1  # channels of pose map, ray map, memory mask
 
@@ -63,12 +65,10 @@ class Sampling:
         steps: of the sampler; 0 takes the released number, 4 or 15.
     """
 
-    kind: str
-    steps: int
+    kind: Literal["", "distilled", "edm"]
+    steps: Natural
 
     def __post_init__(self) -> None:
-        if self.kind not in ("", "distilled", "edm"):
-            raise ValueError(f"simulator.sampling.kind={self.kind!r} must be distilled or edm")
         if self.kind != "edm" and self.steps > len(DISTILLED):
             raise ValueError(
                 f"simulator.sampling.steps={self.steps}, but the distilled sampler has {len(DISTILLED)}"
@@ -93,9 +93,9 @@ class Training:
         checkpointing: compute blocks anew in the backward pass, for memory.
     """
 
-    shift: float
-    foreground: float
-    augment: float
+    shift: Positive
+    foreground: NonNegative
+    augment: Share
     checkpointing: bool
 
 
@@ -121,11 +121,11 @@ class GESimulator(LatentWorld):
     def __init__(
         self,
         spec: WorldSpec,
-        memory_frames: int,
+        memory_frames: Count,
         checkpoint: str | None,
         parity: str,
-        sampling: dict[str, Any],
-        training: dict[str, Any],
+        sampling: Annotated[dict[str, Any], OptionsOf(Sampling)],
+        training: Annotated[dict[str, Any], OptionsOf(Training)],
         scratch: dict[str, dict[str, Any]],
     ):
         if not (spec.pose_map and spec.ray_map):

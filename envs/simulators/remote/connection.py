@@ -12,6 +12,7 @@ import numpy as np
 import requests
 from numpy.typing import NDArray
 
+from envs.ranges import Natural, Positive
 from envs.simulators.remote.protocol import (
     ProtocolError,
     decode_frame,
@@ -41,9 +42,9 @@ class ConnectionOptions:
         user: name that sessions are opened under.
     """
 
-    connect_s: float
-    deadline_s: float
-    retries: int
+    connect_s: Positive
+    deadline_s: Positive
+    retries: Natural
     user: str
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import weakref
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -21,10 +21,12 @@ from torch import Tensor
 
 from envs.conditioning import CANVAS
 from envs.embodiment import ActionKind
+from envs.ranges import Count
 from envs.simulators.base import Simulator
 from envs.simulators.remote.connection import Connection, ConnectionOptions, RemoteError
 from envs.simulators.state_experts.base import StateDecoder
 from envs.specs import WorldSpec
+from envs.targets import OptionsOf
 
 _PARALLEL = 32  # calls at once
 
@@ -53,7 +55,11 @@ class RemoteSimulator(Simulator):
     """
 
     def __init__(
-        self, spec: WorldSpec, memory_frames: int, urls: tuple[str, ...], connection: dict[str, Any]
+        self,
+        spec: WorldSpec,
+        memory_frames: Count,
+        urls: tuple[str, ...],
+        connection: Annotated[dict[str, Any], OptionsOf(ConnectionOptions)],
     ):
         super().__init__(spec, memory_frames)
         if not urls or any(not url.startswith(("http://", "https://")) for url in urls):

@@ -15,6 +15,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from envs.embodiment import ActionKind, Embodiment
+from envs.ranges import Count
 from envs.rng import noise_generator
 from envs.simulators.base import Simulator
 from envs.simulators.dit.engine import TIME_SCALE
@@ -211,7 +212,7 @@ class StateExpert(FlowStateDecoder):
         steps: Euler steps per chunk.
     """
 
-    def __init__(self, simulator: LatentWorld, layers: int, heads: int, head_dim: int, steps: int):
+    def __init__(self, simulator: LatentWorld, layers: Count, heads: Count, head_dim: Count, steps: Count):
         robot = simulator.spec.embodiment
         shape = replace(
             simulator.net.shape,

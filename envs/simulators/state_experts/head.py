@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from envs.conditioning import ActionVector
+from envs.ranges import Count
 from envs.simulators.base import Simulator
 from envs.simulators.row_linear import RowLinear
 from envs.simulators.state_experts.base import StateDecoder
@@ -25,7 +26,7 @@ class StateHead(StateDecoder):
     state_mean: Tensor
     state_std: Tensor
 
-    def __init__(self, simulator: Simulator, memory_frames: int, width: int):
+    def __init__(self, simulator: Simulator, memory_frames: Count, width: Count):
         super().__init__(memory_frames)
         spec = simulator.spec
         self.chunk, self.states = spec.chunk, spec.state_dim

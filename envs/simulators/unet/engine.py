@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from envs.conditioning import render_ray_map
 from envs.precision import working_dtype
+from envs.ranges import Count, Natural, NonNegative
 from envs.simulators.base import Simulator
 from envs.simulators.inputs import build_inputs
 from envs.simulators.unet.blocks import (
@@ -57,13 +58,13 @@ class UNetSimulator(Simulator):
     def __init__(
         self,
         spec: WorldSpec,
-        memory_frames: int,
-        width: int,
-        fine_blocks: int,
-        mid_blocks: int,
-        deep_blocks: int,
-        motion: float,
-        side_weight: float,
+        memory_frames: Count,
+        width: Count,
+        fine_blocks: Natural,
+        mid_blocks: Natural,
+        deep_blocks: Natural,
+        motion: NonNegative,
+        side_weight: NonNegative,
     ):
         super().__init__(spec, memory_frames)
         if any(side % 16 for side in spec.size):

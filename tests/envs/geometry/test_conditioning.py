@@ -17,6 +17,7 @@ from envs.conditioning import (
 )
 from envs.conditioning.pose_map import layout
 from envs.embodiment import EmbodimentError
+from envs.targets import options
 from tests.embodiments import EMBODIMENTS
 
 
@@ -91,8 +92,8 @@ def test_bad_input_is_named() -> None:
         render_pose_map(poses * float("nan"), c2w, intrinsic, (64, 64))
     with pytest.raises(ValueError, match="T=2"):
         render_pose_map(poses[:2], c2w, intrinsic, (64, 64))
-    with pytest.raises(ValueError, match="radius_law"):
-        PoseMapStyle(radius_law="round")
+    with pytest.raises(ValueError, match="radius_law='round' should be 'released' or 'paper'"):
+        options(PoseMapStyle, {"radius_law": "round"}, "simulator.pose_map_style")
 
 
 @pytest.mark.parametrize("arms", [1, 3])

@@ -1,0 +1,171 @@
+"""Everything that can be seen to be wrong with a config before any work, found at once.
+
+Names, types and ranges come from pipeline/sections.py and from the classes that sections become; what no
+single option can tell stands in `_together`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, fields
+from typing import Any
+
+from actors.serving.sessions import ServeConfig
+from envs.conditioning import PoseMapStyle
+from envs.simulators.base import WORLD_OPTIONS
+from envs.specs import Rewards
+from envs.targets import ConfigError, nearest, options, section_faults, unknown_names, value_faults
+from learners.rl.algorithm import RLConfig
+from learners.stages.simulator import SimulatorFitConfig
+from learners.training.fit import FitConfig
+from pipeline import sections
+
+Cfg = Mapping[str, Any]
+
+_SECTIONS = {
+    "task": sections.TaskSection,
+    "collect": sections.CollectSection,
+    "imitation": sections.ImitationSection,
+    "rounds": sections.RoundsSection,
+    "clone": sections.CloneSection,
+    "judge_fit.first": sections.JudgeFitSection,
+    "judge_fit.refresh": sections.JudgeFitSection,
+    "state_fit.first": sections.StateFitSection,
+    "state_fit.refresh": sections.StateFitSection,
+    "finetune": sections.FinetuneSection,
+    "chaos": sections.ChaosSection,
+    "evaluate": sections.EvaluateSection,
+    "measure": sections.MeasureSection,
+    "track": sections.TrackSection,
+    "serve": ServeConfig,
+    "judge.rewards": Rewards,
+    "simulator.pose_map_style": PoseMapStyle,
+}
+_FITS = (
+    *("imitation.perception", "imitation.fit", "clone.perception", "clone.fit", "tokenizer_fit"),
+    *(f"{stage}.{phase}.fit" for stage in ("state_fit", "judge_fit") for phase in ("first", "refresh")),
+    "finetune.state.fit",
+)
+_SIMULATOR_FITS = ("simulator_fit.first", "simulator_fit.refresh", "finetune.simulator")
+_TARGETS = {
+    "simulator": WORLD_OPTIONS,
+    "judge": ("rewards",),
+    "policy": (),
+    "algorithm": (),
+    "task.suite": (),
+}
+_TOP = {key.partition(".")[0] for key in (*_SECTIONS, *_FITS, *_SIMULATOR_FITS, *_TARGETS, "rl", "launch")}
+
+
+def faults(cfg: Cfg) -> list[str]:
+    """A sentence for each thing that is wrong, naming the key, its value and what is allowed; [] if nothing
+    is.
+    """
+    out = list(_alone(cfg))
+    return out or list(_together(cfg))
+
+
+def _alone(cfg: Cfg) -> Iterator[str]:
+    """What is wrong with each option by itself."""
+    known = {field.name for field in fields(sections.Top)} | _TOP
+    yield from (f"{key} is not a key{nearest(key, known)}" for key in cfg if key not in known)
+    yield from (f"{key} is missing from the config" for key in sorted(known - cfg.keys()))
+    odd = [key for key in sorted(_TOP & cfg.keys()) if not isinstance(cfg[key], Mapping)]
+    yield from (f"{key}={cfg[key]!r} should be a section" for key in odd)
+    if odd or known - cfg.keys():
+        return
+    yield from value_faults(sections.Top, cfg, "")
+    if not re.fullmatch(r"\w[\w.-]*", str(cfg["name"])):
+        yield f"name={cfg['name']!r} should be of letters, digits, '_', '-' and '.': it names a folder"
+    for key, kind in _SECTIONS.items():
+        yield from _of(kind, _at(cfg, key), key)
+    for key in _FITS:
+        yield from _of(FitConfig, _at(cfg, key), key)
+    for key in _SIMULATOR_FITS:
+        section = _at(cfg, key)
+        within = section if isinstance(section, Mapping) else {}
+        clips = {name: value for name, value in within.items() if name != "fit"}
+        yield from _of(SimulatorFitConfig, clips if within else section, key)
+        yield from _of(FitConfig, within.get("fit"), f"{key}.fit")
+    yield from _of(RLConfig, cfg["rl"], "rl", given=("iterations", "microbatches", "seed"))
+    yield from _launch(cfg["launch"])
+    for key, around in _TARGETS.items():
+        section = _at(cfg, key)
+        if isinstance(section, Mapping):
+            yield from section_faults(section, key, around)
+    world = {name: value for name, value in cfg["simulator"].items() if name in WORLD_OPTIONS}
+    yield from _of(sections.WorldSection, world, "simulator")
+
+
+def _of(kind: type[Any], section: Any, key: str, given: tuple[str, ...] = ()) -> Iterator[str]:
+    """What is wrong with names and values of a section; what is `given` later may be missing."""
+    if not isinstance(section, Mapping):
+        yield f"{key}={section!r} should be a section with {sorted(field.name for field in fields(kind))}"
+        return
+    yield from unknown_names(kind, section, f"section {key}", key)
+    needed = [field.name for field in fields(kind) if field.default is MISSING and field.name not in given]
+    yield from (f"{key}.{name} is missing" for name in needed if name not in section)
+    yield from value_faults(kind, section, key)
+
+
+def _launch(launch: Cfg) -> Iterator[str]:
+    if launch.get("backend") != "ray":
+        yield from _of(sections.LocalSection, launch, "launch")
+        return
+    # Ray takes seconds to import, which runs in one process need not spend.
+    from actors.fleets.ray_fleet import Patience
+    from actors.serving.judge_service import ServiceConfig
+
+    yield from _of(sections.RaySection, launch, "launch")
+    yield from _of(ServiceConfig, launch.get("service"), "launch.service")
+    yield from _of(Patience, launch.get("patience"), "launch.patience")
+
+
+def _together(cfg: Cfg) -> Iterator[str]:
+    """What options contradict each other; each by itself is as it should be."""
+    task, rounds, rl, launch = cfg["task"], cfg["rounds"], cfg["rl"], cfg["launch"]
+    if task["horizon"] % task["chunk"]:
+        yield f"task.horizon={task['horizon']} must be a multiple of task.chunk={task['chunk']}"
+    if not task.get("suite") and not task.get("data"):
+        yield (
+            "task has neither a suite (physics) nor data (recordings): task.data=[folder of a LeRobot data"
+            " set], or another task"
+        )
+    if abs(sum(cfg["collect"]["mix"].values()) - 1) > 1e-6:
+        yield f"collect.mix={cfg['collect']['mix']} must add up to 1"
+    low, high = cfg["collect"]["noise_level"]
+    if low > high:
+        yield f"collect.noise_level={[low, high]} must be a range, from low to high"
+    if sum(rounds["splits"].values()) >= 1:
+        yield f"rounds.splits={rounds['splits']} must add up to less than 1; the rest is for learning"
+    if rl["envs"] % rl["shards"]:
+        yield f"rl.envs={rl['envs']} must be a multiple of rl.shards={rl['shards']}"
+    elif rl["envs"] // rl["shards"] % cfg["algorithm"].get("group", 1):
+        yield (
+            f"rl.envs / rl.shards = {rl['envs'] // rl['shards']} must be a multiple of"
+            f" algorithm.group={cfg['algorithm']['group']}, or groups would be torn apart"
+        )
+    parts, learners = cfg["microbatches"], launch.get("learners", 1)
+    if parts % learners:
+        yield (
+            f"microbatches={parts} must be a multiple of launch.learners={learners}; say"
+            f" microbatches={learners}"
+        )
+    if rl["minibatch"] % parts:
+        yield f"rl.minibatch={rl['minibatch']} must be a multiple of microbatches={parts}"
+    for key in (*_FITS, *(f"{key}.fit" for key in _SIMULATOR_FITS)):
+        section = _at(cfg, key)
+        if section is not None:
+            try:
+                options(FitConfig, {**section, "microbatches": parts}, key)
+            except ConfigError as error:
+                yield str(error)
+
+
+def _at(cfg: Cfg, path: str) -> Any:
+    """The value at a dotted path, None if it is not there."""
+    value: Any = cfg
+    for part in path.split("."):
+        value = value.get(part) if isinstance(value, Mapping) else None
+    return value

@@ -1,0 +1,198 @@
+"""What every section of configs/ may hold: names, types and ranges.
+
+Sections that describe an object (`_target_`) are checked against what its class says at its options; those
+that become a dataclass elsewhere, against that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from annotated_types import Ge, MinLen, MultipleOf
+
+from envs.ranges import Count, Discount, Natural, NonNegative, Positive, Seed, Share
+
+Side = Annotated[int, Ge(16), MultipleOf(16)]
+Name = Annotated[str, MinLen(1)]
+Fit = Mapping[str, Any]  # learners.training.fit.FitConfig; checked by itself
+Choice = Mapping[str, Any]  # `_target_` and its options; checked by itself
+
+
+@dataclass(frozen=True)
+class TaskSection:
+    """Section task: a suite (physics), or recordings (data)."""
+
+    suite: Choice | None
+    name: Name
+    size: tuple[Side, Side]
+    chunk: Count
+    horizon: Count
+    mode: Literal["relative", "absolute"]
+    data: Sequence[str] | str = ()
+
+
+@dataclass(frozen=True)
+class WorldSection:
+    """What a section simulator says of the world around an engine."""
+
+    pose_map: Literal["auto"] | bool
+    ray_map: Literal["auto"] | bool
+    pose_map_style: Mapping[str, Any]
+    kinematics: Mapping[str, Any] | None
+    shared_noise: bool
+    bf16: bool
+    state_expert: Choice
+
+
+@dataclass(frozen=True)
+class Splits:
+    """Episodes of each split of what is collected."""
+
+    train: Count
+    held_out: Count
+    calibration: Count
+
+
+@dataclass(frozen=True)
+class CollectSection:
+    """Section collect."""
+
+    episodes: Splits
+    shard: Count
+    mix: Mapping[Literal["expert", "noisy", "random"], Share]
+    noise_level: tuple[Share, Share]
+
+
+@dataclass(frozen=True)
+class ImitationSection:
+    """Section imitation."""
+
+    demos: Count
+    sources: Annotated[Sequence[str], MinLen(1)]
+    perception: Fit
+    discount: Discount
+    fit: Fit
+
+
+@dataclass(frozen=True)
+class RoundsSection:
+    """Section rounds."""
+
+    count: Count
+    deploy: Annotated[tuple[Count, ...], MinLen(1)]
+    splits: Mapping[Literal["held_out", "calibration"], Share]
+    iterations: Annotated[tuple[Count, ...], MinLen(1)]
+    clone: Natural
+
+
+@dataclass(frozen=True)
+class CloneSection:
+    """Section clone."""
+
+    imagined: Natural
+    perception: Fit
+    fit: Fit
+
+
+@dataclass(frozen=True)
+class JudgeFitSection:
+    """Sections judge_fit.first and judge_fit.refresh."""
+
+    imagined: Natural
+    fit: Fit
+
+
+@dataclass(frozen=True)
+class StateFitSection:
+    """Sections state_fit.first, state_fit.refresh and finetune.state."""
+
+    lora: Natural
+    fit: Fit
+
+
+@dataclass(frozen=True)
+class FinetuneSection:
+    """Section finetune."""
+
+    data: Sequence[str] | str
+    weights: str | None
+    simulator: Mapping[str, Any]
+    state: StateFitSection
+
+
+@dataclass(frozen=True)
+class ChaosSection:
+    """Section chaos."""
+
+    seconds: Positive
+    every: Positive
+    learner_every: Positive
+    actors: Count
+
+
+@dataclass(frozen=True)
+class EvaluateSection:
+    """Section evaluate."""
+
+    episodes: Count
+    envs: Count
+    imagined: Count
+
+
+@dataclass(frozen=True)
+class MeasureSection:
+    """Section measure."""
+
+    videos: Natural
+    starts: Count
+    speed_chunks: Count
+
+
+@dataclass(frozen=True)
+class TrackSection:
+    """Section track."""
+
+    wandb: Literal["offline", "online", "disabled"]
+    project: Name
+
+
+@dataclass(frozen=True)
+class LocalSection:
+    """Section launch, everything in one process."""
+
+    backend: Literal["local"]
+    device: Annotated[str, MinLen(1)]
+    workers: Natural
+
+
+@dataclass(frozen=True)
+class RaySection:
+    """Section launch, on Ray."""
+
+    backend: Literal["ray"]
+    device: Annotated[str, MinLen(1)]
+    workers: Natural
+    address: Name
+    cpus: Natural
+    object_store_mb: Annotated[int, Ge(80)]
+    actors: Count
+    learners: Count
+    threads: Natural
+    strategy: Literal["collocated", "disaggregated", "hybrid"]
+    place: Mapping[str, Mapping[Literal["num_cpus", "num_gpus"], NonNegative]]
+    judge_service: bool
+    service: Mapping[str, Any]
+    patience: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Top:
+    """Keys that stand by themselves."""
+
+    name: Name
+    seed: Seed
+    runs: Name
+    cameras: Literal["all", "main"] | Annotated[Sequence[str], MinLen(1)]
+    microbatches: Count
