@@ -76,6 +76,8 @@ def build(section: Mapping[str, Any], key: str, **context: Any) -> Any:
     if doubled:
         raise ConfigError(f"{key}.{doubled[0]} is filled in by Worldloop; leave it out of the config")
     _check_names(factory, section[TARGET], given, context, key)
+    if wrong := value_faults(factory, given, key):
+        raise ConfigError("; ".join(wrong))
     try:
         return factory(**context, **given)
     except ConfigError:

@@ -239,11 +239,20 @@ def doctor(words: Words) -> None:
     sys.exit(examine())
 
 
+def completion(words: Words) -> None:
+    """print what completes commands and choices in a shell: eval "$(worldloop completion bash)", or zsh"""
+    from pipeline.commands.completion import SHELLS, script
+
+    if len(words) != 1 or words[0] not in SHELLS:
+        raise ConfigError(f"say which shell: worldloop completion {'|'.join(SHELLS)}")
+    print(script(words[0], COMMANDS))
+
+
 COMMANDS: dict[str, Callable[[Words], None]] = {
     command.__name__: command
     for command in (
         *(run, rl, stage, stages, evaluate, controls, compare, finetune, serve, convert, inspect),
-        *(bench, verify, submit, chaos, config, doctor),
+        *(bench, verify, submit, chaos, config, doctor, completion),
     )
 }
 _ROOMS = ("envs", "actors", "learners", "pipeline")
@@ -261,10 +270,11 @@ def _root(cfg: dict[str, Any]) -> Path:
 
 def _prepared(words: Words) -> tuple[dict[str, Any], Path]:
     """The config and the run's folder, with this process made ready for work."""
-    from actors.factory import prepare_process
+    from actors.factory import device_of, prepare_process
     from pipeline.config import load_config
 
     cfg = load_config(words)
+    device_of(cfg)  # one that is not there is told before any work
     prepare_process(cfg["seed"])
     return cfg, _root(cfg)
 
@@ -300,11 +310,23 @@ def _source_and_cut(words: Words, usage: str) -> tuple[list[Path], Any, dict[str
 
 
 def _help() -> str:
-    lines = [f"  {name:<10} {function.__doc__}" for name, function in COMMANDS.items()]
+    lines = [
+        f"  {name:<10} {' '.join((command.__doc__ or '').split())}" for name, command in COMMANDS.items()
+    ]
     return (
         "worldloop <command> [key=value ...]\n\n"
         + "\n".join(lines)
-        + "\n\nKeys are those of configs/; `worldloop config` prints them."
+        + "\n\nKeys are those of configs/; `worldloop config` prints them. `worldloop <command> --help` says"
+        " more of one, `worldloop --version` which this is."
+    )
+
+
+def _help_of(name: str) -> str:
+    words = " ".join((COMMANDS[name].__doc__ or "").split())
+    return (
+        f"worldloop {name} [key=value ...]\n\n{words}\n\n"
+        "Keys are those of configs/, as in experiment=smoke rl.lr=1e-4; `worldloop config` prints all with"
+        " their values."
     )
 
 
@@ -319,9 +341,17 @@ def main() -> None:
     if not words or words[0] in ("-h", "--help", "help"):
         print(_help())
         return
+    if words[0] in ("-V", "--version", "version"):
+        from importlib.metadata import version
+
+        print(f"worldloop {version('worldloop')}")
+        return
     if words[0] not in COMMANDS:
-        print(f"no command {words[0]!r}{nearest(words[0], COMMANDS)}\n\n{_help()}", file=sys.stderr)
+        print(f"no command {words[0]!r}{nearest(words[0], COMMANDS)}; worldloop --help", file=sys.stderr)
         sys.exit(2)
+    if {"-h", "--help"} & set(words[1:]):
+        print(_help_of(words[0]))
+        return
     try:
         COMMANDS[words[0]](words[1:])
     except KeyboardInterrupt:

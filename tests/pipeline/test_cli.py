@@ -33,3 +33,27 @@ def test_mistakes_are_one_line() -> None:
     ):
         wrong = worldloop(*words)
         assert wrong.returncode == 1 and said in wrong.stderr and "Traceback" not in wrong.stderr, wrong
+
+
+def test_every_command_explains_itself_at_once_and_starts_nothing() -> None:
+    from pipeline.cli import COMMANDS
+
+    for name in ("run", "chaos", "convert"):
+        out = worldloop(name, "--help")
+        assert out.returncode == 0 and out.stdout.startswith(f"worldloop {name} "), out
+    assert all(command.__doc__ for command in COMMANDS.values())
+    assert worldloop("--version").stdout.startswith("worldloop 0.")
+
+
+def test_shells_complete_commands_and_choices() -> None:
+    def completed(*words: str) -> list[str]:
+        script = worldloop("completion", "bash").stdout
+        ask = f"COMP_WORDS=({' '.join(words)}); COMP_CWORD={len(words) - 1}; _worldloop"
+        line = f'{script}\n{ask}; echo "${{COMPREPLY[@]}}"'
+        return subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True).stdout.split()
+
+    assert completed("worldloop", "ru") == ["run"]
+    assert "experiment=smoke" in completed("worldloop", "run", "exp")
+    assert completed("worldloop", "run", "experiment", "=", "quickstart_") == ["quickstart_dit"]
+    assert "bashcompinit" in worldloop("completion", "zsh").stdout
+    assert "say which shell" in worldloop("completion", "fish").stderr

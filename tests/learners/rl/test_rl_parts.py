@@ -46,7 +46,7 @@ def test_alarms() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"schedule": "now"}, "must be sync or async"),
+        ({"schedule": "now"}, r"rl\.schedule='now' should be 'sync' or 'async'"),
         ({"shards": 3}, "must be a multiple of shards=3"),
         ({"epoch": 3}, r"rl\.epoch is not an option of RLConfig; did you mean epochs"),
     ],
