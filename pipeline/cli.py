@@ -179,11 +179,18 @@ def bench(words: Words) -> None:
 
 
 def verify(words: Words) -> None:
-    """compare our network with a public one's outputs: worldloop verify gesim FIXTURE.safetensors"""
+    """see that every file of a run is what its stage left: worldloop verify runs/quickstart; or compare our
+    network with a public one's outputs: worldloop verify gesim FIXTURE.safetensors
+    """
+    from pipeline.commands.verify import verify_run
+
+    if len(words) == 1 and words[0] != "gesim":
+        print(verify_run(Path(words[0])))
+        return
+    if len(words) != 2 or words[0] != "gesim":
+        raise ConfigError("say what: worldloop verify runs/quickstart, or gesim FIXTURE.safetensors")
     from envs.simulators.gesim.fixture import verify as errors_of
 
-    if len(words) != 2 or words[0] != "gesim":
-        raise ConfigError("say what and which: worldloop verify gesim FIXTURE.safetensors")
     errors = errors_of(Path(words[1]))
     for name, error in errors.items():
         print(f"{name:<14} max abs error {error:.2e}")

@@ -13,7 +13,7 @@ from typing import Any
 from tqdm import tqdm
 
 from envs.files import write_text
-from pipeline.graph.artefact import Identity, finish, read_manifest
+from pipeline.graph.artefact import Identity, check, finish, read_manifest
 from pipeline.graph.code_version import code_of, digest
 from pipeline.graph.stage import Inputs, Stage
 from pipeline.graph.view import ConfigView, sections
@@ -147,6 +147,7 @@ class Graph:
         folder = self.folder(name)
         manifest = read_manifest(folder)
         if manifest is not None:
+            check(folder, manifest)
             tqdm.write(f"=== {name} is finished, reused from {folder}")
             tracker.catch_up(name, folder)
             return manifest

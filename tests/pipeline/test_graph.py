@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import shutil
 import sys
 import time
 from collections.abc import Iterator
@@ -11,8 +12,9 @@ from typing import Any
 
 import pytest
 
+from pipeline.commands.verify import verify_run
 from pipeline.graph import code_version
-from pipeline.graph.artefact import read_manifest
+from pipeline.graph.artefact import DamagedArtefact, read_manifest
 from pipeline.graph.code_version import code_of
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, Stage, stage
@@ -211,3 +213,62 @@ def test_a_stage_is_found_by_its_path() -> None:
     from pipeline.stages.collect import deploy
 
     assert isinstance(deploy, Stage) and find_stage(deploy.path) is deploy
+
+
+@stage(reads=("x",))
+def weighty(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    LOG.append("weighty")
+    (folder / "weights.safetensors").write_bytes(bytes(range(256)) * 40)
+    (folder / "dataset/data").mkdir(parents=True)
+    (folder / "dataset/data/file-000.parquet").write_bytes(b"PAR1" * 100)
+    (folder / "dataset/.cache").mkdir()
+    (folder / "dataset/.cache/frames").write_bytes(b"made anew when it is gone")
+    return {}
+
+
+def flip(path: Path) -> None:
+    """One bit of a file."""
+    bytes_ = bytearray(path.read_bytes())
+    bytes_[len(bytes_) // 2] ^= 1
+    path.write_bytes(bytes(bytes_))
+
+
+def spoil_nothing(folder: Path) -> None:
+    (folder / "dataset/.cache/frames").unlink()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda folder: flip(folder / "weights.safetensors"), r"weights\.safetensors\. Bring"),
+        (lambda folder: flip(folder / "dataset/data/file-000.parquet"), r"dataset/data/file-000\.parquet\."),
+        (lambda folder: (folder / "weights.safetensors").unlink(), r"weights\.safetensors \(missing\)"),
+        (lambda folder: (folder / "manifest.json").write_text("{"), r"manifest\.json\. Bring"),
+        (lambda folder: (folder / "manifest.json").write_text("{}"), r"manifest\.json\. Bring"),
+        (spoil_nothing, ""),
+    ],
+)
+def test_a_finished_stage_that_has_changed_is_told_and_not_built_upon(
+    tmp_path: Path, spoil: Any, said: str
+) -> None:
+    def graph() -> Graph:
+        built = Graph(CFG, tmp_path / "stages")
+        built.add("first", weighty)
+        built.add("second", plain, {"data": "first"})
+        return built
+
+    folder = graph().folder("first")
+    graph().run("first")
+    spoil(folder)
+    if not said:
+        graph().run()
+        assert LOG == ["weighty", "second"] and "2 stages" in verify_run(tmp_path)
+        return
+    with pytest.raises(DamagedArtefact, match=said):
+        graph().run()
+    with pytest.raises(DamagedArtefact, match=said):
+        verify_run(tmp_path)
+    assert LOG == ["weighty"]
+    shutil.rmtree(folder)  # the fix that the message names
+    graph().run()
+    assert LOG == ["weighty", "weighty", "second"]

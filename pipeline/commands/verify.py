@@ -1,0 +1,37 @@
+"""worldloop verify: every file of a run against the hashes that its stages left."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tqdm import tqdm
+
+from envs.targets import ConfigError
+from pipeline.graph.artefact import DamagedArtefact, check, read_manifest
+
+
+def verify_run(root: Path) -> str:
+    """What was found, in a line.
+
+    Raises:
+        ConfigError: if the folder holds no stages.
+        DamagedArtefact: naming everything that has changed.
+    """
+    folders = sorted(path for path in (root / "stages").glob("*") if path.is_dir())
+    if not folders:
+        raise ConfigError(f"{root} holds no stages; say a run's folder, such as runs/quickstart")
+    wrong, files, unfinished = [], 0, 0
+    for folder in tqdm(folders, desc="verify", unit="stage", dynamic_ncols=True):
+        try:
+            manifest = read_manifest(folder)
+            if manifest is None:
+                unfinished += 1
+                continue
+            check(folder, manifest)
+            files += len(manifest.get("files", {}))
+        except DamagedArtefact as error:
+            wrong.append(str(error))
+    if wrong:
+        raise DamagedArtefact("\n".join(wrong))
+    half = f", {unfinished} unfinished" if unfinished else ""
+    return f"{len(folders) - unfinished} stages of {root}: {files} files are what they were{half}"
