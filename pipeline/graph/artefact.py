@@ -137,9 +137,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
         return None
     try:
         manifest = dict(json.loads(path.read_text()))
-        return (
-            manifest if {"stage", "key", "result"} <= manifest.keys() else _refuse(folder, ["manifest.json"])
-        )
+        return manifest if {"stage", "result"} <= manifest.keys() else _refuse(folder, ["manifest.json"])
     except ValueError:
         return _refuse(folder, ["manifest.json"])
 

@@ -17,6 +17,7 @@ from envs.episodes.clips import ClipStore
 from envs.specs import C2W, CHUNK, IMAGE, INSTRUCTION_UTF8, ActionMode, bytes_to_text
 from learners.stages.generated import generated_frames
 from learners.stages.imitation import Cloning, chunks_ahead, train_imitation
+from learners.stages.observed import observe
 from learners.training.fit import FitConfig
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, EMBODIMENTS
 from tests.learners.models import POLICIES, policy_of, simulator_of
@@ -70,7 +71,7 @@ def test_past_the_end_of_a_robot_that_takes_changes_only_grippers_go_on(tiny_sto
 def test_what_is_observed(tiny_store: Stores) -> None:
     store = tiny_store(BIMANUAL_POSES)
     cloning = Cloning(policy_of("chunk_gaussian", store.spec), store, torch.arange(4), ActionMode.RELATIVE)
-    seen = cloning.observe(store.start[:2] + 3)
+    seen = observe(store, store.start[:2] + 3)
     assert torch.equal(seen[IMAGE], store.frames(store.start[:2] + 3))
     assert bytes_to_text(seen[INSTRUCTION_UTF8]) == [INSTRUCTION] * 2 and seen[C2W].shape == (2, 3, 4, 4)
     draw = cloning.sample(4, torch.Generator().manual_seed(1))
@@ -114,7 +115,7 @@ def test_cloning_makes_a_policy_act_alike_on_generated_and_recorded_pictures(
         train_imitation(
             cloning, FitConfig(40, 16, lr=2e-3, warmup=1, bf16=False), tmp_path / name, fresh=False
         )
-        observed = cloning.observe(made["row"])
+        observed = observe(store, made["row"])
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             one = policy(inputs_for(observed, policy))[CHUNK]
             observed[IMAGE] = made["frames"]
