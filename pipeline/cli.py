@@ -227,6 +227,9 @@ def chaos(words: Words) -> None:
     except ChaosFailure as error:
         print(f"worldloop chaos: {error}", file=sys.stderr)
         sys.exit(1)
+    except KeyboardInterrupt:
+        print("\ninterrupted; the learner is gone, and chaos begins anew", file=sys.stderr)
+        sys.exit(130)
     print(json.dumps(found, indent=1))
 
 
@@ -359,8 +362,11 @@ def main() -> None:
     if {"-h", "--help"} & set(words[1:]):
         print(_help_of(words[0]))
         return
+    from learners.training.interrupt import clean_ending
+
     try:
-        COMMANDS[words[0]](words[1:])
+        with clean_ending():
+            COMMANDS[words[0]](words[1:])
     except KeyboardInterrupt:
         print("\ninterrupted; the same command goes on from the last checkpoint", file=sys.stderr)
         sys.exit(130)

@@ -33,7 +33,7 @@ from learners.rl.feed import AsyncFeed, Feed
 from learners.rl.recorded import TrueExperience
 from learners.rl.update import update
 from learners.training.checkpoint import Checkpoints, adam_moments, buffers_of, truncate_log
-from learners.training.interrupt import deferred_sigterm
+from learners.training.interrupt import deferred_signals, leave
 from learners.training.parallel import Trainee, from_leader, leads
 
 
@@ -65,7 +65,7 @@ def train_rl(
     Raises:
         TrainingDiverged: on numbers that are not finite.
         FleetError: if too many episodes are lost.
-        SystemExit: after SIGTERM, once a checkpoint is written.
+        KeyboardInterrupt, SystemExit: after SIGINT and SIGTERM, once a checkpoint is written.
     """
     if fleet is not None:
         _check(fleet, algorithm, config)
@@ -75,7 +75,7 @@ def train_rl(
     optimiser = torch.optim.Adam(algorithm.groups(config.lr), lr=config.lr, eps=1e-5)
     rates = [group["lr"] for group in optimiser.param_groups]
     alarms, ledger, first, episodes, wave = Alarms(), EpisodeLedger(), 0, 0, 0
-    spent = {"rollout": 0.0, "update": 0.0}
+    spent, figures = {"rollout": 0.0, "update": 0.0}, dict[str, float]()
 
     def state() -> dict[str, Any]:
         return {
@@ -88,6 +88,7 @@ def train_rl(
         facts = checkpoints.load(state())
         assert facts is not None
         first, episodes, spent, wave = facts["iteration"], facts["episodes"], facts["spent"], facts["wave"]
+        figures = facts["last"]
         alarms.entropy, alarms.silent, alarms.raised = facts["entropy"], facts["silent"], facts["raised"]
         ledger = EpisodeLedger(**facts["ledger"])
         ledger.drop("learner died", ledger.asked - ledger.learned - sum(ledger.dropped.values()))
@@ -126,6 +127,7 @@ def train_rl(
             "entropy": alarms.entropy,
             "silent": alarms.silent,
             "raised": alarms.raised,
+            "last": figures,
         }
         if feed is not None:
             facts |= {"wave": feed.upcoming(iteration), "episodes_per_job": feed.fleet.episodes}
@@ -134,12 +136,11 @@ def train_rl(
     bar = tqdm(
         total=config.iterations, initial=first, desc=name, unit="it", dynamic_ncols=True, disable=not leads()
     )
-    figures: dict[str, float] = {}
     nowhere = Path(os.devnull)
     with (
         (log if leads() else nowhere).open("a") as rows,
         (learned if leads() else nowhere).open("a") as jobs,
-        deferred_sigterm() as asked,
+        deferred_signals() as asked,
     ):
         for iteration in range(first, config.iterations):
             began = time.perf_counter()
@@ -191,15 +192,15 @@ def train_rl(
             stop = from_leader(asked)
             if (iteration + 1) % config.checkpoint_every == 0 or stop:
                 save(iteration + 1)
-            if until is not None and until(iteration):
-                break
-            if stop and iteration + 1 < config.iterations:
+            if stop:
                 bar.close()
                 tqdm.write(
-                    f"{name}: SIGTERM; stopped after iteration {iteration}, the same command goes on from"
+                    f"{name}: stopped after iteration {iteration}, as asked; the same command goes on from"
                     " there"
                 )
-                raise SystemExit(143)
+                leave(stop)
+            if until is not None and until(iteration):
+                break
     bar.close()
     trainee.release()
     checkpoints.clear()

@@ -24,8 +24,18 @@ from envs.precision import mixed_precision
 from envs.ranges import Count, Decay, Natural, NonNegative, Positive
 from envs.rng import step_generator
 from learners.training.checkpoint import Checkpoints, buffers_of, truncate_log
+from learners.training.interrupt import deferred_signals, leave
 from learners.training.optimisers import OPTIMISERS, optimiser_state
-from learners.training.parallel import Trainee, averaged, clip_gradients, leads, local, my_share, twin
+from learners.training.parallel import (
+    Trainee,
+    averaged,
+    clip_gradients,
+    from_leader,
+    leads,
+    local,
+    my_share,
+    twin,
+)
 
 Batch = Callable[[int, torch.Generator], Any]
 
@@ -112,6 +122,7 @@ def fit(
 
     Raises:
         TrainingDiverged: on a loss or gradient that is not finite.
+        KeyboardInterrupt, SystemExit: after SIGINT and SIGTERM, once a checkpoint is written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     checkpoints, log = Checkpoints(folder), folder / "metrics.jsonl"
@@ -122,6 +133,7 @@ def fit(
     optimisers = OPTIMISERS[config.optimiser](trained, config.lr, config.weight_decay, hidden)
     average = twin(trained)
     first, spent = 0, {"data": 0.0, "compute": 0.0}
+    smooth: float | None = None
 
     def state() -> dict[str, Any]:
         return {
@@ -134,7 +146,7 @@ def fit(
     if checkpoints.newest is not None:
         facts = checkpoints.load(state())
         assert facts is not None
-        first, spent = int(facts["step"]), dict(facts["spent"])
+        first, spent, smooth = int(facts["step"]), dict(facts["spent"]), facts["smooth"]
         if leads():
             truncate_log(log, first)
     module.train()
@@ -147,8 +159,7 @@ def fit(
         dynamic_ncols=True,
         disable=not leads(),
     )
-    smooth: float | None = None
-    with (log if leads() else Path(os.devnull)).open("a") as stream:
+    with (log if leads() else Path(os.devnull)).open("a") as stream, deferred_signals() as asked_to_leave:
         for step in range(first, config.steps):
             began, waited = time.perf_counter(), 0.0
             for optimiser in optimisers:
@@ -194,9 +205,16 @@ def fit(
             if step - first == 2 and leads():
                 _announce(name, config.steps - step - 1, took)
             bar.set_postfix_str(f"{watch} {figures.get(watch, smooth):.4g}", refresh=False)
-            if (step + 1) % config.checkpoint_every == 0 and step + 1 < config.steps:
+            stop = from_leader(asked_to_leave)
+            if stop or ((step + 1) % config.checkpoint_every == 0 and step + 1 < config.steps):
                 stream.flush()
-                checkpoints.save(step + 1, state(), {"step": step + 1, "spent": spent})
+                checkpoints.save(step + 1, state(), {"step": step + 1, "spent": spent, "smooth": smooth})
+            if stop:
+                bar.close()
+                tqdm.write(
+                    f"{name}: stopped after step {step}, as asked; the same command goes on from there"
+                )
+                leave(stop)
     bar.close()
     if config.ema:
         with torch.no_grad():

@@ -8,6 +8,7 @@ left behind.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import math
@@ -69,48 +70,51 @@ def run_chaos(cfg: Mapping[str, Any], words: list[str], folder: Path) -> dict[st
                     stderr=log,
                     start_new_session=True,
                 )
-            # One learner in four may be killed before it has learned anything; the others live on after their
-            # first iteration.
-            begun, life = len(_rows(folder)), section["learner_every"] * chance.uniform(0.7, 1.3)
-            stop = time.monotonic() + life if chance.random() < 0.25 else math.inf
-            enough = False
-            while time.monotonic() < stop and not enough and learner.poll() is None:
-                time.sleep(0.2)
-                now, learned = time.monotonic(), len(_rows(folder))
-                if math.isinf(stop) and learned > begun:
-                    stop = now + life
-                enough = now >= end and kills > 0 and learned > begun
-                bar.n = min(section["seconds"], section["seconds"] - end + now)
-                bar.set_postfix_str(f"{learned} iterations, learner killed {kills} times")
-                if now > end + 600:
-                    os.killpg(learner.pid, signal.SIGKILL)
-                    raise ChaosFailure(
-                        f"nothing was learned for ten minutes after the end; see {folder}/learner.log"
-                    )
-            if learner.poll() is not None:
-                raise ChaosFailure(
-                    f"the learner left by itself with {learner.returncode}; see {folder}/learner.log"
-                )
-            if enough:
-                # the last one finishes its iteration and writes its checkpoint
-                learner.send_signal(signal.SIGTERM)
-            else:
-                os.kill(learner.pid, signal.SIGKILL)
-                kills += 1
             try:
-                learner.wait(timeout=120)
-            except subprocess.TimeoutExpired as error:
-                os.killpg(learner.pid, signal.SIGKILL)
-                raise ChaosFailure(
-                    f"the learner did not leave within two minutes of SIGTERM; see {folder}/learner.log"
-                ) from error
-            if enough:
-                if learner.returncode != 143:
+                # One learner in four may be killed before it has learned anything; the others live on after
+                # their first iteration.
+                begun, life = len(_rows(folder)), section["learner_every"] * chance.uniform(0.7, 1.3)
+                stop = time.monotonic() + life if chance.random() < 0.25 else math.inf
+                enough = False
+                while time.monotonic() < stop and not enough and learner.poll() is None:
+                    time.sleep(0.2)
+                    now, learned = time.monotonic(), len(_rows(folder))
+                    if math.isinf(stop) and learned > begun:
+                        stop = now + life
+                    enough = now >= end and kills > 0 and learned > begun
+                    bar.n = min(section["seconds"], section["seconds"] - end + now)
+                    bar.set_postfix_str(f"{learned} iterations, learner killed {kills} times")
+                    if now > end + 600:
+                        raise ChaosFailure(
+                            f"nothing was learned for ten minutes after the end; see {folder}/learner.log"
+                        )
+                if learner.poll() is not None:
                     raise ChaosFailure(
-                        f"after SIGTERM the learner left with {learner.returncode}, not 143;"
-                        f" see {folder}/learner.log"
+                        f"the learner left by itself with {learner.returncode}; see {folder}/learner.log"
                     )
-                break
+                if enough:
+                    # the last one finishes its iteration and writes its checkpoint
+                    learner.send_signal(signal.SIGTERM)
+                else:
+                    os.kill(learner.pid, signal.SIGKILL)
+                    kills += 1
+                try:
+                    learner.wait(timeout=120)
+                except subprocess.TimeoutExpired as error:
+                    raise ChaosFailure(
+                        f"the learner did not leave within two minutes of SIGTERM; see {folder}/learner.log"
+                    ) from error
+                if enough:
+                    if learner.returncode != 143:
+                        raise ChaosFailure(
+                            f"after SIGTERM the learner left with {learner.returncode}, not 143;"
+                            f" see {folder}/learner.log"
+                        )
+                    break
+            except BaseException:  # whatever ends this command ends its learner
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(learner.pid, signal.SIGKILL)
+                raise
     report = _check(folder, before)
     report |= {"seconds": section["seconds"], "learner_kills": kills}
     (folder / "chaos.json").write_text(json.dumps(report, indent=1))

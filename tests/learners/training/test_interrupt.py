@@ -1,0 +1,96 @@
+"""Signals: what learns writes its checkpoint before it leaves, and goes on as if nothing had been."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from learners.training.checkpoint import Checkpoints
+from learners.training.fit import FitConfig, fit
+from learners.training.interrupt import clean_ending, deferred_signals
+
+ENDS = [(signal.SIGTERM, SystemExit), (signal.SIGINT, KeyboardInterrupt)]
+
+
+@pytest.mark.parametrize(("number", "end"), ENDS)
+def test_the_first_signal_waits_and_the_second_does_not(
+    number: signal.Signals, end: type[BaseException]
+) -> None:
+    with clean_ending(), pytest.raises(end), deferred_signals() as asked:
+        assert not asked()
+        os.kill(os.getpid(), number)
+        assert asked() == number
+        os.kill(os.getpid(), number)
+        time.sleep(1)
+        raise AssertionError("the second signal was swallowed")
+
+
+@pytest.mark.parametrize("at", [3, 7])  # in the middle, between checkpoints, and in the last step
+@pytest.mark.parametrize(("number", "end"), ENDS)
+def test_an_interrupted_fit_goes_on_to_the_same_metrics_weights_and_result(
+    number: signal.Signals, end: type[BaseException], at: int, tmp_path: Path
+) -> None:
+    def run(folder: Path, disturb: Callable[[int], None]) -> tuple[list[Any], Tensor, float]:
+        torch.manual_seed(0)
+        module = nn.Linear(3, 1)
+        steps: list[int] = []
+
+        def batch(step: int, generator: torch.Generator) -> Tensor:
+            steps.append(step)
+            return torch.randn(4, 3, generator=generator)
+
+        def loss(data: Tensor, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
+            disturb(steps[-1])
+            return module(data).square().mean(), {}
+
+        result = fit("x", module, batch, loss, FitConfig(steps=8, batch=4, bf16=False), folder)
+        rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+        return rows, module.weight.detach().clone(), result["loss"]
+
+    def interrupt(step: int) -> None:
+        if step == at:
+            os.kill(os.getpid(), number)
+
+    whole = run(tmp_path / "whole", lambda step: None)
+    with clean_ending(), pytest.raises(end):
+        run(tmp_path / "cut", interrupt)
+    assert Checkpoints(tmp_path / "cut").facts()["step"] == at + 1  # type: ignore[index]
+    rows, weight, loss = run(tmp_path / "cut", lambda step: None)
+    assert rows == whole[0] and torch.equal(weight, whole[1]) and loss == whole[2]
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_command_ends_soon_and_leaves_a_checkpoint(
+    number: signal.Signals, code: int, tmp_path: Path
+) -> None:
+    words = ["stage", "imitation", "experiment=smoke", f"runs={tmp_path}", "track=disabled"]
+    words += ["imitation.perception.steps=5000", "collect.episodes.train=12"]
+    command = subprocess.Popen(
+        [sys.executable, "-m", "pipeline", *words],
+        cwd=Path(__file__).resolve().parents[3],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and command.poll() is None:
+        if any(log.stat().st_size for log in tmp_path.rglob("metrics.jsonl")):
+            break
+        time.sleep(0.1)
+    command.send_signal(number)
+    said = command.communicate(timeout=30)[0]
+    assert command.returncode == code, said
+    assert "Traceback" not in said and "goes on from" in said
+    assert list(tmp_path.rglob("checkpoint-*/facts.json"))
+    assert not list(tmp_path.rglob(".owner.json"))
