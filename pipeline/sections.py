@@ -179,7 +179,6 @@ class RaySection:
     object_store_mb: Annotated[int, Ge(80)]
     actors: Count
     learners: Count
-    threads: Natural
     strategy: Literal["collocated", "disaggregated", "hybrid"]
     place: Mapping[str, Mapping[Literal["num_cpus", "num_gpus"], NonNegative]]
     judge_service: bool

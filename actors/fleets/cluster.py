@@ -14,7 +14,6 @@ import torch
 
 from actors.factory import ConfigError
 from actors.fleets.reaper import reap_after_me
-from envs.physics.pool import available_cores
 
 ROLES = ("learner", "actors", "judge", "evaluator")
 
@@ -223,8 +222,3 @@ def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str]) -> None:
         raise ConfigError(
             f"a node of the cluster has {says}; install the versions of constraints.txt on every node"
         )
-
-
-def threads_of(cpus: float) -> int:
-    """Threads of a process with that share of CPUs; one at least."""
-    return max(1, int(cpus)) if cpus else available_cores()

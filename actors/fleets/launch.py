@@ -25,7 +25,7 @@ def build_fleet(recipe: Recipe) -> Fleet:
             f"launch.backend={launch['backend']!r} is unknown; choose launch=local or launch=ray"
         )
     # Ray takes seconds to import, which a local run need not spend.
-    from actors.fleets.cluster import Plan, connect, threads_of
+    from actors.fleets.cluster import Plan, connect
     from actors.fleets.ray_fleet import Patience, RayFleet
     from actors.serving.judge_service import ServiceConfig, start_service
 
@@ -35,7 +35,6 @@ def build_fleet(recipe: Recipe) -> Fleet:
     missing = recipe.missing()
     if missing:
         raise ConfigError(f"{missing} do not exist; run the stages that make them")
-    own = replace(recipe, threads=launch["threads"] or threads_of(plan.cpus["actors"]))
     attached: tuple[Any, ...] = ()
     if launch["judge_service"] and recipe.judge:
         name = f"judge-{uuid.uuid4().hex[:8]}"
@@ -47,12 +46,12 @@ def build_fleet(recipe: Recipe) -> Fleet:
                 recipe.judge,
                 settings,
                 plan.options("judge"),
-                threads_of(plan.cpus["judge"]),
+                recipe.config["rl"]["threads"],
             ),
         )
-        own = replace(own, service=name)
+        recipe = replace(recipe, service=name)
     return RayFleet(
-        own,
+        recipe,
         launch["actors"],
         plan.options("actors"),
         options(Patience, launch["patience"], "launch.patience"),

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,10 +87,14 @@ class Host:
         policy: the replica; nobody else may change it (see policies/contract.py).
         bootstrap: also give critics what they read of each next observation: the policy's visual features,
             or, of a policy that writes none, the observation.
+        threads: that torch computes a job with, so that it gives the same bits in any process; None for those
+            of the process.
     """
 
-    def __init__(self, env: EnvBase, policy: TensorDictModuleBase, bootstrap: bool = True):
-        self.env, self.policy, self.bootstrap = env, policy, bootstrap
+    def __init__(
+        self, env: EnvBase, policy: TensorDictModuleBase, bootstrap: bool = True, threads: int | None = None
+    ):
+        self.env, self.policy, self.bootstrap, self.threads = env, policy, bootstrap, threads
         self.base = getattr(env, "base_env", env)
         self.steps = self.base.horizon // self.base.chunk
         self.version = -1
@@ -153,17 +158,17 @@ class Host:
         """
         devices = [torch.cuda.current_device()] if device_of(self.policy).type == "cuda" else []
         # In one process with the learner, its random numbers are its own.
-        with torch.random.fork_rng(devices=devices), torch.no_grad():
+        with torch.random.fork_rng(devices=devices), torch.no_grad(), computing_threads(self.threads):
             torch.manual_seed(job.sampling)
             if self._judging is not None:
                 self._judging.forget()
             self.base.schedule(job.seeds)
             with set_exploration_type(ExplorationType.RANDOM):
                 batch, ends = self._collect()
-        if self._features is not None:
-            batch["next", VISUAL_FEATURES] = self._next_features(batch, ends)
-        if self._judging is not None and self._judging.later:
-            self._judging.settle(batch)
+            if self._features is not None:
+                batch["next", VISUAL_FEATURES] = self._next_features(batch, ends)
+            if self._judging is not None and self._judging.later:
+                self._judging.settle(batch)
         batch[VERSION] = torch.full((*batch.shape, 1), self.version)
         return batch.cpu()
 
@@ -202,6 +207,19 @@ class Host:
         """Let go of the world."""
         if not self.env.is_closed:
             self.env.close()
+
+
+@contextmanager
+def computing_threads(count: int | None) -> Iterator[None]:
+    """Within, torch computes on the CPU with that many threads, which decide the order of sums and so their
+    last bits; None changes nothing.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(count or before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def pack(batch: TensorDict) -> Weights:

@@ -43,7 +43,6 @@ class Recipe:
         freeze_perception, bootstrap: see RLConfig and Host.
         later: let rewards arrive after the episode, see JudgeReward.
         service: name of the judge service to ask instead of a judge of its own.
-        threads: of the process that hosts it, 0 for all cores.
     """
 
     config: Mapping[str, Any]
@@ -59,7 +58,6 @@ class Recipe:
     bootstrap: bool = True
     later: bool = False
     service: str = ""
-    threads: int = 0
 
     def plain(self) -> dict[str, Any]:
         """As a dictionary of plain containers, for the wire."""
@@ -85,12 +83,12 @@ def build_host(recipe: Recipe) -> Host:
             f"{recipe.missing()} are not on this machine; on a cluster, let `runs` be a folder that all nodes"
             " share"
         )
-    cfg = recipe.config
+    cfg, threads = recipe.config, recipe.config["rl"]["threads"]
     policy = build_policy(cfg, Path(recipe.policy))
     if recipe.freeze_perception:
         freeze_perception(policy)
     if not recipe.simulator:
-        return Host(build_physics(cfg, recipe.episodes), policy, recipe.bootstrap)
+        return Host(build_physics(cfg, recipe.episodes), policy, recipe.bootstrap, threads)
     simulator = build_simulator(cfg, Path(recipe.simulator))
     decoder = build_state_decoder(cfg, simulator, Path(recipe.decoder))
     if recipe.service:
@@ -107,11 +105,11 @@ def build_host(recipe: Recipe) -> Host:
     world = build_world(
         cfg, simulator, decoder, judge, starts, recipe.episodes, recipe.later, recipe.horizon or None
     )
-    return Host(world, policy, recipe.bootstrap)
+    return Host(world, policy, recipe.bootstrap, threads)
 
 
 def build_host_process(plain: Mapping[str, Any]) -> Host:
-    """build_host in a process of its own: from the wire's form of a recipe, with its threads."""
+    """build_host in a process of its own, from the wire's form of a recipe."""
     recipe = Recipe(**{**plain, **{name: tuple(plain[name]) for name in ("data", "inside")}})
-    prepare_process(0, recipe.threads)
+    prepare_process(0, recipe.config["rl"]["threads"])
     return build_host(recipe)

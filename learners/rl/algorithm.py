@@ -25,6 +25,8 @@ class RLConfig:
         envs: episodes side by side over all hosts, and so the least number of episodes per iteration.
         shards: jobs an iteration is cut into, each of envs / shards episodes; results depend on this, not on
             who runs them.
+        threads: that torch computes one job's rollout with, on whatever machine; with another number sums are
+            taken in another order and the last bits differ.
         starts: imagined episodes begin "inside" the newest recorded ones, at any of their chunks, or at the
             "first" frames of all. A world errs more with every chunk it builds on its own; from inside, short
             episodes meet every stage of the task.
@@ -60,6 +62,7 @@ class RLConfig:
     iterations: Count
     envs: Count
     shards: Count
+    threads: Count
     starts: Literal["inside", "first"]
     chunks: Count | None
     schedule: Literal["sync", "async"]

@@ -27,10 +27,10 @@ def actors(cfg: dict[str, Any]) -> None:
     """Rollouts per second here and on one and two Ray actors of one thread, where the time goes, bytes,
     weight sync, and recovery.
     """
+    cfg = {**cfg, "rl": {**cfg["rl"], "threads": 1}}  # or two actors would share the cores of one
     prepare_process(0, 1)
     with tempfile.TemporaryDirectory() as folder:
         recipe = demo_recipe(cfg, Path(folder), _EPISODES)
-        recipe = Recipe(**{**recipe.plain(), "threads": 1})
         plan = Plan.of(cfg["launch"])
         connect(cfg["launch"])
         rates: dict[str, float] = {}

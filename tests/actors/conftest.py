@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -21,4 +20,4 @@ def cfg() -> dict[str, Any]:
 @pytest.fixture(scope="session")
 def recipe(cfg: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Recipe:
     """An imagined world of untrained networks: what it shows is poor, but it shows the same to everybody."""
-    return replace(demo_recipe(cfg, tmp_path_factory.mktemp("world"), 4, starts=8), threads=1)
+    return demo_recipe(cfg, tmp_path_factory.mktemp("world"), 4, starts=8)
