@@ -130,18 +130,23 @@ def serve(words: Words) -> None:
     """serve a simulator to many sessions by GE-Sim's protocol: worldloop serve simulator=gesim
     simulator.checkpoint=<folder>
     """
+    from actors.serving.app import listening
     from actors.serving.app import serve as run_server
+    from actors.serving.sessions import ServeConfig
+    from envs.targets import options
     from pipeline.commands.serving import build_session_host
 
     cfg, root = _prepared(words)
-    host, config = build_session_host(cfg, root)
-    name = cfg["simulator"]["_target_"].rpartition(".")[2]
-    print(
-        f"{name} at http://{config.host}:{config.port}, up to {config.sessions} sessions; look at it in a"
-        " browser, end it with Ctrl-C",
-        flush=True,
-    )
-    run_server(host, name, config)
+    config = options(ServeConfig, cfg["serve"], "serve")
+    with listening(config) as server:
+        host = build_session_host(cfg, root, config)
+        name, port = cfg["simulator"]["_target_"].rpartition(".")[2], server.getsockname()[1]
+        print(
+            f"{name} at http://{config.host}:{port}, up to {config.sessions} sessions; look at it in a browser,"
+            " end it with Ctrl-C",
+            flush=True,
+        )
+        run_server(host, name, server)
 
 
 def convert(words: Words) -> None:

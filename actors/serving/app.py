@@ -1,18 +1,18 @@
 """The HTTP side of a served simulator: GE-Sim's endpoints, their status codes, and the live page.
 
 Clients written for the released server work unchanged. What is new is overlooked by them: many sessions
-instead of one, `seed` in /init, `state` beside the first frame, `chunk` in /step (a repeated step is answered
-again, not made again), and what /healthz says beside "ok".
+instead of one, `seed` and `bound` in /init, `state` beside the first frame, `chunk` in /step (a repeated step
+is answered again, not made again), and what /healthz says beside "ok".
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
-import logging
 import re
+import socket
 import zlib
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from typing import Any
 
 import cv2
@@ -21,8 +21,9 @@ from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 from numpy.typing import NDArray
 
+from actors.serving.access import errors, json_answer, writes
 from actors.serving.page import PAGE, joint_table
-from actors.serving.sessions import NoPlace, ServeConfig, Session, SessionHost, UnknownSession
+from actors.serving.sessions import ServeConfig, Session, SessionHost
 from envs.simulators.remote.protocol import (
     ProtocolError,
     decode_frame,
@@ -34,40 +35,6 @@ from envs.simulators.remote.protocol import (
     shape_in,
     unpack,
 )
-
-logger = logging.getLogger("worldloop.serve")
-Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-
-
-def _json(status: int, value: Any) -> web.Response:
-    return web.Response(
-        status=status,
-        text=json.dumps(value),
-        content_type="application/json",
-        headers={"Cache-Control": "no-store"},
-    )
-
-
-@web.middleware
-async def _errors(request: web.Request, handler: Handler) -> web.StreamResponse:
-    """Status codes of the protocol: 403 unknown client, 400 bad input, 413 too large, 503 full, 500 model
-    failure; all say why in JSON.
-    """
-    try:
-        return await handler(request)
-    except UnknownSession as error:
-        return _json(403, {"error": str(error)})
-    except ProtocolError as error:
-        return _json(400, {"error": str(error)})
-    except NoPlace as error:
-        return _json(503, {"error": str(error)})
-    except web.HTTPException as error:
-        return _json(error.status, {"error": error.reason})
-    except (ConnectionResetError, asyncio.CancelledError):
-        raise
-    except Exception as error:
-        logger.exception("%s failed", request.path)
-        return _json(500, {"error": f"{type(error).__name__}: {error}"})
 
 
 class Server:
@@ -84,7 +51,7 @@ class Server:
 
     def app(self) -> web.Application:
         """The application, to be run by aiohttp."""
-        app = web.Application(middlewares=[_errors], client_max_size=self.limit)
+        app = web.Application(middlewares=[errors, writes], client_max_size=self.limit)
         for path, call in (
             ("/init", self.init),
             ("/reset", self.reset),
@@ -108,12 +75,18 @@ class Server:
 
         async def forever() -> None:
             while True:
-                await asyncio.sleep(min(30.0, self.host.config.idle_s / 2))
+                await asyncio.sleep(min(self.host.config.grace_s, self.host.config.idle_s) / 2)
                 self.host.expire()
 
         task = asyncio.create_task(forever())
         yield
         task.cancel()
+
+    def _session(self, request: web.Request, said: dict[str, Any]) -> Session:
+        """The session that a request names, reached by the request's connection from now on."""
+        session = self.host.get(said.get("client_id"))
+        session.connection = request.transport
+        return session
 
     async def _body(self, request: web.Request) -> bytes:
         if (request.content_length or 0) > self.limit:
@@ -138,25 +111,26 @@ class Server:
         if seed is not None and (type(seed) is not int or not 0 <= seed < 2**62):
             raise ProtocolError(f"seed must be a whole number from 0, got {str(seed)[:80]}")
         session = self.host.open(str(body.get("user_name", "anonymous"))[:80], seed)
-        return _json(200, {"success": True, "client_id": session.client_id})
+        session.bound, session.connection = body.get("bound") is True, request.transport
+        return json_answer(200, {"success": True, "client_id": session.client_id})
 
     async def reset(self, request: web.Request) -> web.Response:
         """Forget the episode of a session."""
-        session = self.host.get(parse(await self._body(request)).get("client_id"))
+        session = self._session(request, parse(await self._body(request)))
         async with session.lock:
             session.restart()
-        return _json(200, {"success": True})
+        return json_answer(200, {"success": True})
 
     async def set_task(self, request: web.Request) -> web.Response:
         """Remember the task's words; no simulator reads them."""
         body = parse(await self._body(request))
-        self.host.get(body.get("client_id")).task = str(body.get("task", ""))[:1000]
-        return _json(200, {"success": True})
+        self._session(request, body).task = str(body.get("task", ""))[:1000]
+        return json_answer(200, {"success": True})
 
     async def set_camera_params(self, request: web.Request) -> web.Response:
         """Intrinsics in pixels of the client's pictures, and cameras at the start if they are known."""
         body = parse(await self._body(request))
-        session, views = self.host.get(body.get("client_id")), self.host.spec.views
+        session, views = self._session(request, body), self.host.spec.views
         if "intrinsic" not in body:
             raise ProtocolError("intrinsic is missing")
         intrinsic = numbers(body["intrinsic"], (views, 3, 3), "intrinsic")
@@ -167,14 +141,14 @@ class Server:
         )
         async with session.lock:
             session.intrinsic, session.extrinsic = intrinsic, extrinsic
-        return _json(200, {"success": True})
+        return json_answer(200, {"success": True})
 
     async def close(self, request: web.Request) -> web.Response:
         """End a session."""
-        session = self.host.get(parse(await self._body(request)).get("client_id"))
+        session = self._session(request, parse(await self._body(request)))
         async with session.lock:
             self.host.close(session.client_id)
-        return _json(200, {"success": True})
+        return json_answer(200, {"success": True})
 
     # -- binary endpoints
     # ------------------------------------------------------------------------------------------
@@ -182,7 +156,7 @@ class Server:
         """The first frame; whatever came of an earlier one is forgotten."""
         picture, said = unpack(await self._body(request), 2)
         meta = parse(said)
-        session = self.host.get(meta.get("client_id"))
+        session = self._session(request, meta)
         _, views, height, width = shape_in(meta, "frame_shape", f"3,{self.host.spec.views},H,W")
         frame = await asyncio.to_thread(
             lambda: self._sized(decode_frame(picture, views, height, width)[None])[0]
@@ -201,13 +175,13 @@ class Server:
             session.first, session.frame_size = frame, (height, width)
             session.joints, session.command = known.get("state"), known.get("command")
             session.traj, session.c2w = traj, c2w
-        return _json(200, {"success": True})
+        return json_answer(200, {"success": True})
 
     async def set_episode_traj(self, request: web.Request) -> web.Response:
         """Pose maps and cameras of a whole recording, or of the chunk to come."""
         pictures, poses, said = unpack(await self._body(request), 3)
         meta = parse(said)
-        session = self.host.get(meta.get("client_id"))
+        session = self._session(request, meta)
         _, views, count, height, width = shape_in(meta, "traj_shape", f"3,{self.host.spec.views},T,H,W")
         shape_in(meta, "c2w_shape", f"{views},{count},4,4")
         c2w = floats(poses, (views, count, 4, 4), "c2w").transpose(1, 0, 2, 3)
@@ -223,7 +197,7 @@ class Server:
         maps = await asyncio.to_thread(read)
         async with session.lock:
             session.traj, session.c2w = maps, np.ascontiguousarray(c2w)
-        return _json(200, {"success": True})
+        return json_answer(200, {"success": True})
 
     def _sized(self, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Frames [T, V, 3, H, W] at the simulator's size."""
@@ -246,7 +220,7 @@ class Server:
         body = await self._body(request)
         values, said = unpack(body, 2)
         meta = parse(said)
-        session = self.host.get(meta.get("client_id"))
+        session = self._session(request, meta)
         actions = floats(values, shape_in(meta, "action_shape", "L,A"), "actions")
         async with session.lock:
             asked = meta.get("chunk")
@@ -273,7 +247,7 @@ class Server:
     # ------------------------------------------------------------------------------------------------
     async def healthz(self, request: web.Request) -> web.Response:
         """Whether it lives, how many sessions it holds, and that repeated steps are known apart."""
-        return _json(200, {"status": "ok", "sessions": self.host.config.sessions, "repeatable": True})
+        return json_answer(200, {"status": "ok", "sessions": self.host.config.sessions, "repeatable": True})
 
     async def page(self, request: web.Request) -> web.Response:
         """The live page."""
@@ -311,7 +285,9 @@ class Server:
             {"number": s.number, "user": s.user, "task": s.task, "steps": s.chunk, "frames": s.frames}
             for s in self.host.sessions.values()
         ]
-        return _json(200, {**one, "sessions": rows, "passes": self.host.passes, "steps": self.host.steps})
+        return json_answer(
+            200, {**one, "sessions": rows, "passes": self.host.passes, "steps": self.host.steps}
+        )
 
     async def preview(self, request: web.Request) -> web.Response:
         """The last frame of a session."""
@@ -336,10 +312,35 @@ def _answer(frames: NDArray[np.uint8], states: NDArray[np.float32] | None) -> tu
     ), pictures[-1]
 
 
-def serve(host: SessionHost, name: str, config: ServeConfig) -> None:
-    """Serve until interrupted.
+def listening(config: ServeConfig) -> socket.socket:
+    """A bound socket, taken before anything is built.
 
     Raises:
-        OSError: if the port is taken.
+        OSError: if nobody may listen there, naming the key and the fix.
     """
-    web.run_app(Server(host, name).app(), host=config.host, port=config.port, print=None, access_log=None)
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(
+            config.host, config.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        server = socket.socket(family, kind)
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        server.bind(address)
+    except OSError as error:
+        raise OSError(
+            error.errno,
+            f"cannot listen on serve.host={config.host} serve.port={config.port}: {error.strerror}; choose"
+            " another port, or 0 for any free one",
+        ) from error
+    return server
+
+
+def serve(host: SessionHost, name: str, server: socket.socket) -> None:
+    """Serve on a bound socket until interrupted."""
+    web.run_app(
+        Server(host, name).app(),
+        sock=server,
+        print=None,
+        access_log=None,
+        # a client may think for long between its steps, and is not gone because of that
+        keepalive_timeout=host.config.idle_s,
+    )

@@ -45,6 +45,7 @@ class ServeConfig:
         linger_ms: longest that a step waits for others that usually come soon; never longer than a pass
             takes.
         idle_s: after which an unused session ends.
+        grace_s: after which a session that was opened as bound to its connection ends, once that is lost.
         body_mb: largest request body.
         seed: of sessions that name none.
         fixed_seed: every such session has that very seed, so that the same client gets the same frames
@@ -57,6 +58,7 @@ class ServeConfig:
     batch: Count
     linger_ms: NonNegative
     idle_s: Positive
+    grace_s: Positive
     body_mb: Positive
     seed: Natural
     fixed_seed: bool
@@ -70,6 +72,7 @@ class Session:
     Attributes:
         number: counts sessions as they were opened; the page names it, the client_id is a secret.
         intrinsic: in pixels of the client's pictures, whose size is `frame_size`.
+        bound: whether it ends soon after the connection that last used it is lost; else only when it is idle.
         reply: chunk number, request and answer of the last step, for a client that asks again.
     """
 
@@ -78,6 +81,8 @@ class Session:
     user: str
     seed: int
     touched: float
+    bound: bool = False
+    connection: asyncio.Transport | None = None
     task: str = ""
     intrinsic: NDArray[np.float32] | None = None
     extrinsic: NDArray[np.float32] | None = None
@@ -95,6 +100,11 @@ class Session:
     preview: bytes = b""
     reply: tuple[int, bytes, bytes] | None = None
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+    @property
+    def left(self) -> bool:
+        """Whether whoever drives it is gone, as far as its connection says so."""
+        return self.bound and (self.connection is None or self.connection.is_closing())
 
     def restart(self) -> None:
         """Forget the episode; cameras stay."""
@@ -164,12 +174,13 @@ class SessionHost:
         return session
 
     def expire(self) -> None:
-        """End the sessions that nobody used for `idle_s` seconds."""
+        """End the sessions that nobody used for `idle_s` seconds, or `grace_s` if their client is gone."""
         now = time.monotonic()
         for client in [
             key
             for key, session in self.sessions.items()
-            if now - session.touched > self.config.idle_s and not session.lock.locked()
+            if now - session.touched > (self.config.grace_s if session.left else self.config.idle_s)
+            and not session.lock.locked()
         ]:
             self.close(client)
 

@@ -13,11 +13,11 @@ from actors.serving.sessions import ServeConfig, SessionHost
 from envs.conditioning.joint_commands import JointCommands
 from envs.embodiment import ActionKind
 from envs.simulators.remote.engine import RemoteSimulator
-from envs.targets import ConfigError, options, target
+from envs.targets import ConfigError, target
 from pipeline.loop import build_loop, last_round
 
 
-def build_session_host(cfg: Mapping[str, Any], root: Path) -> tuple[SessionHost, ServeConfig]:
+def build_session_host(cfg: Mapping[str, Any], root: Path, config: ServeConfig) -> SessionHost:
     """The sessions of the configured simulator.
 
     Raises:
@@ -25,7 +25,6 @@ def build_session_host(cfg: Mapping[str, Any], root: Path) -> tuple[SessionHost,
     """
     if issubclass(target(cfg["simulator"], "simulator"), RemoteSimulator):  # type: ignore[arg-type]
         raise ConfigError("simulator=remote is served already; serve unet, dit or gesim")
-    config = options(ServeConfig, cfg["serve"], "serve")
     graph, last = build_loop(cfg, root), last_round(cfg)
     weights, states = (
         graph.folder(f"{stage}-{last}") / "weights.safetensors" for stage in ("simulator", "state")
@@ -37,7 +36,7 @@ def build_session_host(cfg: Mapping[str, Any], root: Path) -> tuple[SessionHost,
         )
     simulator = build_simulator(cfg, weights if weights.exists() else None)
     decoder = build_state_decoder(cfg, simulator, states if states.exists() else None)
-    return SessionHost(simulator, decoder.eval(), config, _joints(cfg), cfg["simulator"]["bf16"]), config
+    return SessionHost(simulator, decoder.eval(), config, _joints(cfg), cfg["simulator"]["bf16"])
 
 
 def _joints(cfg: Mapping[str, Any]) -> JointCommands | None:

@@ -30,6 +30,7 @@ SERVE: dict[str, Any] = {
     "batch": 8,
     "linger_ms": 500.0,
     "idle_s": 900.0,
+    "grace_s": 10.0,
     "body_mb": 8.0,
     "seed": 0,
     "fixed_seed": False,

@@ -16,6 +16,7 @@ from pipeline.benches.gesim_floor import count_flops
 from pipeline.commands.finetune import build_finetune
 from pipeline.commands.serving import build_session_host
 from pipeline.config import load_config
+from tests.actors.serving import serve_config
 from tests.envs.simulators.gesim_tiny import write_checkpoint
 
 WORDS = [
@@ -59,10 +60,10 @@ def test_finetune_a_checkpoint_and_serve_what_came_of_it(shared: Path, tmp_path:
     assert set(done) == {"simulator", "state"}
     simulator = build_simulator(graph.cfg, graph.folder("simulator") / "weights.safetensors")
     build_state_decoder(graph.cfg, simulator, graph.folder("state") / "weights.safetensors")
-    host, config = build_session_host(graph.cfg, tmp_path / "runs/default")
-    assert config.host == "127.0.0.1" and host.simulator.spec.chunk == 5 and host.decoder is not None
+    host = build_session_host(graph.cfg, tmp_path / "runs/default", serve_config())
+    assert host.simulator.spec.chunk == 5 and host.decoder is not None
     with pytest.raises(ConfigError, match="run this experiment first"):
-        build_session_host(load_config(WORDS), tmp_path / "nowhere")
+        build_session_host(load_config(WORDS), tmp_path / "nowhere", serve_config())
     with pytest.raises(ConfigError, match=r"finetune\.data"):
         build_finetune(load_config(WORDS), tmp_path / "none").run()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from envs.ranges import Natural, Positive
 from envs.simulators.remote.protocol import (
+    TOKEN,
     ProtocolError,
     decode_frame,
     encode_frame,
@@ -95,6 +97,8 @@ class Connection:
     def __init__(self, url: str, options: ConnectionOptions):
         self.url, self.options = url.rstrip("/"), options
         self.http = requests.Session()
+        if os.environ.get(TOKEN):
+            self.http.headers["Authorization"] = f"Bearer {os.environ[TOKEN]}"
         self.client_id = ""
         self.chunks = 0
 
@@ -158,9 +162,11 @@ class Connection:
         Args:
             first: frames uint8 [V, 3, H, W] and state [S]; of calibrated cameras intrinsic [V, 3, 3] and c2w
                 [V, 4, 4].
-            seed: of the episode; like `state` and `chunk` it is ours, and released servers overlook it.
+            seed: of the episode; like `bound`, `state` and `chunk` it is ours, and released servers overlook
+                it.
         """
-        answer = self.ask("/init", {"user_name": self.options.user, "seed": seed})
+        # bound: if this process dies, the session ends with its connection
+        answer = self.ask("/init", {"user_name": self.options.user, "seed": seed, "bound": True})
         client = answer.get("client_id")
         if not isinstance(client, str) or not client:
             raise RemoteError(f"{self.url}/init answered {answer} without a client_id")

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 QUALITY = 95  # of JPEGs, as released
+TOKEN = "WORLDLOOP_TOKEN"  # environment variable; a config would carry the secret into logs and manifests
 _MOST_PIXELS = 2**26  # of one tiled picture; a header may announce any size
 _MOST_NUMBERS = 2**26
 
