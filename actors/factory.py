@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
@@ -26,6 +27,7 @@ from envs.episodes.clips import ClipStore
 from envs.geometry.kinematics import Kinematics, KinematicsError
 from envs.initial_states import InitialStates
 from envs.judges.base import Judge
+from envs.manifest import check_part
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import TaskPool, available_cores
 from envs.physics.suite import SuiteError, build_suite
@@ -306,13 +308,18 @@ def load(module: T, weights: Path | None) -> T:
 
     Raises:
         ConfigError: if the file is missing or of another architecture, naming the first differences.
+        DamagedArtefact: if it is part of a finished stage and has changed since.
     """
     if weights is None:
         return module
     assert isinstance(module, nn.Module)
     if not weights.exists():
         raise ConfigError(f"{weights} does not exist; run the stage that makes it")
-    found, wanted = load_file(weights), module.state_dict()
+    check_part(weights.resolve())
+    try:
+        found, wanted = load_file(weights), module.state_dict()
+    except SafetensorError as error:
+        raise ConfigError(f"{weights} cannot be read: {error}; restore the file") from error
     wrong = [
         f"{k}: file {tuple(found[k].shape)}, model {tuple(wanted[k].shape)}"
         for k in found.keys() & wanted.keys()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -142,8 +143,8 @@ def serve(words: Words) -> None:
         host = build_session_host(cfg, root, config)
         name, port = cfg["simulator"]["_target_"].rpartition(".")[2], server.getsockname()[1]
         print(
-            f"{name} at http://{config.host}:{port}, up to {config.sessions} sessions; look at it in a browser,"
-            " end it with Ctrl-C",
+            f"{name} at http://{config.host}:{port}, up to {config.sessions} sessions; look at it in a"
+            " browser, end with Ctrl-C",
             flush=True,
         )
         run_server(host, name, server)
@@ -218,24 +219,26 @@ def submit(words: Words) -> None:
 
 
 def chaos(words: Words) -> None:
-    """kill parts of a small Ray run by a seeded schedule and check its ledger: worldloop chaos
-    chaos.seconds=60
+    """disturb a small run by a seeded schedule and check all that is promised: worldloop chaos
+    chaos.events=1000
     """
-    from pipeline.chaos.chaos import ChaosFailure, run_chaos
+    from pipeline.chaos.fleet import ChaosFailure, run_chaos
+    from pipeline.chaos.soak import Soak
     from pipeline.config import load_config
 
     base = ("experiment=smoke", "algorithm=grpo", "launch=ray", "launch.judge_service=true", "launch.cpus=8")
-    words = [*without_given(base, words), *words]
-    cfg = load_config(words)
+    fleet = [*without_given(base, words), *words]
+    cfg = load_config(fleet)
+    folder, section = Path(cfg["runs"]) / f"chaos-{cfg['seed']}", cfg["chaos"]
     try:
-        found = run_chaos(cfg, words, Path(cfg["runs"]) / f"chaos-{cfg['seed']}")
+        if section["events"]:
+            soak = Soak(cfg, [*without_given(base[:1], words), *words], folder / "soak")
+            print(json.dumps(asdict(soak.run(section["events"])), indent=1))
+        if section["seconds"]:
+            print(json.dumps(run_chaos(cfg, fleet, folder / "fleet"), indent=1))
     except ChaosFailure as error:
         print(f"worldloop chaos: {error}", file=sys.stderr)
         sys.exit(1)
-    except KeyboardInterrupt:
-        print("\ninterrupted; the learner is gone, and chaos begins anew", file=sys.stderr)
-        sys.exit(130)
-    print(json.dumps(found, indent=1))
 
 
 def config(words: Words) -> None:

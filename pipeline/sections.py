@@ -126,7 +126,8 @@ class FinetuneSection:
 class ChaosSection:
     """Section chaos."""
 
-    seconds: Positive
+    events: Natural
+    seconds: NonNegative
     every: Positive
     learner_every: Positive
     actors: Count

@@ -28,6 +28,7 @@ from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.geometry.cameras import follow_wrists
 from envs.geometry.kinematics import Kinematics
+from envs.manifest import check_part
 from envs.specs import WorldSpec
 
 _FORM = "5"  # changes when what a cache holds does
@@ -64,6 +65,7 @@ def open_cached(folder: Path, spec: WorldSpec, style: PoseMapStyle, chosen: Path
 
     Raises:
         EpisodeError: if the data are damaged, or those of another robot.
+        DamagedArtefact: if they are part of a finished stage and have changed since.
         OSError: if there is no room for the cache; the message names it and its size.
     """
     if not (folder / "meta/info.json").exists():
@@ -80,6 +82,7 @@ def open_cached(folder: Path, spec: WorldSpec, style: PoseMapStyle, chosen: Path
         if part is None:
             continue
         try:
+            check_part(folder.resolve())
             _Builder(folder, spec, style).build(part, stamp)
             _put(part, place, stamp)
         finally:

@@ -22,8 +22,15 @@ from torch import Tensor, nn
 from torch.distributed.tensor import DTensor, distribute_tensor
 
 from envs.files import atomic, write_text
+from envs.manifest import hashes
 from learners.training.optimisers import optimiser_state
 from learners.training.parallel import leads, whole, workers
+
+_SUMS = "sha256.json"  # of every file beside it
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint is damaged, or belongs to another architecture; the message names it and the fix."""
 
 
 class Checkpoints:
@@ -65,6 +72,7 @@ class Checkpoints:
                 for name, held in tensors.items():
                     _write(part / f"{name}.safetensors", gathered(held))
                 (part / "facts.json").write_text(json.dumps(dict(facts)))
+                (part / _SUMS).write_text(json.dumps(hashes(part)))
             for path in older:
                 if path != final:
                     shutil.rmtree(path)
@@ -77,16 +85,17 @@ class Checkpoints:
         """Fill these tensors in place from the newest checkpoint; returns its facts, None if there is none.
 
         Raises:
-            RuntimeError: if it belongs to another architecture, or is damaged.
+            CheckpointError: if it belongs to another architecture, or is damaged.
         """
         path = self.newest
         if path is None:
             return None
+        _check(path)
         for name, held in tensors.items():
             try:
                 _read(path / f"{name}.safetensors", held)
             except (OSError, SafetensorError, ValueError) as error:
-                raise RuntimeError(
+                raise CheckpointError(
                     f"{path} belongs to another architecture: {name}: {error}."
                     " Remove the folder or restore the config."
                 ) from error
@@ -98,6 +107,21 @@ class Checkpoints:
         if leads():
             for path in self.folder.glob("checkpoint-*"):
                 shutil.rmtree(path)
+
+
+def _check(path: Path) -> None:
+    try:
+        sums = json.loads((path / _SUMS).read_text())
+    except (OSError, ValueError):
+        sums = {}
+    found = hashes(path)
+    found.pop(_SUMS, None)
+    if found != sums:
+        odd = sorted(name for name in {_SUMS, *found, *sums} if found.get(name) != sums.get(name))
+        raise CheckpointError(
+            f"{path} is damaged: {', '.join(odd or [_SUMS])} changed since it was written. Delete the folder:"
+            " what it belongs to then begins anew."
+        )
 
 
 def _wait() -> None:

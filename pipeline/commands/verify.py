@@ -6,8 +6,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from envs.manifest import DamagedArtefact, check, read_manifest
 from envs.targets import ConfigError
-from pipeline.graph.artefact import DamagedArtefact, check, read_manifest
 
 
 def verify_run(root: Path) -> str:

@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
+from envs.manifest import read_manifest
 from pipeline.evaluation.statistics import mcnemar, rate
-from pipeline.graph.artefact import read_manifest
 from pipeline.graph.stage import Inputs
 
 _ENTRY = ("successes", "episodes", "low", "high")

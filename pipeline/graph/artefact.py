@@ -6,7 +6,6 @@ it: one that has changed since is told before anything is built on it.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import platform
 import subprocess
@@ -15,13 +14,14 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from omegaconf import OmegaConf
 from safetensors.torch import save_file
 from torch import nn
 
 from envs.files import atomic, write_text
+from envs.manifest import write_manifest
 from learners.training.parallel import leads
 from pipeline.graph.code_version import digest
 
@@ -113,7 +113,6 @@ def finish(
     write_text(folder / "config.yaml", OmegaConf.to_yaml(nested))
     manifest = {
         "stage": identity.stage,
-        "files": hashes(folder),
         "key": identity.key,
         "parents": dict(identity.parents),
         "seconds": round(seconds, 2),
@@ -121,68 +120,4 @@ def finish(
         "result": dict(result),
         "identity": asdict(identity),
     }
-    text = json.dumps(manifest, indent=1, default=float)
-    write_text(folder / "manifest.json", text)
-    return dict(json.loads(text))
-
-
-def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """The manifest of a finished artefact, or None.
-
-    Raises:
-        DamagedArtefact: if it cannot be read.
-    """
-    path = folder / "manifest.json"
-    if not path.exists():
-        return None
-    try:
-        manifest = dict(json.loads(path.read_text()))
-        return manifest if {"stage", "result"} <= manifest.keys() else _refuse(folder, ["manifest.json"])
-    except ValueError:
-        return _refuse(folder, ["manifest.json"])
-
-
-class DamagedArtefact(RuntimeError):
-    """Files of a finished stage are not what they were when it ended; the message names them and the fix."""
-
-
-def hashes(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file of an artefact by its path, but for the manifest and what is hidden (caches)."""
-    out = {}
-    for path in sorted(folder.rglob("*")):
-        inside = path.relative_to(folder)
-        if (
-            path.is_file()
-            and inside.name != "manifest.json"
-            and not any(p.startswith(".") for p in inside.parts)
-        ):
-            out[inside.as_posix()] = _digest_of(path)
-    return out
-
-
-def _digest_of(path: Path) -> str:
-    found = hashlib.sha256()
-    with path.open("rb") as file:
-        while part := file.read(1 << 20):
-            found.update(part)
-    return found.hexdigest()
-
-
-def check(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """See that a finished artefact is what it was.
-
-    Raises:
-        DamagedArtefact: if a file has changed or is missing.
-    """
-    known, found = manifest.get("files", {}), hashes(folder)
-    changed = [name for name, value in known.items() if found.get(name) != value]
-    if changed:
-        _refuse(folder, [f"{name}{'' if name in found else ' (missing)'}" for name in changed])
-
-
-def _refuse(folder: Path, names: list[str]) -> NoReturn:
-    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    raise DamagedArtefact(
-        f"{folder} is not what its stage left there: {', '.join(names[:5])}{more}. Bring the files back, or"
-        " delete the folder: the same command then makes it anew"
-    )
+    return write_manifest(folder, manifest)

@@ -13,7 +13,8 @@ from typing import Any
 from tqdm import tqdm
 
 from envs.files import write_text
-from pipeline.graph.artefact import Identity, check, finish, read_manifest
+from envs.manifest import check, read_manifest
+from pipeline.graph.artefact import Identity, finish
 from pipeline.graph.code_version import code_of, digest
 from pipeline.graph.stage import Inputs, Stage
 from pipeline.graph.view import ConfigView, sections

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from envs.files import atomic
-from pipeline.graph.artefact import read_manifest
+from envs.manifest import read_manifest
 from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.given import Cfg
 

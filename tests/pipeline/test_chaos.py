@@ -1,21 +1,77 @@
-"""A minute of chaos with real kills, as a user would run it."""
+"""A few minutes of chaos with real kills, as a user would run it."""
 
 from __future__ import annotations
 
 import json
+import random
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envs.manifest import DamagedArtefact, check, read_manifest, write_manifest
+from pipeline.chaos.compare import differences
+from pipeline.chaos.corruption import spoil
 
 
-def test_a_minute_of_chaos_leaves_balanced_books(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "pipeline", "chaos", "chaos.seconds=60", f"runs={tmp_path}"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=400)
-    assert done.returncode == 0, done.stderr[-3000:] + (tmp_path / "chaos-0/learner.log").read_text()[-3000:]
-    found = json.loads((tmp_path / "chaos-0/chaos.json").read_text())
-    assert (
-        found["balanced"]
-        and found["learner_kills"] >= 1
-        and found["iterations"] >= 1
-        and sum(found["events"].values()) >= 2
+def chaos(folder: Path, *words: str) -> Path:
+    command = [sys.executable, "-m", "pipeline", "chaos", f"runs={folder}", *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stderr[-5000:]
+    return folder / "chaos-0"
+
+
+def test_a_minute_of_kills_on_ray_leaves_balanced_books(tmp_path: Path) -> None:
+    folder = chaos(tmp_path, "chaos.events=0", "chaos.seconds=60")
+    found = json.loads((folder / "fleet/chaos.json").read_text())
+    assert found["balanced"] and found["learner_kills"] >= 1 and found["iterations"] >= 1
+    assert sum(found["events"].values()) >= 2
+
+
+def test_a_slice_of_the_soak_leaves_nothing_wrong_unnoticed(tmp_path: Path) -> None:
+    folder = chaos(tmp_path, "chaos.events=24", "chaos.seconds=0")
+    books: dict[str, Any] = json.loads((folder / "soak/books.json").read_text())
+    assert sum(books["events"].values()) == 24 and books["runs"] >= 1
+    assert set(books["answers"]) <= {
+        *(f"{kind}: ended as asked" for kind in ("SIGKILL", "SIGTERM", "SIGINT")),
+        "disk full: told in a line",
+        "corruption: told by name",
+    }
+    again = json.loads(
+        (chaos(tmp_path, "chaos.events=24", "chaos.seconds=0") / "soak/books.json").read_text()
     )
+    assert again == books  # a soak goes on where it was: here, at its end
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_no_spoiled_file_passes(seed: int, tmp_path: Path) -> None:
+    stage = tmp_path / "stages/one-key"
+    (stage / "dataset").mkdir(parents=True)
+    (stage / "weights.safetensors").write_bytes(bytes(range(200)))
+    (stage / "dataset/info.json").write_text('{"fps": 10}')
+    (stage / "empty.jsonl").touch()
+    write_manifest(stage, {"stage": "one", "result": {"loss": 0.25}, "seconds": 12.5})
+    manifest = read_manifest(stage)
+    assert manifest is not None
+    check(stage, manifest)
+    done = spoil(tmp_path / "stages", random.Random(seed))
+    assert done is not None and done[0] == stage
+    with pytest.raises(DamagedArtefact, match="one-key"):
+        check(stage, read_manifest(stage) or {})
+
+
+def test_runs_are_equal_but_for_their_times(tmp_path: Path) -> None:
+    def made(name: str, weight: bytes, seconds: float, loss: float) -> Path:
+        stage = tmp_path / name / "stages/one-key"
+        stage.mkdir(parents=True)
+        (stage / "weights.safetensors").write_bytes(weight)
+        (stage / "metrics.jsonl").write_text(json.dumps({"step": 0, "loss": loss, "time/ms": seconds}) + "\n")
+        write_manifest(stage, {"stage": "one", "result": {"loss": loss, "data_seconds": seconds}})
+        return tmp_path / name
+
+    one = made("one", b"w", 1.0, 0.5)
+    assert differences(one, made("same", b"w", 2.0, 0.5)) == []
+    assert differences(one, made("weights", b"v", 1.0, 0.5)) == ["one-key/weights.safetensors"]
+    assert differences(one, made("loss", b"w", 1.0, 0.6)) == ["one-key", "one-key/metrics.jsonl"]

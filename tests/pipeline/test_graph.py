@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
+from envs.manifest import DamagedArtefact, read_manifest
 from pipeline.commands.verify import verify_run
 from pipeline.graph import code_version
-from pipeline.graph.artefact import DamagedArtefact, read_manifest
 from pipeline.graph.code_version import code_of
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, Stage, stage

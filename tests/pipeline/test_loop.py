@@ -15,8 +15,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from actors.factory import prepare_process
+from envs.manifest import write_manifest
 from pipeline.config import load_config
-from pipeline.graph.artefact import hashes
 from pipeline.loop import build_loop
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -61,9 +61,8 @@ def test_no_learned_weight_knows_privileged_columns(tmp_path: Path) -> None:
     for name in ("collect", "deploy-1"):
         shutil.copytree(true.folder(name), noisy.folder(name))
         assert overwrite_privileged(noisy.folder(name) / "dataset") > 0
-        manifest = noisy.folder(name) / "manifest.json"  # or the graph would see that the data have changed
-        known = json.loads(manifest.read_text()) | {"files": hashes(noisy.folder(name))}
-        manifest.write_text(json.dumps(known))
+        # or the graph would see that the data have changed
+        write_manifest(noisy.folder(name), json.loads((noisy.folder(name) / "manifest.json").read_text()))
     # The policy that was deployed is learned again, too; its recorded episodes stay.
     noisy.run("rl-1")
     for name in LEARNED:

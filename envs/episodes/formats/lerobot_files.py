@@ -42,7 +42,7 @@ def _fixed(kind: pa.DataType) -> bool:
 def open_parquet(path: Path) -> pq.ParquetFile:
     """Open a parquet file, or say which one is damaged."""
     try:
-        return pq.ParquetFile(path)
+        return pq.ParquetFile(path, page_checksum_verification=True)
     except (OSError, pa.ArrowInvalid) as error:
         raise EpisodeError(f"{path}: {error}; restore the file or collect its episodes again") from error
 

@@ -40,6 +40,7 @@ from envs.episodes.video import write_video
 from envs.files import write_atomically
 
 _JOURNAL = "meta/worldloop.writing.json"
+_SUMS: dict[str, Any] = {"write_page_checksum": True}  # a flipped bit is an error, not another number
 _FILE = re.compile(r"chunk-(\d+)/file-(\d+)\.")
 
 
@@ -139,7 +140,7 @@ class LeRobotWriter:
         if not rows:
             self._write_json("meta/info.json", self._info(features, [], {}))
         table = self._like_existing(pa.Table.from_pylist(records))
-        write_atomically(self.root / listing, lambda path: pq.write_table(table, path))
+        write_atomically(self.root / listing, lambda path: pq.write_table(table, path, **_SUMS))
         self._rows = [*rows, *records]
         self._describe(features)
         (self.root / _JOURNAL).unlink()
@@ -218,7 +219,9 @@ class LeRobotWriter:
             tasks.setdefault(episode.instruction, len(tasks))
         if len(tasks) > known:
             table = _tasks_table(tasks)
-            write_atomically(self.root / "meta/tasks.parquet", lambda path: pq.write_table(table, path))
+            write_atomically(
+                self.root / "meta/tasks.parquet", lambda path: pq.write_table(table, path, **_SUMS)
+            )
         return tasks
 
     def _describe(self, features: dict[str, Any]) -> None:
@@ -278,7 +281,7 @@ def _column(values: NDArray[Any]) -> pa.Array:
 
 def _write_groups(path: Path, tables: list[pa.Table]) -> None:
     """Each episode as a row group of its own, so that one can be read without the others."""
-    with pq.ParquetWriter(path, tables[0].schema) as writer:
+    with pq.ParquetWriter(path, tables[0].schema, **_SUMS) as writer:
         for table in tables:
             writer.write_table(table)
 

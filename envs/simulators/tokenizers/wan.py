@@ -44,10 +44,11 @@ class WanCodec(Codec):
 
     @classmethod
     def load(cls, folder: Path) -> WanCodec:
-        """The VAE of a folder in diffusers' layout."""
-        return cls(
-            AutoencoderKLWan.from_pretrained(str(folder), torch_dtype=torch.float32, local_files_only=True)
+        """The VAE of a folder in diffusers' layout, as safetensors: other files of weights may hold code."""
+        vae = AutoencoderKLWan.from_pretrained(
+            str(folder), torch_dtype=torch.float32, local_files_only=True, use_safetensors=True
         )
+        return cls(vae)
 
     def _together(self, pixels: int) -> int:
         """Clips of so many pixels a frame that are taken in one call."""

@@ -1,0 +1,39 @@
+"""What a bad disk, a bad copy or a careless hand does to the files of a run."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+
+def spoil(stages: Path, chance: random.Random) -> tuple[Path, str] | None:
+    """Spoil one file of a finished stage or of a checkpoint.
+
+    Returns:
+        The folder whose removal is the fix, and what was done in words; None if there is nothing to spoil.
+    """
+    folders = sorted(path.parent for path in stages.glob("*/manifest.json"))
+    folders += sorted(stages.glob("*/checkpoint-*"))
+    folders += sorted(stages.glob("*/*/checkpoint-*"))
+    if not folders:
+        return None
+    folder = chance.choice(folders)
+    files = sorted(
+        path
+        for path in folder.rglob("*")
+        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    )
+    # what is gone with its manifest is unfinished work, and made again without a word
+    path = chance.choice(files)
+    ways = ["flip", "cut", "grow"] if path.name == "manifest.json" else ["flip", "cut", "grow", "remove"]
+    way, content = chance.choice(ways), path.read_bytes()
+    if way == "remove":
+        path.unlink()
+    elif way == "grow" or not content:
+        path.write_bytes(content + b"\0")
+    elif way == "cut":
+        path.write_bytes(content[: chance.randrange(len(content))])
+    else:
+        at = chance.randrange(len(content))
+        path.write_bytes(content[:at] + bytes([content[at] ^ 1 << chance.randrange(8)]) + content[at + 1 :])
+    return folder, f"{way} of {path}"

@@ -1,0 +1,6 @@
+"""What every life needs, imported once by the server that lives are forked from."""
+
+import pipeline.config
+import pipeline.loop
+import pipeline.stages.collect
+import pipeline.track  # noqa: F401

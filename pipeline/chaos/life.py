@@ -1,0 +1,66 @@
+"""One life of a command, in a process of its own, from its beginning to its end or to what happens to it.
+
+Lives are forked from a server that has imported everything and done nothing, so that a thousand of them do
+not spend an hour importing.
+"""
+
+from __future__ import annotations
+
+import atexit
+import multiprocessing
+import os
+import sys
+from contextlib import nullcontext
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+from pipeline.chaos.faults import faulty_disk
+from pipeline.cli import main
+
+MARK = "WORLDLOOP_CHAOS"  # environment variable by which the children of a life are known
+OVERLOOKED = 99  # exit status of a command that ended well although it could not write
+
+_context = multiprocessing.get_context("forkserver")
+_context.set_forkserver_preload(["pipeline.chaos.life", "pipeline.chaos.imports"])
+
+
+def begin(words: list[str], mark: str, log: Path, folder: Path, full_after: int | None = None) -> BaseProcess:
+    """Start `worldloop <words>`.
+
+    Args:
+        words: command and overrides.
+        mark: value of MARK in its environment.
+        log: file that its output is added to.
+        folder: that it writes to.
+        full_after: writes after which the disk under `folder` is full; None for never.
+    """
+    process = _context.Process(target=_live, args=(words, mark, str(log), str(folder), full_after))
+    process.start()
+    return process
+
+
+def _live(words: list[str], mark: str, log: str, folder: str, full_after: int | None) -> None:
+    os.setsid()
+    os.environ[MARK] = mark
+    file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    os.dup2(file, 1)
+    os.dup2(file, 2)
+    # the server's streams are not this log
+    sys.stdout, sys.stderr = os.fdopen(1, "w", buffering=1), os.fdopen(2, "w", buffering=1)
+    sys.argv = ["worldloop", *words]
+    disk = nullcontext() if full_after is None else faulty_disk(Path(folder), full_after, "full")
+    try:
+        with disk as fault:
+            main()
+        if fault is not None and fault.tripped:
+            sys.exit(OVERLOOKED)
+    finally:
+        atexit._run_exitfuncs()  # a forked process ends without them, and Ray's would stay
+        sys.stdout.flush()
+        sys.stderr.flush()
+
+
+def send(process: BaseProcess, number: int) -> None:
+    """A signal to the command itself; what it started is its own affair."""
+    assert process.pid is not None
+    os.kill(process.pid, number)

@@ -1,0 +1,42 @@
+"""Which processes belong to a life: those of its session, and whatever inherited its mark."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from pipeline.chaos.life import MARK
+
+_PATIENCE = 30.0  # seconds; what was told to end may take a moment
+
+
+def belonging(mark: str, session: int) -> list[str]:
+    """Living processes of a session or with a mark, with the beginning of their command lines."""
+    found, wanted = [], f"{MARK}={mark}".encode()
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            state, _, _, its = (entry / "stat").read_text().rsplit(")", 1)[1].split()[:4]
+            if int(its) != session and wanted not in (entry / "environ").read_bytes().split(b"\0"):
+                continue
+            line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        except OSError:
+            continue  # it ended while we looked
+        if state != "Z":
+            found.append(f"{entry.name} {line[:80]}")
+    return found
+
+
+def nothing_left(mark: str, session: int, failure: Callable[[str], Exception]) -> None:
+    """Wait until none of them lives.
+
+    Raises:
+        Exception: what `failure` makes of it, if some stay.
+    """
+    deadline = time.monotonic() + _PATIENCE
+    while left := belonging(mark, session):
+        if time.monotonic() > deadline:
+            raise failure(f"processes outlive it: {left[:5]}")
+        time.sleep(0.1)
