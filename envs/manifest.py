@@ -64,11 +64,14 @@ def digest_of(path: Path) -> str:
 
 
 def hashes(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file of an artefact by its path, but for the manifest and what is hidden (caches)."""
+    """SHA-256 of every file of a folder by its path, but for the manifest, what is hidden (caches), and
+    checkpoints, which are removed after it.
+    """
     out = {}
     for path in sorted(folder.rglob("*")):
         inside = path.relative_to(folder)
-        if path.is_file() and inside.name != MANIFEST and not any(p.startswith(".") for p in inside.parts):
+        passing = any(part.startswith((".", "checkpoint-")) for part in inside.parts)
+        if path.is_file() and inside.name != MANIFEST and not passing:
             out[inside.as_posix()] = digest_of(path)
     return out
 

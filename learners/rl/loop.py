@@ -74,7 +74,7 @@ def train_rl(
     trainee = Trainee(algorithm.modules())
     optimiser = torch.optim.Adam(algorithm.groups(config.lr), lr=config.lr, eps=1e-5)
     rates = [group["lr"] for group in optimiser.param_groups]
-    alarms, ledger, first, episodes, wave = Alarms(), EpisodeLedger(), 0, 0, 0
+    alarms, ledger, first, episodes, wave, over = Alarms(), EpisodeLedger(), 0, 0, 0, False
     spent, figures = {"rollout": 0.0, "update": 0.0}, dict[str, float]()
 
     def state() -> dict[str, Any]:
@@ -92,9 +92,10 @@ def train_rl(
         alarms.entropy, alarms.silent, alarms.raised = facts["entropy"], facts["silent"], facts["raised"]
         ledger = EpisodeLedger(**facts["ledger"])
         ledger.drop("learner died", ledger.asked - ledger.learned - sum(ledger.dropped.values()))
-        if leads():
-            truncate_log(log, first)
-            truncate_log(learned, first)
+        over = facts["over"]
+    if leads():
+        truncate_log(log, first)
+        truncate_log(learned, first)
 
     def seeds(iteration: int) -> list[int]:
         pool = range(starts) if isinstance(starts, int) else starts
@@ -121,6 +122,7 @@ def train_rl(
     def save(iteration: int) -> None:
         facts = {
             "iteration": iteration,
+            "over": over,
             "episodes": episodes,
             "spent": spent,
             "ledger": asdict(ledger),
@@ -142,7 +144,7 @@ def train_rl(
         (learned if leads() else nowhere).open("a") as jobs,
         deferred_signals() as asked,
     ):
-        for iteration in range(first, config.iterations):
+        for iteration in range(first, first if over else config.iterations):
             began = time.perf_counter()
             for group, lr in zip(optimiser.param_groups, rates, strict=True):
                 group["lr"] = lr * (1 - iteration / config.iterations)
@@ -189,8 +191,9 @@ def train_rl(
                     f"{name}: about {(updated - began) * (config.iterations - first - 1) / 60:.1f} min for"
                     f" {config.iterations - first - 1} more iterations"
                 )
+            over = iteration + 1 == config.iterations or (until is not None and until(iteration))
             stop = from_leader(asked)
-            if (iteration + 1) % config.checkpoint_every == 0 or stop:
+            if (iteration + 1) % config.checkpoint_every == 0 or over or stop:
                 save(iteration + 1)
             if stop:
                 bar.close()
@@ -199,11 +202,10 @@ def train_rl(
                     " there"
                 )
                 leave(stop)
-            if until is not None and until(iteration):
+            if over:
                 break
     bar.close()
     trainee.release()
-    checkpoints.clear()
     # What was submitted ahead and never learned from is no loss, but it was asked for.
     ledger.drop("unused", ledger.asked - ledger.learned - sum(ledger.dropped.values()))
     return {

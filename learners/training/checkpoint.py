@@ -66,7 +66,8 @@ class Checkpoints:
         final = self.folder / f"checkpoint-{step:09d}"
         _wait()
         if leads():
-            older = list(self.folder.glob("checkpoint-*"))
+            # half-written ones are a killed process's
+            older = [*self.folder.glob("checkpoint-*"), *self.folder.glob(".checkpoint-*")]
             with atomic(final) as part:
                 part.mkdir()
                 for name, held in tensors.items():
@@ -101,12 +102,11 @@ class Checkpoints:
                 ) from error
         return self.facts()
 
-    def clear(self) -> None:
-        """Remove all, once the run has ended and what it made is kept elsewhere."""
-        _wait()
-        if leads():
-            for path in self.folder.glob("checkpoint-*"):
-                shutil.rmtree(path)
+
+def clear_checkpoints(folder: Path) -> None:
+    """Remove all checkpoints in and under a folder, once what they led to is kept elsewhere."""
+    for path in [*folder.rglob("checkpoint-*"), *folder.rglob(".checkpoint-*")]:
+        shutil.rmtree(path)
 
 
 def _check(path: Path) -> None:

@@ -147,8 +147,8 @@ def fit(
         facts = checkpoints.load(state())
         assert facts is not None
         first, spent, smooth = int(facts["step"]), dict(facts["spent"]), facts["smooth"]
-        if leads():
-            truncate_log(log, first)
+    if leads():
+        truncate_log(log, first)
     module.train()
     bar = tqdm(
         total=config.steps,
@@ -206,7 +206,7 @@ def fit(
                 _announce(name, config.steps - step - 1, took)
             bar.set_postfix_str(f"{watch} {figures.get(watch, smooth):.4g}", refresh=False)
             stop = from_leader(asked_to_leave)
-            if stop or ((step + 1) % config.checkpoint_every == 0 and step + 1 < config.steps):
+            if stop or (step + 1) % config.checkpoint_every == 0 or step + 1 == config.steps:
                 stream.flush()
                 checkpoints.save(step + 1, state(), {"step": step + 1, "spent": spent, "smooth": smooth})
             if stop:
@@ -222,7 +222,6 @@ def fit(
                 parameter.copy_(average[key])
     trainee.release()
     module.eval()
-    checkpoints.clear()
     return {
         **{f"{key}_seconds": value for key, value in spent.items()},
         "loss": smooth if smooth is not None else math.nan,

@@ -12,9 +12,10 @@ def spoil(stages: Path, chance: random.Random) -> tuple[Path, str] | None:
     Returns:
         The folder whose removal is the fix, and what was done in words; None if there is nothing to spoil.
     """
-    folders = sorted(path.parent for path in stages.glob("*/manifest.json"))
-    folders += sorted(stages.glob("*/checkpoint-*"))
-    folders += sorted(stages.glob("*/*/checkpoint-*"))
+    folders = []
+    for stage in sorted(stages.glob("*")):
+        done = (stage / "manifest.json").exists()
+        folders += [stage] if done else sorted(stage.rglob("checkpoint-*"))
     if not folders:
         return None
     folder = chance.choice(folders)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,9 +10,10 @@ from typing import Any
 
 from tqdm import tqdm
 
-from envs.files import write_text
 from envs.manifest import check, read_manifest
+from learners.training.checkpoint import clear_checkpoints
 from pipeline.graph.artefact import Identity, finish
+from pipeline.graph.clock import WorkClock
 from pipeline.graph.code_version import code_of, digest
 from pipeline.graph.stage import Inputs, Stage
 from pipeline.graph.view import ConfigView, sections
@@ -149,27 +148,20 @@ class Graph:
         manifest = read_manifest(folder)
         if manifest is not None:
             check(folder, manifest)
+            clear_checkpoints(folder)  # of a process that was killed right after the manifest was there
             tqdm.write(f"=== {name} is finished, reused from {folder}")
             tracker.catch_up(name, folder)
             return manifest
         folder.mkdir(parents=True, exist_ok=True)
         resumed = any(folder.iterdir())
         tqdm.write(f"=== {name}{' (resumed)' if resumed else ''} -> {folder}")
-        spent = folder / "seconds.json"  # of earlier, interrupted attempts
-        earlier = json.loads(spent.read_text()) if spent.exists() else 0.0
-        began, node = time.perf_counter(), self.nodes[name]
-        try:
-            with tracker.follow(name, folder):
-                result = run_stage(node.stage, name, self.cfg, folder, self.inputs(name))
-        except BaseException:
-            with contextlib.suppress(OSError):  # a full disk must not hide what went wrong
-                write_text(spent, json.dumps(earlier + time.perf_counter() - began))
-            raise
-        seconds = earlier + time.perf_counter() - began
-        spent.unlink(missing_ok=True)
+        node = self.nodes[name]
+        with WorkClock(folder) as clock, tracker.follow(name, folder):
+            result = run_stage(node.stage, name, self.cfg, folder, self.inputs(name))
         read = sections(self.cfg, node.stage.reads_of(node.settings))
-        manifest = finish(folder, node.identity, read, seconds, result)
-        tqdm.write(f"    {name} took {seconds:.0f} s {_brief(manifest['result'])}")
+        manifest = finish(folder, node.identity, read, clock.seconds, result)
+        clear_checkpoints(folder)
+        tqdm.write(f"    {name} took {clock.seconds:.0f} s {_brief(manifest['result'])}")
         return manifest
 
     def why(self, name: str) -> str:

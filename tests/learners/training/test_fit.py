@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from learners.training.checkpoint import Checkpoints
+from learners.training.checkpoint import Checkpoints, clear_checkpoints
 from learners.training.fit import FitConfig, TrainingDiverged, fit, follow
 from learners.training.muon import Muon
 from learners.training.optimisers import OPTIMISERS, optimiser_state
@@ -61,6 +61,10 @@ def test_a_killed_run_goes_on_bit_for_bit(tmp_path: Path, optimiser: str) -> Non
     resumed, rest = train(tmp_path / "cut", optimiser)
     assert rest == log
     assert all(torch.equal(value, whole.state_dict()[name]) for name, value in resumed.state_dict().items())
+    again, rest = train(tmp_path / "cut", optimiser)  # it has ended: nothing is trained twice
+    assert rest == log
+    assert all(torch.equal(value, whole.state_dict()[name]) for name, value in again.state_dict().items())
+    clear_checkpoints(tmp_path)
     assert not list((tmp_path / "cut").glob("*checkpoint-*"))
 
 
