@@ -69,12 +69,16 @@ class Camera:
     calibrated: bool = False
 
 
+PYTHON = "python:"  # before the import path of a function, where the path of a robot's file may stand
+
+
 @dataclass(frozen=True)
 class Robot:
     """A robot description file and the names in it, for forward kinematics of joint commands.
 
     Args:
-        model: path of a URDF or MJCF file.
+        model: path of a URDF or MJCF file, or python:package.module.function around a library that gives
+            flange poses (see envs/geometry/kinematics.py).
         joints: per arm the names of its joints, in the action's order.
         flanges: per arm the body (URDF link) or site whose pose is the end-effector pose.
         held: joints that stand still, such as head and waist, and their values in radians.
@@ -214,6 +218,8 @@ class Embodiment:
         plain = asdict(self)
         for known in ("robot", "action_names", "state_names", "fps"):
             plain.pop(known)
+        if self.kinematics is not None and self.kinematics.model.startswith(PYTHON):
+            plain["kinematics"] = None  # data name no code
         plain["action_kind"] = self.action_kind.value
         plain["cameras"] = {
             camera.name: {"wrist": camera.wrist, "calibrated": camera.calibrated} for camera in self.cameras
@@ -252,6 +258,11 @@ class Embodiment:
         ]
         kind, delta = guess_action(action)
         robot = own.get("kinematics")
+        if robot is not None and str(robot["model"]).startswith(PYTHON):
+            raise EmbodimentError(
+                f"kinematics.model={robot['model']} of a data set names code, which is never run; remove it"
+                " from info.json and say simulator.kinematics in the config"
+            )
         return cls(
             robot=str(info.get("robot_type") or "unknown"),
             action_names=action,

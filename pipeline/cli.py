@@ -232,7 +232,7 @@ def chaos(words: Words) -> None:
     folder, section = Path(cfg["runs"]) / f"chaos-{cfg['seed']}", cfg["chaos"]
     try:
         if section["events"]:
-            soak = Soak(cfg, [*without_given(base[:1], words), *words], folder / "soak")
+            soak = Soak(cfg, [*without_given(("experiment=soak",), words), *words], folder / "soak")
             print(json.dumps(asdict(soak.run(section["events"])), indent=1))
         if section["seconds"]:
             print(json.dumps(run_chaos(cfg, fleet, folder / "fleet"), indent=1))

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from envs.embodiment import Robot
+from envs.embodiment import INFO_KEY, Embodiment, EmbodimentError, Robot
 from envs.geometry.kinematics import Kinematics, KinematicsError
+from tests.embodiments import BIMANUAL_JOINTS
 
 
 def _urdf(path: Path) -> Path:
@@ -60,3 +62,40 @@ def test_a_urdf_without_its_meshes(tmp_path: Path) -> None:
     (tmp_path / "bad.urdf").write_text("<robot")
     with pytest.raises(KinematicsError, match="cannot be read"):
         Kinematics(Robot(str(tmp_path / "bad.urdf"), names, ("tool_l", "tool_r")))
+
+
+def turning(joints: list[np.ndarray], held: dict[str, float]) -> np.ndarray:
+    """A maker's library: each arm turns about z by the sum of its joints, at the height of the waist."""
+    out = np.tile(np.eye(4), (len(joints[0]), len(joints), 1, 1))
+    for arm, angles in enumerate(joints):
+        turn = angles.sum(-1)
+        out[:, arm, 0, 0] = out[:, arm, 1, 1] = np.cos(turn)
+        out[:, arm, 1, 0], out[:, arm, 0, 1] = np.sin(turn), -np.sin(turn)
+        out[:, arm, 2, 3] = held["waist"]
+    return out
+
+
+def test_a_library_instead_of_a_description() -> None:
+    names = (("a", "b"), ("c", "d"))
+    robot = Robot(f"python:{__name__}.turning", names, ("left", "right"), {"waist": 0.4})
+    poses = Kinematics(robot).flanges([torch.full((3, 5, 2), 0.25), torch.zeros(3, 5, 2)])
+    assert poses.shape == (3, 5, 2, 6)
+    assert torch.allclose(poses[1, 2, 0], torch.tensor([0, 0, 0.4, 0, 0, 0.5]), atol=1e-6)
+    assert torch.allclose(poses[1, 2, 1], torch.tensor([0, 0, 0.4, 0, 0, 0.0]), atol=1e-6)
+    with pytest.raises(KinematicsError, match="does not import"):
+        Kinematics(Robot(f"python:{__name__}.nothing", names, ("left", "right")))
+    other = Kinematics(Robot(f"python:{__name__}.nonsense", names, ("left", "right")))
+    with pytest.raises(KinematicsError, match=r"flange poses \[N, arms, 4, 4\]"):
+        other.flanges([torch.zeros(1, 2)] * 2)
+    own = replace(BIMANUAL_JOINTS, kinematics=robot)
+    assert own.to_info()["kinematics"] is None
+    features = {"action": {"shape": [1], "info": {INFO_KEY: {"kinematics": asdict(robot)}}}}
+    features["observation.state"] = {"shape": [1]}
+    features["observation.images.a"] = {"shape": [8, 8, 3], "dtype": "video"}
+    with pytest.raises(EmbodimentError, match="names code"):
+        Embodiment.from_info({"features": features, "fps": 10})
+
+
+def nonsense(joints: list[np.ndarray], held: dict[str, float]) -> np.ndarray:
+    """A library that answers joints."""
+    return joints[0]
