@@ -9,12 +9,17 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from actors.policies.contract import VISUAL_FEATURES, feature_part, imitation_loss, inputs_for, with_text
+from actors.policies.contract import (
+    VISUAL_FEATURES,
+    disagreement,
+    feature_part,
+    imitation_loss,
+    inputs_for,
+    with_text,
+)
 from envs.episodes.clips import ClipStore
 from envs.specs import (
-    CHUNK,
     IMAGE,
     STATE,
     ActionMode,
@@ -112,9 +117,7 @@ class Cloning:
         total = imitation_loss(self.policy, with_text(observed, self.policy), data["target"])
         if "generated" not in data.keys():
             return total
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            wanted = self.policy(inputs_for(data["recorded"], self.policy))[CHUNK]
-        return total + imitation_loss(self.policy, with_text(data["generated"], self.policy), wanted)
+        return total + disagreement(self.policy, data["recorded"], data["generated"])
 
 
 def chunks_ahead(store: ClipStore, rows: Tensor, mode: ActionMode) -> Tensor:
