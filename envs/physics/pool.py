@@ -112,6 +112,7 @@ class _Remote:
         self.process = subprocess.Popen(
             [sys.executable, "-m", "envs.physics.worker", str(theirs.fileno())],
             pass_fds=[theirs.fileno()],
+            start_new_session=True,  # a terminal's Ctrl-C is for the owner, whose end closes the pipe
             env={**os.environ, "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)},
         )
         theirs.close()
