@@ -177,7 +177,7 @@ def inspect(words: Words) -> None:
 
 def bench(words: Words) -> None:
     """measure performance: worldloop bench
-    conditioning|physics|world|actors|learning|gesim|overfit|pretrained
+    conditioning|physics|world|actors|learning|serving|gesim|overfit|pretrained
     """
     from pipeline.benches.bench import run_bench
 

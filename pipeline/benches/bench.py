@@ -15,6 +15,7 @@ BENCHES: dict[str, tuple[str, tuple[str, ...]]] = {
     "world": ("pipeline.benches.worlds", ()),
     "actors": ("pipeline.benches.actors", ("launch=ray",)),
     "learning": ("pipeline.benches.learning", ()),
+    "serving": ("pipeline.benches.serving", ("experiment=smoke",)),
     "gesim": ("pipeline.benches.gesim", ()),
     "overfit": ("pipeline.benches.training", ("simulator=dit_small", "task=lerobot")),
     "pretrained": ("pipeline.benches.training", ("experiment=smoke", "simulator=dit_small")),

@@ -1,4 +1,4 @@
-"""Ctrl-C on every command that lasts: it ends soon, without a traceback, and nothing that it began lives on."""
+"""Ctrl-C on every command that lasts: it ends soon, without a traceback, and nothing it began lives on."""
 
 from __future__ import annotations
 
