@@ -9,13 +9,15 @@ from tqdm import tqdm
 
 from learners.training.fit import TrainingDiverged
 
+_FEW = 0.15  # of the planned updates
+
 
 @dataclass
 class Alarms:
     """Watches an RL run for the ways it goes wrong quietly.
 
     Args:
-        patience: iterations in a row without reward variance before the alarm.
+        patience: iterations in a row without reward variance, or of hardly any step, before the alarm.
         kl: KL per iteration that counts as exploding.
         entropy_drop: fall of entropy (nats) from the first iteration that counts as collapse.
     """
@@ -24,6 +26,7 @@ class Alarms:
     kl: float = 0.5
     entropy_drop: float = 12.0
     silent: int = 0
+    short: int = 0
     entropy: float | None = None
     raised: list[str] = field(default_factory=list)
 
@@ -46,6 +49,16 @@ class Alarms:
                 iteration,
                 "every episode scores the same; check the judge, or start from a policy that succeeds"
                 " sometimes",
+            )
+        few = figures.get("updates", 0.0) <= _FEW * figures.get("planned_updates", 0.0)
+        self.short = self.short + 1 if few and figures.get("kl_reached", 0.0) > 0.0 else 0
+        if self.short == self.patience:
+            self._warn(
+                "hardly any step",
+                iteration,
+                f"{figures['updates']:.0f} of {figures['planned_updates']:.0f} updates an iteration, then KL"
+                f" {figures['kl_reached']:.2g} is above rl.kl_stop: one step changes too much of what the"
+                " policy does; lower rl.lr, or see whether its cloning diverged",
             )
         if figures.get("kl", 0.0) > self.kl:
             self._warn(

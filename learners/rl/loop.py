@@ -89,7 +89,7 @@ def train_rl(
         assert facts is not None
         first, episodes, spent, wave = facts["iteration"], facts["episodes"], facts["spent"], facts["wave"]
         figures = facts["last"]
-        alarms.entropy, alarms.silent, alarms.raised = facts["entropy"], facts["silent"], facts["raised"]
+        alarms = Alarms(**facts["alarms"])
         ledger = EpisodeLedger(**facts["ledger"])
         ledger.drop("learner died", ledger.asked - ledger.learned - sum(ledger.dropped.values()))
         over = facts["over"]
@@ -126,9 +126,7 @@ def train_rl(
             "episodes": episodes,
             "spent": spent,
             "ledger": asdict(ledger),
-            "entropy": alarms.entropy,
-            "silent": alarms.silent,
-            "raised": alarms.raised,
+            "alarms": asdict(alarms),
             "last": figures,
         }
         if feed is not None:

@@ -43,11 +43,14 @@ def update(
     if true is not None and true.decisions is not None and config.recorded:
         known = trainee(true.decisions.sample, config.recorded, data, shuffle)
     sums: dict[str, float] = {}
-    count, stopped = 0, False
+    count, planned, reached = 0, 0, 0.0
     for _ in range(config.epochs):
         order = torch.randperm(len(data), generator=shuffle)
         for pick in order.split(config.minibatch):
             if not len(pick) or len(pick) < 16 <= len(data):  # nothing, or a rest too small for a step
+                continue
+            planned += 1
+            if reached > config.kl_stop:
                 continue
             optimiser.zero_grad(set_to_none=True)
             rows, parts, mine = [], pick.tensor_split(config.microbatches), my_share(config.microbatches)
@@ -57,9 +60,9 @@ def update(
                 (loss / len(mine)).backward()
                 rows.append(row)
             means = averaged(rows)
-            if means.get("kl", 0.0) > config.kl_stop:
-                stopped = True
-                break
+            reached = means.get("kl", 0.0)
+            if reached > config.kl_stop:
+                continue
             # each group by itself: a critic's large gradients must not make the policy's small
             norm = max(clip_gradients(group["params"], config.clip) for group in optimiser.param_groups)
             if not math.isfinite(norm):
@@ -68,10 +71,9 @@ def update(
             for key, value in {**means, "grad_norm": norm}.items():
                 sums[key] = sums.get(key, 0.0) + value
             count += 1
-        if stopped:
-            break
     figures |= {key: value / max(1, count) for key, value in sums.items()}
-    return figures | {"updates": float(count), "transitions": float(len(data))}
+    done = {"updates": float(count), "planned_updates": float(planned), "kl_reached": reached}
+    return figures | done | {"transitions": float(len(data))}
 
 
 def _loss(

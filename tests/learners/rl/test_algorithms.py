@@ -26,7 +26,15 @@ from tests.embodiments import ARM_DELTAS, observations, world_spec
 from tests.sections import offered, section
 
 RL = {
-    **{"iterations": 2, "envs": 8, "shards": 1, "schedule": "sync", "max_policy_lag": 2, "queue": 8},
+    **{
+        "iterations": 2,
+        "envs": 8,
+        "shards": 1,
+        "threads": 2,
+        "schedule": "sync",
+        "max_policy_lag": 2,
+        "queue": 8,
+    },
     **{"max_dropped": 0.05, "epochs": 2, "minibatch": 16, "microbatches": 1, "lr": 1e-3, "clip": 1.0},
     **{
         "kl_stop": 10.0,

@@ -39,6 +39,10 @@ def test_alarms() -> None:
         "exploding KL",
         "collapsed entropy",
     ]
+    for iteration in range(2):
+        said = {"updates": 1.0, "planned_updates": 16.0, "kl_reached": 0.3, "reward_std": 1.0}
+        alarms.check(said, iteration)
+    assert "hardly any step at iteration 1: 1 of 16 updates" in alarms.raised[-1]
     with pytest.raises(TrainingDiverged, match="kl"):
         alarms.check({"reward_std": 1.0, "kl": float("nan")}, 4)
 
