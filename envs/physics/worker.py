@@ -6,6 +6,7 @@ owner.
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import sys
 import traceback
@@ -184,34 +185,27 @@ class Worker:
 
 
 def serve(pipe: Connection) -> None:
-    """Answer requests until the pipe closes: first (spec, slots), then (method, arguments), None to end."""
-    try:
-        worker = Worker(*pipe.recv())
-        pipe.send(("ok", None))
-    except EOFError:
-        return
-    except ConfigError as error:
-        pipe.send(("config", str(error)))
-        return
-    except Exception:
-        pipe.send(("error", traceback.format_exc()))
-        return
-    while True:
+    """Answer requests until the pipe closes, at whatever moment its owner dies: first (spec, slots), then
+    (method, arguments), None to end.
+    """
+    with contextlib.suppress(EOFError, OSError):
+        spec, slots = pipe.recv()
         try:
-            message = pipe.recv()
-        except (EOFError, OSError):
+            worker = Worker(spec, slots)
+        except ConfigError as error:
+            pipe.send(("config", str(error)))
             return
-        if message is None:
-            return
-        name, arguments = message
-        try:
-            answer = ("ok", getattr(worker, name)(*arguments))
         except Exception:
-            answer = ("error", traceback.format_exc())
-        try:
-            pipe.send(answer)
-        except OSError:
+            pipe.send(("error", traceback.format_exc()))
             return
+        pipe.send(("ok", None))
+        while (message := pipe.recv()) is not None:
+            name, arguments = message
+            try:
+                answer = ("ok", getattr(worker, name)(*arguments))
+            except Exception:
+                answer = ("error", traceback.format_exc())
+            pipe.send(answer)
 
 
 if __name__ == "__main__":

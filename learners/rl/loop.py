@@ -189,7 +189,7 @@ def train_rl(
                     f"{name}: about {(updated - began) * (config.iterations - first - 1) / 60:.1f} min for"
                     f" {config.iterations - first - 1} more iterations"
                 )
-            over = iteration + 1 == config.iterations or (until is not None and until(iteration))
+            over = (until is not None and until(iteration)) or iteration + 1 == config.iterations
             stop = from_leader(asked)
             if (iteration + 1) % config.checkpoint_every == 0 or over or stop:
                 save(iteration + 1)

@@ -79,7 +79,7 @@ def test_rollouts_and_learned_weights_are_the_same_bits_for_any_number_of_actors
     assert torch.get_num_threads() == before + 1
     torch.set_num_threads(before)
     weights, _ = learn(LocalFleet(build_host(recipe)), recipe, tmp_path / "local")
-    for actors in (1, 2, 4):
+    for actors in (1, 3):
         fleet = RayFleet(recipe, actors)
         try:
             got = rollout(fleet, recipe)
