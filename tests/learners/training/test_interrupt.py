@@ -70,10 +70,7 @@ def test_an_interrupted_fit_goes_on_to_the_same_metrics_weights_and_result(
     assert rows == whole[0] and torch.equal(weight, whole[1]) and loss == whole[2]
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_a_command_ends_soon_and_leaves_a_checkpoint(
-    number: signal.Signals, code: int, tmp_path: Path
-) -> None:
+def test_a_command_ends_soon_and_leaves_a_checkpoint(tmp_path: Path) -> None:  # Ctrl-C: test_signals.py
     words = ["stage", "imitation", "experiment=smoke", f"runs={tmp_path}", "track=disabled"]
     words += ["imitation.perception.steps=5000", "collect.episodes.train=12"]
     command = subprocess.Popen(
@@ -88,9 +85,9 @@ def test_a_command_ends_soon_and_leaves_a_checkpoint(
         if any(log.stat().st_size for log in tmp_path.rglob("metrics.jsonl")):
             break
         time.sleep(0.1)
-    command.send_signal(number)
+    command.send_signal(signal.SIGTERM)
     said = command.communicate(timeout=30)[0]
-    assert command.returncode == code, said
+    assert command.returncode == 143, said
     assert "Traceback" not in said and "goes on from" in said
     assert list(tmp_path.rglob("checkpoint-*/facts.json"))
     assert not list(tmp_path.rglob(".owner.json"))
