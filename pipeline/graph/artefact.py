@@ -59,6 +59,10 @@ def versions() -> dict[str, str]:
 class Identity:
     """All that an artefact's key is made of.
 
+    Left out on purpose: `launch`, which decides who computes and not what comes out; the kind of machine and
+    the versions of libraries, which move last bits only and stand in the manifest (an upgrade must not throw
+    a day's training away); the run's name and its tracking.
+
     Args:
         stage: the node's name.
         config: hash of every config section that it reads, by dotted path.
