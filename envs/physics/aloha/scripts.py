@@ -16,6 +16,7 @@ from envs.physics.aloha.arms import Array, Hand, facing
 
 PITCH = 0.8  # rad by which hands look down when they pick things up
 OPEN, CLOSED = 1.0, 0.0
+_CLEAR = np.array([0.0, 0.0, 0.007])  # m above the peg's middle at which fingers do not rub on the table
 MEETING = np.array([0.0, 0.5, 0.25])  # m, over the table's middle, where the hands meet
 
 
@@ -76,15 +77,15 @@ class TransferCube(Script):
 
     def lost(self, phase: int, sight: Sight) -> bool:
         """Whether the cube is too low for hands that should hold it in the air."""
-        return phase > 3 and bool(sight.objects[0, 2] < MEETING[2] - 0.08)
+        holder = sight.hands[0 if phase > 5 else 1]
+        return phase > 2 and _apart(holder, sight.objects[0])
 
 
 class Insertion(Script):
     """The left hand picks the socket up, the right one the peg, and pushes it in until it meets the pin."""
 
     #         over  down  grip  lift  align push
-    phases = (0.10, 0.20, 0.30, 0.20, 0.30, 0.20)
-    _GAP = (0.15, 0.10, 0.0)  # m from the socket's centre to the peg's: apart, and where the peg meets the pin
+    phases = (0.20, 0.40, 0.70, 0.30, 0.40, 0.20)
 
     def goals(self, phase: int, sight: Sight) -> tuple[Hand, Hand]:
         """See Script."""
@@ -93,26 +94,47 @@ class Insertion(Script):
             above = np.array([0.0, 0.0, 0.10 if phase == 0 else 0.0])
             opening = CLOSED if phase == 2 else OPEN
             left = Hand(socket + above, facing(0, PITCH, _yaw(sight.objects[1])), opening)
-            right = Hand(peg + above, facing(1, PITCH, _yaw(sight.objects[0])), opening)
+            right = Hand(peg + above + _CLEAR, facing(1, PITCH, _yaw(sight.objects[0])), opening)
             return left, right
         left = Hand(MEETING - (0.075, 0.0, 0.0), facing(0, PITCH), CLOSED)
         if phase == 3:
             return left, Hand(MEETING + (0.075, 0.0, 0.0), facing(1, PITCH), CLOSED)
-        ahead = np.array([0.15 if phase == 4 else 0.09, 0.0, 0.0])
-        # The hand goes where the peg, as it lies in the hand, has the socket in front of it.
-        return left, Hand(socket + ahead + sight.hands[1].position - peg, facing(1, PITCH), CLOSED)
+        return left, _bring(sight, 0.15 if phase == 4 else 0.09)
 
     def lost(self, phase: int, sight: Sight) -> bool:
         """Whether peg or socket is too low for hands that should hold it in the air."""
-        return phase > 3 and bool((sight.objects[:, 2] < MEETING[2] - 0.08).any())
+        left, right = sight.hands
+        return phase > 2 and (_apart(right, sight.objects[0]) or _apart(left, sight.objects[1]))
+
+
+def _bring(sight: Sight, ahead: float) -> Hand:
+    """The right hand at which the peg, as it lies in it, is `ahead` metres in front of the socket and in line
+    with it.
+    """
+    hand, (peg, socket) = sight.hands[1], sight.objects
+    hole, axis = (_rotation(pose).as_matrix()[:, 0] for pose in (socket, peg))
+    hole *= np.sign(hole[0])
+    axis *= np.sign(axis @ hole)
+    turn, _ = Rotation.align_vectors(hole[None], axis[None])
+    position = socket[:3] + ahead * hole + turn.apply(hand.position - peg[:3])
+    return Hand(position, (turn * Rotation.from_matrix(hand.rotation)).as_matrix(), CLOSED)
+
+
+def _apart(hand: Hand, thing: Array) -> bool:
+    """Whether a thing is too low to be in the hand."""
+    return bool(hand.position[2] - thing[2] > 0.04)
 
 
 def _yaw(pose: Array) -> float:
     """The heading of a long thing, whichever end is in front, in -pi/2..pi/2."""
-    yaw = Rotation.from_quat(pose[3:], scalar_first=True).as_euler("ZYX")[0]
+    yaw = _rotation(pose).as_euler("ZYX")[0]
     return float((yaw + np.pi / 2) % np.pi - np.pi / 2)
 
 
 def _quarter(pose: Array) -> float:
     """The heading of a cube, whichever side is in front, in -pi/4..pi/4."""
     return float((_yaw(pose) + np.pi / 4) % (np.pi / 2) - np.pi / 4)
+
+
+def _rotation(pose: Array) -> Rotation:
+    return Rotation.from_quat(pose[3:], scalar_first=True)
