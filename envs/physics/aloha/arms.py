@@ -36,6 +36,9 @@ class Hand:
     opening: float
 
 
+Hands = tuple[Hand, Hand]  # the left and the right one
+
+
 def facing(side: int, pitch: float, yaw: float = 0.0, roll: float = 0.0) -> Array:
     """Rotation [3, 3] of a hand that looks towards the other arm.
 
@@ -66,15 +69,15 @@ class ArmKinematics:
         self.high = np.array([[joint.range[1] for joint in arm] for arm in joints])
         self._jac = np.zeros((6, model.nv))
 
-    def read(self, data: mujoco.MjData, openings: Sequence[float]) -> list[Hand]:
+    def read(self, data: mujoco.MjData, openings: Sequence[float]) -> Hands:
         """Both hands as a state has them, with the openings that are given."""
         hands = []
         for body, opening in zip(self.bodies, openings, strict=True):
             rotation = data.xmat[body].reshape(3, 3).copy()
             hands.append(Hand(data.xpos[body] + REACH * rotation[:, 0], rotation, float(opening)))
-        return hands
+        return hands[0], hands[1]
 
-    def forward(self, joints: Array, openings: Sequence[float]) -> list[Hand]:
+    def forward(self, joints: Array, openings: Sequence[float]) -> Hands:
         """Both hands at joint angles [2, 6] in radians."""
         self.data.qpos[self.qpos] = joints
         mujoco.mj_kinematics(self.model, self.data)

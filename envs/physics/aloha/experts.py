@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from envs.physics.aloha.arms import ArmKinematics, Array, Hand, facing
+from envs.physics.aloha.arms import ArmKinematics, Array, Hand, Hands, facing
 from envs.physics.aloha.scripts import Script, Sight
 from envs.physics.suite import check_noise_level
 
 SPEED = 0.35  # m/s that fingertips move at most
 TURN_SPEED = 2.5  # rad/s
+BIAS = 0.01  # m, standard deviation of where things are believed to be, at noise 1
+DRIFT = 0.01  # m, of the slowly varying offset of each hand, at noise 1
 _ARRIVED = (0.004, 0.05)  # m and rad from a goal at which a phase's time begins to run
 _WAYPOINT = 1.0  # s of a random way-point
 
@@ -27,7 +29,7 @@ class NoisyScript:
     Args:
         script: of the task.
         arms: kinematics.
-        sight: () -> what is to be seen now.
+        look: () -> poses [n, 7] of the things, and both hands, as they are now.
         command: [14], the joint command in force.
         noise_level: 0 is the script itself, 1 pays no heed to the task.
         rng: of the noise.
@@ -41,27 +43,27 @@ class NoisyScript:
         self,
         script: Script,
         arms: ArmKinematics,
-        sight: Callable[[], Sight],
+        look: Callable[[], tuple[Array, Hands]],
         command: Array,
         noise_level: float,
         rng: np.random.Generator,
         period: float,
     ):
         check_noise_level(noise_level)
-        self.script, self.arms, self.sight = script, arms, sight
+        self.script, self.arms, self.look = script, arms, look
         self.noise_level, self.rng, self.period = noise_level, rng, period
         self.joints = command.reshape(2, 7)[:, :6].copy()
-        self.hands: Sequence[Hand] = arms.forward(self.joints, command.reshape(2, 7)[:, 6])
+        self.hands: Hands = arms.forward(self.joints, command.reshape(2, 7)[:, 6])
         self.phase, self.waited = 0, 0.0
         self.keep = 0.8 ** (period / 0.1)
         self.start = 0.1 * noise_level**2 * period / 0.1  # chance that way-points interrupt, per action
-        self.bias = rng.normal(0.0, 0.02 * noise_level, (2, 2))  # m, of the things' places on the table
+        self.bias = rng.normal(0.0, BIAS * noise_level, (2, 2))  # m, of the things' places on the table
         self.drift = np.zeros((2, 3))
-        self.left, self.waypoints = 0, tuple(self.hands)
+        self.left, self.waypoints = 0, self.hands
 
     def __call__(self) -> Array:
         """The next joint command [14]."""
-        sight = self.sight()
+        sight = Sight(*self.look(), self.hands)
         if self.left == 0 and (self.noise_level >= 1.0 or self.rng.random() < self.start):
             self.left = max(1, round(_WAYPOINT / self.period))
             self.waypoints = self._wander(sight)
@@ -70,11 +72,12 @@ class NoisyScript:
             goals = self.waypoints
         else:
             goals = self._follow(sight)
-        self.hands = [
+        left, right = (
             _towards(hand, goal, SPEED * self.period, TURN_SPEED * self.period)
             for hand, goal in zip(self.hands, goals, strict=True)
-        ]
-        scale = 0.02 * self.noise_level * np.sqrt(1 - self.keep**2)
+        )
+        self.hands = (left, right)
+        scale = DRIFT * self.noise_level * np.sqrt(1 - self.keep**2)
         self.drift = self.keep * self.drift + self.rng.normal(0.0, scale, (2, 3))
         bent = [
             replace(hand, position=hand.position + off)
@@ -84,7 +87,7 @@ class NoisyScript:
         openings = [[hand.opening] for hand in self.hands]
         return np.concatenate((self.joints, openings), 1).flatten()
 
-    def _follow(self, sight: Sight) -> tuple[Hand, Hand]:
+    def _follow(self, sight: Sight) -> Hands:
         """The script's goals, after going on to its next phase if this one's time is over."""
         things = sight.objects.copy()
         things[:, :2] += self.bias[: len(things)]
@@ -100,7 +103,7 @@ class NoisyScript:
             goals = self.script.goals(self.phase, sight)
         return goals
 
-    def _wander(self, sight: Sight) -> tuple[Hand, Hand]:
+    def _wander(self, sight: Sight) -> Hands:
         """A random goal for each hand, about the things."""
         goals = []
         for side in range(2):

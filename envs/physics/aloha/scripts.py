@@ -7,13 +7,14 @@ slips or is knocked over is picked up again.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from envs.physics.aloha.arms import Array, Hand, facing
+from envs.physics.aloha.arms import Array, Hand, Hands, facing
 
+PUSH = 0.096
 PITCH = 0.8  # rad by which hands look down when they pick things up
 OPEN, CLOSED = 1.0, 0.0
 _CLEAR = np.array([0.0, 0.0, 0.007])  # m above the peg's middle at which fingers do not rub on the table
@@ -27,10 +28,12 @@ class Sight:
     Args:
         objects: [n, 7] position in metres and quaternion (w first) of each thing.
         hands: the left and the right one, as they are.
+        aims: where they are sent now, which is a little ahead of where they are.
     """
 
     objects: Array
-    hands: tuple[Hand, Hand]
+    hands: Hands
+    aims: Hands
 
 
 class Script(ABC):
@@ -43,7 +46,7 @@ class Script(ABC):
     phases: tuple[float, ...]
 
     @abstractmethod
-    def goals(self, phase: int, sight: Sight) -> tuple[Hand, Hand]:
+    def goals(self, phase: int, sight: Sight) -> Hands:
         """Where the left and the right hand should be."""
 
     @abstractmethod
@@ -57,7 +60,7 @@ class TransferCube(Script):
     #         over  down  grip  lift  meet  take  yield part
     phases = (0.10, 0.20, 0.30, 0.20, 0.20, 0.40, 0.30, 0.20)
 
-    def goals(self, phase: int, sight: Sight) -> tuple[Hand, Hand]:
+    def goals(self, phase: int, sight: Sight) -> Hands:
         """See Script."""
         cube = sight.objects[0, :3]
         turn = facing(0, 0.0, roll=np.pi / 2)
@@ -65,10 +68,11 @@ class TransferCube(Script):
             left = Hand(MEETING - (0.13, 0.0, 0.0), turn, OPEN)
         else:
             left = Hand(cube + (0.005, 0.0, 0.0), turn, OPEN if phase == 4 else CLOSED)
-        if phase < 3:
+        if phase < 2:
             above = (0.0, 0.0, 0.10 if phase == 0 else 0.0)
-            upright = facing(1, PITCH, _quarter(sight.objects[0]))
-            right = Hand(cube + above, upright, CLOSED if phase == 2 else OPEN)
+            right = Hand(cube + above, facing(1, PITCH, _quarter(sight.objects[0])), OPEN)
+        elif phase == 2:
+            right = replace(sight.aims[1], opening=CLOSED)
         elif phase < 7:
             right = Hand(MEETING, facing(1, PITCH), OPEN if phase == 6 else CLOSED)
         else:
@@ -76,9 +80,8 @@ class TransferCube(Script):
         return left, right
 
     def lost(self, phase: int, sight: Sight) -> bool:
-        """Whether the cube is too low for hands that should hold it in the air."""
-        holder = sight.hands[0 if phase > 5 else 1]
-        return phase > 2 and _apart(holder, sight.objects[0])
+        """Whether the cube is not where the hand is that goes for it or holds it."""
+        return phase > 0 and _away(sight.hands[0 if phase > 5 else 1], sight.objects[0], phase > 1)
 
 
 class Insertion(Script):
@@ -87,24 +90,25 @@ class Insertion(Script):
     #         over  down  grip  lift  align push
     phases = (0.20, 0.40, 0.70, 0.30, 0.40, 0.20)
 
-    def goals(self, phase: int, sight: Sight) -> tuple[Hand, Hand]:
+    def goals(self, phase: int, sight: Sight) -> Hands:
         """See Script."""
         peg, socket = sight.objects[:, :3]
-        if phase < 3:
+        if phase < 2:
             above = np.array([0.0, 0.0, 0.10 if phase == 0 else 0.0])
-            opening = CLOSED if phase == 2 else OPEN
-            left = Hand(socket + above, facing(0, PITCH, _yaw(sight.objects[1])), opening)
-            right = Hand(peg + above + _CLEAR, facing(1, PITCH, _yaw(sight.objects[0])), opening)
-            return left, right
+            left = Hand(socket + above, facing(0, PITCH, _yaw(sight.objects[1])), OPEN)
+            return left, Hand(peg + above + _CLEAR, facing(1, PITCH, _yaw(sight.objects[0])), OPEN)
+        if phase == 2:
+            left, right = sight.aims
+            return replace(left, opening=CLOSED), replace(right, opening=CLOSED)
         left = Hand(MEETING - (0.075, 0.0, 0.0), facing(0, PITCH), CLOSED)
         if phase == 3:
             return left, Hand(MEETING + (0.075, 0.0, 0.0), facing(1, PITCH), CLOSED)
-        return left, _bring(sight, 0.15 if phase == 4 else 0.09)
+        return left, _bring(sight, 0.15 if phase == 4 else PUSH)
 
     def lost(self, phase: int, sight: Sight) -> bool:
-        """Whether peg or socket is too low for hands that should hold it in the air."""
-        left, right = sight.hands
-        return phase > 2 and (_apart(right, sight.objects[0]) or _apart(left, sight.objects[1]))
+        """Whether peg or socket is not where its hand is."""
+        pairs = zip(reversed(sight.hands), sight.objects, strict=True)
+        return phase > 0 and any(_away(hand, thing, phase > 1) for hand, thing in pairs)
 
 
 def _bring(sight: Sight, ahead: float) -> Hand:
@@ -113,16 +117,17 @@ def _bring(sight: Sight, ahead: float) -> Hand:
     """
     hand, (peg, socket) = sight.hands[1], sight.objects
     hole, axis = (_rotation(pose).as_matrix()[:, 0] for pose in (socket, peg))
-    hole *= np.sign(hole[0])
-    axis *= np.sign(axis @ hole)
+    hole = hole if hole[0] > 0 else -hole
+    axis = axis if axis @ hole > 0 else -axis
     turn, _ = Rotation.align_vectors(hole[None], axis[None])
     position = socket[:3] + ahead * hole + turn.apply(hand.position - peg[:3])
     return Hand(position, (turn * Rotation.from_matrix(hand.rotation)).as_matrix(), CLOSED)
 
 
-def _apart(hand: Hand, thing: Array) -> bool:
-    """Whether a thing is too low to be in the hand."""
-    return bool(hand.position[2] - thing[2] > 0.04)
+def _away(hand: Hand, thing: Array, level: bool) -> bool:
+    """Whether a hand is not over a thing, or, when it should be `level` with it, not around it."""
+    apart = np.abs(hand.position - thing[:3])
+    return bool(np.hypot(*apart[:2]) > 0.05 or (level and apart[2] > 0.04))
 
 
 def _yaw(pose: Array) -> float:

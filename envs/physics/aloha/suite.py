@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.embodiment import ActionKind, Arm, Camera, Embodiment
-from envs.physics.aloha.arms import JOINTS, SIDES, ArmKinematics, Array
+from envs.physics.aloha.arms import JOINTS, SIDES, ArmKinematics, Array, Hands
 from envs.physics.aloha.experts import NoisyScript
-from envs.physics.aloha.scripts import Insertion, Script, Sight, TransferCube
+from envs.physics.aloha.scripts import Insertion, Script, TransferCube
 from envs.physics.render import calibration, offscreen_for
 from envs.physics.suite import (
     Expert,
@@ -161,7 +161,7 @@ class Aloha(TaskSuite):
         """The task's script for both hands, bent by noise; see NoisyScript."""
         bench = self._bench
         script, period = _SCRIPTS[self._task](), 1 / self.embodiment.fps
-        return NoisyScript(script, bench.arms, bench.sight, bench.command, noise_level, rng, period)
+        return NoisyScript(script, bench.arms, bench.look, bench.command, noise_level, rng, period)
 
     def _render(self, size: tuple[int, int], shadows: bool) -> NDArray[np.uint8]:
         offscreen = offscreen_for(f"aloha/{self._task}", self._bench.model, size)
@@ -217,10 +217,9 @@ class _Bench:
         poses: Array = self._task.get_env_state(self._physics)
         return poses.reshape(-1, 7)
 
-    def sight(self) -> Sight:
-        """What scripts see."""
-        left, right = self.arms.read(self.data, self.state()[6::7])
-        return Sight(self.objects(), (left, right))
+    def look(self) -> tuple[Array, Hands]:
+        """Things and hands as they are."""
+        return self.objects(), self.arms.read(self.data, self.state()[6::7])
 
 
 def _wrist(camera: str) -> str | None:
