@@ -4,7 +4,7 @@ squares.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -17,7 +17,7 @@ SIDES = ("left", "right")  # in the order of actions and states
 JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
 REACH = 0.142  # m from a gripper's body ahead to the point between its fingertips
 _HEADING = (0.0, np.pi)  # rad about the vertical at which each hand looks over the table at the other
-_DAMPING = 1e-4
+_DAMPING = 1e-3
 _STEP_LIMIT = 0.35  # rad per iteration and joint
 
 
@@ -69,7 +69,7 @@ class ArmKinematics:
         self.high = np.array([[joint.range[1] for joint in arm] for arm in joints])
         self._jac = np.zeros((6, model.nv))
 
-    def read(self, data: mujoco.MjData, openings: Sequence[float]) -> Hands:
+    def read(self, data: mujoco.MjData, openings: Iterable[float]) -> Hands:
         """Both hands as a state has them, with the openings that are given."""
         hands = []
         for body, opening in zip(self.bodies, openings, strict=True):
@@ -77,14 +77,14 @@ class ArmKinematics:
             hands.append(Hand(data.xpos[body] + REACH * rotation[:, 0], rotation, float(opening)))
         return hands[0], hands[1]
 
-    def forward(self, joints: Array, openings: Sequence[float]) -> Hands:
+    def forward(self, joints: Array, openings: Iterable[float]) -> Hands:
         """Both hands at joint angles [2, 6] in radians."""
         self.data.qpos[self.qpos] = joints
         mujoco.mj_kinematics(self.model, self.data)
         return self.read(self.data, openings)
 
     def solve(
-        self, hands: Sequence[Hand], start: Array, iterations: int = 15, tolerance: float = 5e-4
+        self, hands: Sequence[Hand], start: Array, reach: float, iterations: int = 15, tolerance: float = 5e-4
     ) -> Array:
         """Joint angles [2, 6] in radians at which both hands stand as they should.
 
@@ -92,10 +92,12 @@ class ArmKinematics:
             hands: the left and the right one; where none can be, the joints of the nearest place within
                 limits are returned.
             start: joint angles [2, 6] to begin at.
+            reach: rad that each joint may be moved from there.
             iterations: upper bound.
             tolerance: in metres and radians, at which the search ends.
         """
         joints = np.array(start)
+        low, high = np.maximum(self.low, start - reach), np.minimum(self.high, start + reach)
         for _ in range(iterations):
             self.data.qpos[self.qpos] = joints
             mujoco.mj_kinematics(self.model, self.data)
@@ -106,13 +108,11 @@ class ArmKinematics:
                 error = np.concatenate((hand.position - now.position, turn))
                 worst = max(worst, float(np.abs(error).max()))
                 point = now.position[:, None]
-                mujoco.mj_jac(
-                    self.model, self.data, self._jac[:3], self._jac[3:], point, self.bodies[k]
-                )
+                mujoco.mj_jac(self.model, self.data, self._jac[:3], self._jac[3:], point, self.bodies[k])
                 jac = self._jac[:, self.dofs[k]]
                 step = jac.T @ np.linalg.solve(jac @ jac.T + _DAMPING * np.eye(6), error)
                 step = np.clip(step, -_STEP_LIMIT, _STEP_LIMIT)
-                joints[k] = np.clip(joints[k] + step, self.low[k], self.high[k])
+                joints[k] = np.clip(joints[k] + step, low[k], high[k])
             if worst < tolerance:
                 break
         return joints

@@ -14,6 +14,7 @@ from envs.physics.suite import check_noise_level
 
 SPEED = 0.35  # m/s that fingertips move at most
 TURN_SPEED = 2.5  # rad/s
+JOINT_SPEED = 3.0  # rad/s that joints turn at most, such as when a wrist passes its singularity
 BIAS = 0.01  # m, standard deviation of where things are believed to be, at noise 1
 DRIFT = 0.01  # m, of the slowly varying offset of each hand, at noise 1
 _ARRIVED = (0.004, 0.05)  # m and rad from a goal at which a phase's time begins to run
@@ -83,7 +84,7 @@ class NoisyScript:
             replace(hand, position=hand.position + off)
             for hand, off in zip(self.hands, self.drift, strict=True)
         ]
-        self.joints = self.arms.solve(bent, self.joints)
+        self.joints = self.arms.solve(bent, self.joints, JOINT_SPEED * self.period)
         openings = [[hand.opening] for hand in self.hands]
         return np.concatenate((self.joints, openings), 1).flatten()
 

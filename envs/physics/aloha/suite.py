@@ -7,6 +7,8 @@ it is installed without its dependencies; `make setup` does.
 
 from __future__ import annotations
 
+import importlib
+import warnings
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 
 from envs.embodiment import ActionKind, Arm, Camera, Embodiment
 from envs.physics.aloha.arms import JOINTS, SIDES, ArmKinematics, Array, Hands
+from envs.physics.aloha.cameras import CAMERAS, load_model, wrist_of
 from envs.physics.aloha.experts import NoisyScript
 from envs.physics.aloha.scripts import Insertion, Script, TransferCube
 from envs.physics.render import calibration, offscreen_for
@@ -29,17 +32,8 @@ from envs.physics.suite import (
 from envs.ranges import NonNegative, Positive
 
 SIM_HZ = 50.0  # at which gym-aloha's own step takes actions
+MAX_SPEED = 4.0  # rad/s that a command may change by; much faster ones make the simulation unstable
 MAX_REWARD = 4  # of its rewards, which is success
-# Our names of the model's cameras. "vis" looks at the left hand from the front and turns with it.
-CAMERAS = {
-    "top": "top",
-    "angle": "angle",
-    "vis": "front_close",
-    "left_pillar": "left_pillar",
-    "right_pillar": "right_pillar",
-    "left_wrist": "left_wrist",
-    "right_wrist": "right_wrist",
-}
 _INSTRUCTIONS = {
     "transfer_cube": "pick up the red cube with the right arm and hand it to the left arm",
     "insertion": "pick up the red peg and the blue socket and insert the peg into the socket",
@@ -62,7 +56,7 @@ class Aloha(TaskSuite):
         control_hz: actions and frames per second, a divisor of SIM_HZ.
         hold: seconds that a task's full reward must hold.
         size: (height, width) of every picture.
-        cameras: names out of CAMERAS, in the views' order.
+        cameras: names out of cameras.CAMERAS, in the views' order.
         calibrated: whether intrinsics and camera poses are told.
 
     Raises:
@@ -80,7 +74,9 @@ class Aloha(TaskSuite):
         calibrated: bool,
     ):
         try:
-            import gym_aloha.tasks.sim
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # dm_control looks for a screen, which nothing here needs
+                importlib.import_module("gym_aloha.tasks.sim")
         except ImportError as error:
             raise SuiteError(f"task=aloha needs more packages ({error}): {INSTALL}") from error
         if SIM_HZ % control_hz:
@@ -103,7 +99,7 @@ class Aloha(TaskSuite):
                 for k, side in enumerate(SIDES)
             ),
             state_names=names,
-            cameras=tuple(Camera(name, size, _wrist(name), calibrated) for name in cameras),
+            cameras=tuple(Camera(name, size, wrist_of(name), calibrated) for name in cameras),
             fps=control_hz,
         )
 
@@ -117,7 +113,8 @@ class Aloha(TaskSuite):
         self.condition.reset()
 
     def step(self, action: Array) -> None:
-        """Go over to one command [14] in the course of a frame; what exceeds the joints' limits is cut.
+        """Go over to one command [14] in the course of a frame; what exceeds the joints' limits or speed is
+        cut.
 
         Raises:
             ValueError: if it is not finite or has another shape.
@@ -153,7 +150,7 @@ class Aloha(TaskSuite):
         )
 
     def privileged(self) -> dict[str, Array]:
-        """object_poses [14]: position in metres and quaternion of the cube and zeros, or of peg and socket."""
+        """object_poses [14]: metres and quaternion of the cube, then zeros, or of peg and socket."""
         poses = self._bench.objects().flatten()
         return {"object_poses": np.pad(poses, (0, 14 - len(poses)))}
 
@@ -173,24 +170,26 @@ class _Bench:
 
     def __init__(self, task: str):
         from dm_control import mujoco
+        from dm_control.rl.control import PhysicsError
         from gym_aloha import utils
         from gym_aloha.constants import ASSETS_DIR
         from gym_aloha.tasks import sim
 
-        self._sim = sim
+        self._sim, self._unstable = sim, PhysicsError
         self._draw: Any = {
             "transfer_cube": utils.sample_box_pose,
             "insertion": lambda seed: np.concatenate(utils.sample_insertion_pose(seed)),
         }[task]
         self._task: Any = {"transfer_cube": sim.TransferCubeTask, "insertion": sim.InsertionTask}[task]()
-        path = ASSETS_DIR / f"bimanual_viperx_{task}.xml"
-        self._physics = mujoco.Physics.from_xml_path(str(path))
-        self.model, self.data = self._physics.model.ptr, self._physics.data.ptr
-        self.model.vis.quality.offsamples = 0
+        self.model = load_model(str(ASSETS_DIR / f"bimanual_viperx_{task}.xml"))
+        self._physics = mujoco.Physics.from_model(mujoco.wrapper.MjModel(self.model))
+        self.data = self._physics.data.ptr
         self._substeps = round(1 / SIM_HZ / self.model.opt.timestep)
         self.arms = ArmKinematics(self.model)
         self._low = np.concatenate((self.arms.low, [[0.0], [0.0]]), 1).flatten()
         self._high = np.concatenate((self.arms.high, [[1.0], [1.0]]), 1).flatten()
+
+        self._speed = np.tile([MAX_SPEED] * len(JOINTS) + [np.inf], 2)
 
     def reset(self, seed: int) -> None:
         """Lay out the episode that gym-aloha draws from a seed, of which it takes 32 bits."""
@@ -201,10 +200,18 @@ class _Bench:
 
     def step(self, action: Array, periods: int) -> None:
         """Go over to a command [14] within a number of gym-aloha's control periods."""
-        before, self.command = self.command, np.clip(action, self._low, self._high)
-        for k in range(1, periods + 1):
-            self._task.before_step(before + (self.command - before) * (k / periods), self._physics)
-            self._physics.step(self._substeps)
+        before, joints = self.command, self._physics.data.qpos.copy()
+        stride = self._speed * periods / SIM_HZ
+        goal = np.clip(action, self._low, self._high)
+        self.command = np.clip(goal, before - stride, before + stride)
+        try:
+            for k in range(1, periods + 1):
+                self._task.before_step(before + (self.command - before) * (k / periods), self._physics)
+                self._physics.step(self._substeps)
+        except self._unstable:  # things stay where they were, at rest
+            with self._physics.reset_context():
+                self._physics.data.qpos[:] = joints
+            self.command = before
         self.reward = self._task.get_reward(self._physics)
 
     def state(self) -> Array:
@@ -220,8 +227,3 @@ class _Bench:
     def look(self) -> tuple[Array, Hands]:
         """Things and hands as they are."""
         return self.objects(), self.arms.read(self.data, self.state()[6::7])
-
-
-def _wrist(camera: str) -> str | None:
-    side, _, mount = camera.partition("_")
-    return side if mount == "wrist" else None
