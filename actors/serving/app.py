@@ -343,4 +343,6 @@ def serve(host: SessionHost, name: str, server: socket.socket) -> None:
         access_log=None,
         # a client may think for long between its steps, and is not gone because of that
         keepalive_timeout=host.config.idle_s,
+        # twice this is what a request may delay the end: a body that never comes, a client that never reads
+        shutdown_timeout=5.0,
     )

@@ -37,7 +37,8 @@ def clean_ending() -> Iterator[None]:
 @contextmanager
 def deferred_signals() -> Iterator[Callable[[], int]]:
     """Within, the first SIGINT or SIGTERM only sets what the yielded function returns, the signal's number;
-    a second one ends the process as it would elsewhere.
+    a second one ends the process as it would elsewhere. One that comes after the last call, as the last
+    checkpoint is written, ends the process on leaving.
 
     Outside the main thread, where Python handles no signals, it changes nothing.
     """
@@ -62,6 +63,8 @@ def deferred_signals() -> Iterator[Callable[[], int]]:
         yield lambda: asked
     finally:
         restore()
+    if asked:
+        leave(asked)
 
 
 def leave(number: int) -> NoReturn:

@@ -49,7 +49,12 @@ def serving(cfg: dict[str, Any]) -> None:
 def _running(host: SessionHost, config: ServeConfig) -> Iterator[str]:
     """The host behind HTTP, in a thread."""
     loop, ready = asyncio.new_event_loop(), threading.Event()
-    runner = web.AppRunner(Server(host, "bench").app(), access_log=None, keepalive_timeout=config.idle_s)
+    runner = web.AppRunner(
+        Server(host, "bench").app(),
+        access_log=None,
+        keepalive_timeout=config.idle_s,
+        shutdown_timeout=5.0,
+    )
     taken = listening(config)
 
     async def begin() -> None:

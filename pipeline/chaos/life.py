@@ -7,6 +7,7 @@ not spend an hour importing.
 from __future__ import annotations
 
 import atexit
+import faulthandler
 import multiprocessing
 import os
 import sys
@@ -47,6 +48,7 @@ def _live(words: list[str], mark: str, log: str, folder: str, full_after: int | 
     os.dup2(file, 2)
     # the server's streams are not this log
     sys.stdout, sys.stderr = os.fdopen(1, "w", buffering=1), os.fdopen(2, "w", buffering=1)
+    faulthandler.enable(sys.stderr)  # SIGABRT tells where a life that does not leave stands
     sys.argv = ["worldloop", *words]
     disk = nullcontext() if full_after is None else faulty_disk(Path(folder), full_after, "full")
     try:

@@ -120,6 +120,8 @@ class Soak:
         """Its exit status; everything that it started must be gone soon after."""
         process.join(within)
         if process.exitcode is None:
+            life.send(process, signal.SIGABRT)
+            process.join(10)
             process.kill()
             raise self._failure(f"it did not leave within {within:.0f} s")
         nothing_left(self.mark, process.pid, self._failure)

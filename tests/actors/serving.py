@@ -75,7 +75,7 @@ class Running:
         ready = threading.Event()
 
         async def begin() -> None:
-            self.runner = web.AppRunner(Server(host, "test").app(), access_log=None)
+            self.runner = web.AppRunner(Server(host, "test").app(), access_log=None, shutdown_timeout=2.0)
             await self.runner.setup()
             await web.TCPSite(self.runner, "127.0.0.1", self.port).start()
             ready.set()

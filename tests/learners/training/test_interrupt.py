@@ -36,6 +36,17 @@ def test_the_first_signal_waits_and_the_second_does_not(
         raise AssertionError("the second signal was swallowed")
 
 
+@pytest.mark.parametrize(("number", "end"), ENDS)
+def test_a_signal_after_the_last_question_is_answered_too(
+    number: signal.Signals, end: type[BaseException]
+) -> None:
+    with clean_ending(), pytest.raises(end):
+        with deferred_signals() as asked:
+            assert not asked()
+            os.kill(os.getpid(), number)
+        raise AssertionError("the signal was swallowed")
+
+
 @pytest.mark.parametrize("at", [3, 7])  # in the middle, between checkpoints, and in the last step
 @pytest.mark.parametrize(("number", "end"), ENDS)
 def test_an_interrupted_fit_goes_on_to_the_same_metrics_weights_and_result(
