@@ -5,8 +5,9 @@ BIN := $(VENV)/bin
 # Extra words for pip, such as an index with CPU builds of torch: make quickstart PIP_ARGS="--extra-index-url URL"
 PIP_ARGS ?=
 SEED ?= 0
+ALOHA := dm_control==1.0.41 gym-aloha==0.1.5
 
-.PHONY: setup gl test lint quickstart smoke controls clean
+.PHONY: setup aloha gl test lint quickstart smoke controls clean
 
 setup: gl $(VENV)/.ready
 
@@ -14,10 +15,16 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 10) else "Worldloop needs Python 3.10 or newer: make PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV) || { echo "python venv is missing: sudo apt-get install -y python3-venv"; exit 1; }
 	$(BIN)/python -m pip install --upgrade pip --quiet
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[dev,metaworld]"
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[dev,metaworld,aloha]"
 	# These two ask for an old numpy and an old mujoco, which nothing in them needs; their real needs are ours.
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps openpi-client==0.1.2 metaworld==3.1.1
+	# The third and fourth ask for a video encoder and a compiled maze, which we do not use.
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps openpi-client==0.1.2 metaworld==3.1.1 $(ALOHA)
 	touch $@
+
+# gym-aloha alone, for an environment that was set up without it.
+aloha:
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[aloha]"
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps $(ALOHA)
 
 # OpenGL in software, for rendering without a screen. Installed where we may, else the line to type is printed.
 gl:
