@@ -5,9 +5,10 @@ BIN := $(VENV)/bin
 # Extra words for pip, such as an index with CPU builds of torch: make quickstart PIP_ARGS="--extra-index-url URL"
 PIP_ARGS ?=
 SEED ?= 0
+METAWORLD := metaworld==3.1.1
 ALOHA := dm_control==1.0.41 gym-aloha==0.1.5
 
-.PHONY: setup aloha gl test lint quickstart smoke controls clean
+.PHONY: setup metaworld aloha gl test lint quickstart smoke controls clean
 
 setup: gl $(VENV)/.ready
 
@@ -18,10 +19,14 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[dev,metaworld,aloha]"
 	# These two ask for an old numpy and an old mujoco, which nothing in them needs; their real needs are ours.
 	# The third and fourth ask for a video encoder and a compiled maze, which we do not use.
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps openpi-client==0.1.2 metaworld==3.1.1 $(ALOHA)
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps openpi-client==0.1.2 $(METAWORLD) $(ALOHA)
 	touch $@
 
-# gym-aloha alone, for an environment that was set up without it.
+# One suite alone, for an environment that was set up without it.
+metaworld:
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[metaworld]"
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps $(METAWORLD)
+
 aloha:
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[aloha]"
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps $(ALOHA)
