@@ -25,7 +25,7 @@ class TaskSection:
     """Section task: a suite (physics), or recordings (data)."""
 
     suite: Choice | None
-    name: Name
+    name: Name | Annotated[Sequence[Name], MinLen(1)]
     size: tuple[Side, Side]
     chunk: Count
     horizon: Count

@@ -30,7 +30,7 @@ from envs.specs import (
 
 
 class PhysicsEnv(ChunkedEnv):
-    """A batch of true episodes of one task; rewards and success come from the suite.
+    """A batch of true episodes; rewards and success come from the suite.
 
     Args:
         pool: a slot per episode side by side, B of them, which this world then owns; the suite's cameras must

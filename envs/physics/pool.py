@@ -13,7 +13,7 @@ import os
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.physics.suite import task_names
 from envs.physics.worker import Track, Worker, WorkerSpec
 from envs.targets import ConfigError, to_plain
 
@@ -158,11 +159,11 @@ class _Remote:
 
 
 class TaskPool:
-    """`slots` episodes of one task over worker processes.
+    """`slots` episodes of a suite over worker processes.
 
     Args:
         suite: config section of the task suite.
-        task: a name of its tasks.
+        task: a name of its tasks, or several, which are played by turns; see task_of.
         slots: how many episodes run side by side.
         horizon: actions after which an episode is over.
         workers: processes; 0 means one per core, 1 runs in this process.
@@ -172,9 +173,11 @@ class TaskPool:
         PoolError: if a worker does not start.
     """
 
-    def __init__(self, suite: Mapping[str, Any], task: str, slots: int, horizon: int, workers: int):
+    def __init__(
+        self, suite: Mapping[str, Any], task: str | Sequence[str], slots: int, horizon: int, workers: int
+    ):
         self.slots, self.horizon = slots, horizon
-        spec = WorkerSpec(to_plain(suite), task, horizon)
+        spec = WorkerSpec(to_plain(suite), task_names(task), horizon)
         count = min(workers or available_cores(), slots)
         self.owner = [slot % count for slot in range(slots)]
         self.local = [slot // count for slot in range(slots)]

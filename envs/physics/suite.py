@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import difflib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -129,6 +129,16 @@ class HeldCondition:
         """Count one frame at which the condition was or was not satisfied."""
         self.count = self.count + 1 if satisfied else 0
         self.success = self.success or self.count >= self.frames
+
+
+def task_names(name: str | Sequence[str]) -> tuple[str, ...]:
+    """task.name of a config as a tuple: one name, or a list of them."""
+    return (name,) if isinstance(name, str) else tuple(name)
+
+
+def task_of(tasks: Sequence[str], seed: int) -> str:
+    """The task of an episode, where several are played by turns: consecutive seeds take consecutive tasks."""
+    return tasks[seed % len(tasks)]
 
 
 def check_task(task: str, tasks: Iterable[str]) -> None:

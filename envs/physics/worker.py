@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.suite import Array, Observation, TaskSuite, build_suite, check_task
+from envs.physics.suite import Array, Observation, TaskSuite, build_suite, check_task, task_of
 from envs.targets import ConfigError
 
 
@@ -70,12 +70,12 @@ class WorkerSpec:
 
     Args:
         suite: config section of the task suite, plain.
-        task: a name of the suite's tasks.
+        tasks: names of the suite's tasks, played by turns; see task_of.
         horizon: actions after which an episode is over.
     """
 
     suite: dict[str, Any]
-    task: str
+    tasks: tuple[str, ...]
     horizon: int
 
 
@@ -93,7 +93,7 @@ class Worker:
     """The work of one process; it runs in the caller's process where a pool has one worker.
 
     Args:
-        spec: of the suite and its task.
+        spec: of the suite and its tasks.
         slots: episodes side by side.
 
     Raises:
@@ -103,14 +103,15 @@ class Worker:
     def __init__(self, spec: WorkerSpec, slots: int):
         self.spec = spec
         self.slots = [Slot(build_suite(spec.suite)) for _ in range(slots)]
-        check_task(spec.task, self.slots[0].suite.tasks)
+        for task in spec.tasks:
+            check_task(task, self.slots[0].suite.tasks)
 
     def reset(self, seeds: dict[int, int], record: bool) -> dict[int, dict[str, Any]]:
         """Start episodes {slot: seed}; returns an observation per slot."""
         out = {}
         for index, seed in seeds.items():
             slot = self.slots[index]
-            slot.suite.reset(self.spec.task, seed)
+            self._lay_out(slot.suite, seed)
             slot.steps, slot.over, slot.track = 0, False, None
             observed = slot.suite.observe()
             if record:
@@ -146,7 +147,7 @@ class Worker:
         out = []
         suite = self.slots[0].suite
         for seed, noise_level in jobs:
-            suite.reset(self.spec.task, seed)
+            self._lay_out(suite, seed)
             act = suite.expert(noise_level, np.random.default_rng([seed, 1]))
             observed = suite.observe()
             track = Track(seed, observed.instruction, observed.intrinsic)
@@ -163,12 +164,15 @@ class Worker:
     def picture(self, seed: int, size: tuple[int, int]) -> NDArray[np.uint8]:
         """Pictures for people of an episode's start, uint8 [V, 3, H, W]."""
         suite = self.slots[0].suite
-        suite.reset(self.spec.task, seed)
+        self._lay_out(suite, seed)
         return suite.picture(size)
 
     def modules(self) -> list[str]:
         """Names of all modules that this process has imported."""
         return sorted(sys.modules)
+
+    def _lay_out(self, suite: TaskSuite, seed: int) -> None:
+        suite.reset(task_of(self.spec.tasks, seed), seed)
 
     def _answer(self, slot: Slot, observed: Observation) -> dict[str, Any]:
         answer = {

@@ -10,6 +10,7 @@ import atexit
 import faulthandler
 import multiprocessing
 import os
+import signal
 import sys
 from contextlib import nullcontext
 from multiprocessing.process import BaseProcess
@@ -48,6 +49,8 @@ def _live(words: list[str], mark: str, log: str, folder: str, full_after: int | 
     os.dup2(file, 2)
     # the server's streams are not this log
     sys.stdout, sys.stderr = os.fdopen(1, "w", buffering=1), os.fdopen(2, "w", buffering=1)
+    # shells start what runs in the background deaf to Ctrl-C
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     faulthandler.enable(sys.stderr)  # SIGABRT tells where a life that does not leave stands
     sys.argv = ["worldloop", *words]
     disk = nullcontext() if full_after is None else faulty_disk(Path(folder), full_after, "full")

@@ -9,7 +9,9 @@ from typing import Any
 import torch
 
 from envs.manifest import read_manifest
-from pipeline.evaluation.statistics import mcnemar, rate
+from envs.physics.suite import task_names
+from pipeline.evaluation.by_task import by_task, tasks_of_seeds
+from pipeline.evaluation.statistics import mcnemar, rate, rate_entry
 from pipeline.graph.stage import Inputs
 
 _ENTRY = ("successes", "episodes", "low", "high")
@@ -25,7 +27,8 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
     Returns:
         name, seed, simulator, algorithm, verdict; physics_before and physics_after (rate entries) with paired
         (McNemar), None without physics; imagined_before, imagined_after; judge, rollout, frames_per_second
-        (see the measure stage); rounds (gaps); episodes used and held out; seconds per stage; alarms.
+        (see the measure stage); tasks (the same rates by task, {} if there is one); rounds (gaps); episodes
+        used and held out; seconds per stage; alarms.
     """
     finished = manifests(inputs)
     imagined, measured = (result_of(inputs.folder(role)) for role in ("imagined", "measured"))
@@ -38,7 +41,7 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
     result: dict[str, Any] = {
         "name": cfg["name"],
         "seed": cfg["seed"],
-        "task": cfg["task"]["name"],
+        "task": ", ".join(task_names(cfg["task"]["name"])),
         "simulator": _class_name(cfg["simulator"]),
         "policy": _class_name(cfg["policy"]),
         "algorithm": cfg["algorithm"].get("name") or _class_name(cfg["algorithm"]),
@@ -48,6 +51,7 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         "judge": measured["judge"],
         "rollout": measured["rollout"],
         "frames_per_second": measured["frames_per_second"],
+        "tasks": _tasks(cfg, inputs, imagined),
         "rounds": [entry["result"] for name, entry in finished.items() if name.startswith("gap-")],
         "episodes_used": sum(entry["episodes"] - entry.get("held_out", 0) for entry in gathered),
         "episodes_held_out": sum(entry.get("held_out", 0) for entry in gathered),
@@ -72,10 +76,10 @@ def result_of(folder: Path) -> dict[str, Any]:
     return dict(manifest["result"])
 
 
-def outcomes(folder: Path) -> torch.Tensor:
-    """Success bool [N] of the evaluation seeds, as evaluate_physics left it."""
-    success: torch.Tensor = torch.load(folder / "outcomes.pt", weights_only=True)["success"]
-    return success
+def outcomes(folder: Path, what: str = "success") -> torch.Tensor:
+    """Success bool [N] of the evaluation seeds, as evaluate_physics left it; or "progress", or "seeds"."""
+    kept: torch.Tensor = torch.load(folder / "outcomes.pt", weights_only=True)[what]
+    return kept
 
 
 def verdict(result: Mapping[str, Any]) -> str:
@@ -128,6 +132,36 @@ def _physics(inputs: Inputs) -> dict[str, Any]:
         f"physics_{when}": {key: result_of(folder)[key] for key in _ENTRY} for when, folder in folders.items()
     }
     return {**entries, "paired": mcnemar(outcomes(folders["before"]), outcomes(folders["after"]))}
+
+
+def _tasks(cfg: Mapping[str, Any], inputs: Inputs, imagined: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """For each of several tasks: physics_before, physics_after and paired, None without physics;
+    imagined_before and imagined_after, absent where no imagined episode began in it.
+    """
+    shown = {f"imagined_{when}": imagined[when]["tasks"] for when in ("before", "after")}
+    names = sorted(set().union(*shown.values()))
+    true: dict[str, Mapping[str, Any]] = {}
+    if "physics_before" in inputs.found:
+        before, after = (inputs.folder(f"physics_{when}") for when in ("before", "after"))
+        tasks = tasks_of_seeds(cfg, outcomes(before, "seeds").tolist())
+        true = by_task(tasks, _pair, outcomes(before), outcomes(after))
+        names = sorted({*names, *true})
+    nothing = {"physics_before": None, "physics_after": None, "paired": None}
+    return {
+        name: {
+            **true.get(name, nothing),
+            **{when: entries[name] for when, entries in shown.items() if name in entries},
+        }
+        for name in names
+    }
+
+
+def _pair(before: torch.Tensor, after: torch.Tensor) -> dict[str, Any]:
+    return {
+        "physics_before": rate_entry(before),
+        "physics_after": rate_entry(after),
+        "paired": mcnemar(before, after),
+    }
 
 
 def _class_name(section: Mapping[str, Any]) -> str:

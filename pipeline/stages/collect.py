@@ -19,8 +19,10 @@ from envs.episodes.formats.lerobot_writer import LeRobotWriter
 from envs.episodes.splits import write_splits
 from envs.episodes.write_behind import WriteBehind
 from envs.files import write_text
+from envs.physics.suite import task_names
 from envs.physics.worker import Track
 from envs.targets import ConfigError
+from pipeline.evaluation.by_task import by_task, tasks_of_seeds
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.graph.code_version import digest
 from pipeline.graph.stage import Inputs, stage
@@ -81,9 +83,9 @@ def scripted_jobs(cfg: Cfg) -> list[tuple[int, float, str]]:
         raise ConfigError(f"collect.mix={section['mix']} must be whole percents that add up to 1")
     order = torch.randperm(100, generator=torch.Generator().manual_seed(0)).tolist()
     low, high = section["noise_level"]
-    jobs = []
+    turns, jobs = len(task_names(cfg["task"]["name"])), []
     for number, seed in enumerate(episode_seeds(cfg["seed"], Purpose.COLLECT, total)):
-        source = names[order[number % 100]]
+        source = names[order[number // turns % 100]]  # the same mix in each task
         drawn = low + (high - low) * ((number * 0.618) % 1.0)
         jobs.append((seed, {"expert": 0.0, "random": 1.0}.get(source, drawn), source))
     return jobs
@@ -112,6 +114,7 @@ def deploy(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         "episodes": len(success),
         "held_out": counts["held_out"],
         "true_stochastic": rate_entry(success),
+        "tasks": by_task(tasks_of_seeds(cfg, seeds), rate_entry, success),
         "success": float(success.float().mean()),
     }
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from actors.factory import (
     build_judge,
@@ -19,6 +20,7 @@ from actors.factory import (
 from actors.rollouts.evaluate import evaluate
 from envs.simulators.replay import replay
 from pipeline.evaluation import measurement
+from pipeline.evaluation.by_task import by_task, tasks_of_episodes, tasks_of_seeds
 from pipeline.evaluation.judging import episode_success, judge_table
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.graph.stage import Inputs, Place, stage
@@ -44,12 +46,11 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(mine)), mine)
     seeds = list(range(len(mine)))
     outcome = evaluate(world, policy, seeds, stochastic=True, label="gap", sampling_seed=cfg["seed"])
-    imagined = outcome.success[outcome.judged]
+    tasks = tasks_of_episodes(cfg, store, mine)
     result = {
         "round": number,
-        "true": rate_entry(truth),
-        "imagined": rate_entry(imagined),
-        "gap": float(imagined.float().mean() - truth.float().mean()),
+        **_gap(truth, outcome.success, outcome.judged),
+        "tasks": by_task(tasks, _gap, truth, outcome.success, outcome.judged),
     }
     held = store.split("held_out")
     held = held[torch.isin(held, store.select(["policy-*"]))]
@@ -72,10 +73,12 @@ def evaluate_physics(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         outcome = evaluate(env, policy, seeds, label="physics")
     finally:
         env.close()
-    torch.save({"success": outcome.success, "progress": outcome.progress}, folder / "outcomes.pt")
+    kept = {"success": outcome.success, "progress": outcome.progress, "seeds": torch.tensor(seeds)}
+    torch.save(kept, folder / "outcomes.pt")
     return {
         "rate": outcome.rate,
         **rate_entry(outcome.success),
+        "tasks": by_task(tasks_of_seeds(cfg, seeds), rate_entry, outcome.success),
         "progress": float(outcome.progress.mean()),
         "evaluation_seconds": time.perf_counter() - began,
     }
@@ -91,12 +94,31 @@ def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     others = torch.arange(len(store))
     starts = torch.cat((held, others[~torch.isin(others, held)]))[: cfg["evaluate"]["imagined"]]
     world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(starts)), starts)
+    tasks = tasks_of_episodes(cfg, store, starts)
     out: dict[str, Any] = {}
     for label in ("before", "after"):
         policy = build_policy(cfg, inputs.weights(label))
         outcome = evaluate(world, policy, list(range(len(starts))), label=f"imagined {label}")
-        out[label] = {**rate_entry(outcome.success[outcome.judged]), "dropped": int((~outcome.judged).sum())}
+        out[label] = {
+            **_imagined(outcome.success, outcome.judged),
+            "tasks": by_task(tasks, _imagined, outcome.success, outcome.judged),
+        }
     return out
+
+
+def _imagined(success: Tensor, judged: Tensor) -> dict[str, Any]:
+    """A rate entry of what the judge gave a verdict on, and how many it dropped."""
+    return {**rate_entry(success[judged]), "dropped": int((~judged).sum())}
+
+
+def _gap(truth: Tensor, success: Tensor, judged: Tensor) -> dict[str, Any]:
+    """True and imagined rates of the same starts, and how far they lie apart."""
+    imagined = success[judged]
+    return {
+        "true": rate_entry(truth),
+        "imagined": rate_entry(imagined),
+        "gap": float(imagined.float().mean() - truth.float().mean()),
+    }
 
 
 @stage(reads=(*WORLD, "measure"), place=Place.EVALUATOR)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from envs.targets import ConfigError
 from pipeline.config import load_config
+from pipeline.evaluation.by_task import tasks_of_seeds
 from pipeline.stages.collect import fingerprint, scripted_jobs, split_counts
 from pipeline.stages.seeds import Purpose, episode_seeds
 
@@ -35,6 +37,19 @@ def test_any_prefix_of_the_scripted_episodes_is_mixed() -> None:
     assert all(level == 0 for _, level, source in jobs if source == "expert")
     low, high = cfg["collect"]["noise_level"]
     assert all(low <= level <= high for _, level, source in jobs if source == "noisy")
+
+
+def test_every_task_of_several_has_the_same_mix() -> None:
+    cfg = load_config(["experiment=smoke", "task=metaworld", "task.name=[drawer-open-v3,door-open-v3]"])
+    cfg["collect"]["episodes"] = {"train": 200, "held_out": 0, "calibration": 0}
+    jobs = scripted_jobs(cfg)
+    mixes = [Counter(source for _, _, source in jobs[turn::2]) for turn in range(2)]
+    assert mixes[0] == mixes[1]
+    assert tasks_of_seeds(cfg, [seed for seed, _, _ in jobs[:3]]) == [
+        "drawer-open-v3",
+        "door-open-v3",
+        "drawer-open-v3",
+    ]
 
 
 def test_seeds_of_purposes_and_experiments_never_meet() -> None:

@@ -40,19 +40,18 @@ class Counting(TaskSuite):
     Args:
         fault: "raise", or "exit" to end the process, or "" for none.
         at_start: the same, when the suite is made.
+        tasks: its names.
     """
 
-    tasks = ("count",)
-
-    def __init__(self, fault: str, at_start: str = ""):
-        self.fault = fault
+    def __init__(self, fault: str, at_start: str = "", tasks: tuple[str, ...] = ("count",)):
+        self.fault, self.tasks = fault, tasks
         self.embodiment = Embodiment(
             "counter", ("a",), ActionKind.OTHER, False, (), ("n",), (Camera("eye", (4, 4)),), 10.0
         )
         _misbehave(at_start)
 
     def reset(self, task: str, seed: int) -> None:
-        self.count = float(seed)
+        self.task, self.count = task, float(seed)
 
     def step(self, action: Array) -> None:
         if action[0] > 1:
@@ -63,7 +62,7 @@ class Counting(TaskSuite):
         return np.full((1, 3, 4, 4), int(self.count) % 256, np.uint8)
 
     def observe(self) -> Observation:
-        return Observation(np.array([self.count]), np.zeros(1), "count", False, 0.0)
+        return Observation(np.array([self.count]), np.zeros(1), self.task, False, 0.0)
 
     def privileged(self) -> dict[str, Array]:
         return {"count": np.array(self.count)}

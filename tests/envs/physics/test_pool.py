@@ -21,6 +21,18 @@ def pool_of(slots: int, workers: int, **changes: Any) -> TaskPool:
     return TaskPool({**COUNTING, **changes}, "count", slots, 8, workers)
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_several_tasks_are_played_by_turns(workers: int) -> None:
+    pool = TaskPool({**COUNTING, "tasks": ["count", "recount"]}, ["recount", "count"], 3, 8, workers)
+    said = pool.reset({0: 4, 1: 5, 2: 6}, False)
+    assert [said[slot]["instruction"] for slot in range(3)] == ["recount", "count", "recount"]
+    tracks = pool.script([(7, 0.0), (8, 0.0)], 1)
+    assert [track.instruction for track in tracks] == ["count", "recount"]
+    pool.close()
+    with pytest.raises(ConfigError, match=r"recount.*unknown"):
+        TaskPool(COUNTING, ["count", "recount"], 2, 8, workers)
+
+
 def test_a_killed_worker_is_replaced_and_its_episodes_go_on() -> None:
     task = task_section("push")
     chunks, ends = {}, []

@@ -50,6 +50,7 @@ def result(**changes: Any) -> dict[str, Any]:
         "judge": {"expert": {"recorded": table, "generated": table}},
         "rollout": rows,
         "frames_per_second": {"batch 1": 30.0, "batch 32": 300.0},
+        "tasks": {},
         "rounds": [{"round": 1, "true": entry(40), "imagined": entry(44), "gap": 0.04, "replayed": table}],
         "episodes_used": 60,
         "episodes_held_out": 10,
@@ -95,6 +96,17 @@ def test_the_page_is_one_file_with_everything(inputs: Inputs) -> None:
     assert "tiny &lt;run&gt;" in page and "worldloop controls" in page and "lr: 0.1" in page
     assert "http" not in page.replace("http://www.w3.org", "").split("<h2>Config")[0]
     assert "2 judge" in page and "25.0%" in page
+
+
+def test_the_page_shows_tasks(inputs: Inputs) -> None:
+    whole = {f"physics_{when}": entry(n) for when, n in (("before", 10), ("after", 35))}
+    tasks = {
+        "open": {**whole, "paired": {"gained": 25, "lost": 0, "p": 1e-6}, "imagined_before": entry(77)},
+        "close": {"physics_before": None, "physics_after": None, "paired": None, "imagined_after": entry(88)},
+    }
+    page = build_report({}, inputs, {**result(tasks=tasks), "verdict": "gain"})
+    assert "Task by task" in page and "+25.0" in page and "77.0%" in page and "88.0%" in page
+    assert "Task by task" not in build_report({}, inputs, {**result(), "verdict": "gain"})
 
 
 def test_the_page_shows_controls_and_runs_without_physics(inputs: Inputs) -> None:

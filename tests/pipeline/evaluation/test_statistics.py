@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from pipeline.evaluation.by_task import by_task
 from pipeline.evaluation.quantiles import quantiles
 from pipeline.evaluation.statistics import confusion, mcnemar, rate_entry, wilson
 
@@ -33,3 +34,13 @@ def test_confusion_and_rates() -> None:
 def test_quantiles_leave_out_what_is_not_finite() -> None:
     assert quantiles(torch.tensor([1.0, 2.0, 3.0, float("nan")]))["median"] == 2.0
     assert quantiles(torch.zeros(0))["p90"] != quantiles(torch.zeros(0))["p90"]
+
+
+def test_figures_task_by_task() -> None:
+    won = torch.tensor([True, False, True, True])
+    parts = by_task(["b", "a", "b", "a"], rate_entry, won)
+    assert {name: (part["successes"], part["episodes"]) for name, part in parts.items()} == {
+        "a": (1, 2),
+        "b": (2, 2),
+    }
+    assert by_task(["a"] * 4, rate_entry, won) == {}
