@@ -28,7 +28,7 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
         ConfigError: for unknown keys or choices and values that cannot work, naming the nearest fix.
     """
     try:
-        cfg = _compose(overrides)
+        cfg = composed(overrides)
     except (HydraException, OmegaConfBaseException) as error:
         hint = _unknown_key(overrides)
         text = str(error).split("\nSee https")[0].split("\nfull_key")[0]
@@ -51,7 +51,8 @@ def choices(group: str) -> list[str]:
     return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
 
 
-def _compose(overrides: Sequence[str]) -> dict[str, Any]:
+def composed(overrides: Sequence[str]) -> dict[str, Any]:
+    """The resolved config, unchecked."""
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
         plain = OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
     assert isinstance(plain, dict)
@@ -62,7 +63,7 @@ def _unknown_key(overrides: Sequence[str]) -> str:
     """What to say of the first override whose key does not exist, "" if all do."""
     choices = [word for word in overrides if word.split("=")[0] in groups()]
     try:
-        base = _compose(choices)
+        base = composed(choices)
     except (HydraException, OmegaConfBaseException):
         return ""
     paths = list(_paths(base))

@@ -62,9 +62,11 @@ class TaskSuite(ABC):
     Attributes:
         tasks: names that `reset` takes.
         embodiment: the robot; camera sizes are those that `render` returns.
+        offers: what else its options choose from, such as scenes or cameras, by the option's name.
     """
 
     tasks: tuple[str, ...]
+    offers: Mapping[str, Sequence[str]] = {}
     embodiment: Embodiment
 
     @abstractmethod

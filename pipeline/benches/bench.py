@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 
 from envs.targets import ConfigError
-from pipeline.cli import without_given
+from pipeline.cli.words import without_given
 from pipeline.config import load_config
 
 # Where each benchmark is, and what it takes for granted unless the command line says otherwise.

@@ -17,7 +17,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from pipeline.chaos.faults import faulty_disk
-from pipeline.cli import main
+from pipeline.cli.main import main
 
 MARK = "WORLDLOOP_CHAOS"  # environment variable by which the children of a life are known
 OVERLOOKED = 99  # exit status of a command that ended well although it could not write

@@ -18,7 +18,8 @@ def worldloop(*words: str) -> subprocess.CompletedProcess[str]:
 def test_help_lists_the_commands_without_loading_torch() -> None:
     out = worldloop("--help")
     assert out.returncode == 0 and "doctor" in out.stdout and "controls" in out.stdout
-    code = "import sys, pipeline.cli as c; c._help(); assert not {'torch', 'ray', 'wandb'} & set(sys.modules)"
+    loaded = "assert not {'torch', 'ray', 'wandb'} & set(sys.modules)"
+    code = f"import sys; from pipeline.cli.main import _help; _help(); {loaded}"
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 
 
@@ -36,7 +37,7 @@ def test_mistakes_are_one_line() -> None:
 
 
 def test_every_command_explains_itself_at_once_and_starts_nothing() -> None:
-    from pipeline.cli import COMMANDS
+    from pipeline.cli.main import COMMANDS
 
     for name in ("run", "chaos", "convert"):
         out = worldloop(name, "--help")
@@ -57,3 +58,10 @@ def test_shells_complete_commands_and_choices() -> None:
     assert completed("worldloop", "run", "experiment", "=", "quickstart_") == ["quickstart_dit"]
     assert "bashcompinit" in worldloop("completion", "zsh").stdout
     assert "say which shell" in worldloop("completion", "fish").stderr
+
+
+def test_tasks_are_listed_with_what_can_be_chosen() -> None:
+    some, one = worldloop("tasks"), worldloop("tasks", "task=metaworld")
+    assert "task=push" in some.stdout and "hand_left" in some.stdout and "(50; " in some.stdout, some
+    assert "window-open-v3" in one.stdout and "task=push" not in one.stdout
+    assert "did you mean metaworld" in worldloop("tasks", "task=metawrld").stderr

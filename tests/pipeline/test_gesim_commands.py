@@ -10,9 +10,9 @@ import torch
 
 from actors.factory import ConfigError, build_simulator, build_state_decoder
 from envs.simulators.dit.network import DiTShape
-from pipeline import cli
 from pipeline.benches.gesim import FULL
 from pipeline.benches.gesim_floor import count_flops
+from pipeline.cli import tools
 from pipeline.commands.finetune import build_finetune
 from pipeline.commands.serving import build_session_host
 from pipeline.config import load_config
@@ -30,15 +30,15 @@ WORDS = [
 
 
 def test_convert_and_inspect(shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cli.convert([str(shared / "data/gesim_v2"), str(tmp_path / "out"), "frames=6", "size=[32,48]"])
-    cli.inspect([str(tmp_path / "out"), str(tmp_path / "pictures")])
+    tools.convert([str(shared / "data/gesim_v2"), str(tmp_path / "out"), "frames=6", "size=[32,48]"])
+    tools.inspect([str(tmp_path / "out"), str(tmp_path / "pictures")])
     assert "1 episodes" in capsys.readouterr().out and len(list((tmp_path / "pictures").glob("*.png"))) == 1
     with pytest.raises(ConfigError, match="worldloop convert SRC DST"):
-        cli.convert(["only-one"])
+        tools.convert(["only-one"])
 
 
 def test_finetune_a_checkpoint_and_serve_what_came_of_it(shared: Path, tmp_path: Path) -> None:
-    cli.convert([str(shared / "data/gesim_v2"), str(tmp_path / "data"), "frames=12", "size=[32,48]"])
+    tools.convert([str(shared / "data/gesim_v2"), str(tmp_path / "data"), "frames=12", "size=[32,48]"])
     checkpoint = write_checkpoint(tmp_path / "released")
     words = [
         *WORDS,

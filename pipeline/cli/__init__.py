@@ -1,0 +1,1 @@
+"""The command line; commands are functions of runs.py and tools.py."""

@@ -1,0 +1,81 @@
+"""The command line. Every command takes Hydra overrides: worldloop run experiment=quickstart seed=1.
+
+What a command needs is imported when it runs, so that help and mistakes answer at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+from envs.targets import nearest
+from pipeline.cli import runs, tools
+from pipeline.cli.words import Words
+
+COMMANDS: dict[str, Callable[[Words], None]] = {
+    command.__name__: command
+    for command in (
+        *(runs.run, runs.rl, runs.stage, runs.stages, runs.evaluate, runs.controls, runs.compare),
+        *(runs.finetune, tools.serve, tools.convert, tools.inspect, tools.bench, tools.verify),
+        *(tools.submit, tools.chaos, tools.tasks, tools.config, tools.doctor, tools.completion),
+    )
+}
+_ROOMS = ("envs", "actors", "learners", "pipeline")
+
+
+def _help() -> str:
+    lines = [
+        f"  {name:<10} {' '.join((command.__doc__ or '').split())}" for name, command in COMMANDS.items()
+    ]
+    return (
+        "worldloop <command> [key=value ...]\n\n"
+        + "\n".join(lines)
+        + "\n\nKeys are those of configs/; `worldloop config` prints them. `worldloop <command> --help` says"
+        " more of one, `worldloop --version` which this is."
+    )
+
+
+def _help_of(name: str) -> str:
+    words = " ".join((COMMANDS[name].__doc__ or "").split())
+    return (
+        f"worldloop {name} [key=value ...]\n\n{words}\n\n"
+        "Keys are those of configs/, as in experiment=smoke rl.lr=1e-4; `worldloop config` prints all with"
+        " their values."
+    )
+
+
+def _explained(error: Exception) -> bool:
+    """Whether an error's message is all that a user needs: the system's, and those that Worldloop defines."""
+    return isinstance(error, OSError) or type(error).__module__.split(".")[0] in _ROOMS
+
+
+def main() -> None:
+    """Entry point of `worldloop` and `python -m pipeline`."""
+    words = sys.argv[1:]
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(_help())
+        return
+    if words[0] in ("-V", "--version", "version"):
+        from importlib.metadata import version
+
+        print(f"worldloop {version('worldloop')}")
+        return
+    if words[0] not in COMMANDS:
+        print(f"no command {words[0]!r}{nearest(words[0], COMMANDS)}; worldloop --help", file=sys.stderr)
+        sys.exit(2)
+    if {"-h", "--help"} & set(words[1:]):
+        print(_help_of(words[0]))
+        return
+    from learners.training.interrupt import clean_ending
+
+    try:
+        with clean_ending():
+            COMMANDS[words[0]](words[1:])
+    except KeyboardInterrupt:
+        print("\ninterrupted; the same command goes on from the last checkpoint", file=sys.stderr)
+        sys.exit(130)
+    except Exception as error:
+        if not _explained(error):
+            raise
+        print(f"worldloop {words[0]}: {error}", file=sys.stderr)
+        sys.exit(1)

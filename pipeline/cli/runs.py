@@ -1,0 +1,134 @@
+"""Commands that learn, and that say what has been learned."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from envs.targets import ConfigError, nearest
+from pipeline.cli.words import Words, prepared, root_of
+
+
+def run(words: Words) -> None:
+    """run the whole loop of an experiment; finished stages are reused, interrupted ones resume"""
+    from pipeline.graph.owner import owning
+    from pipeline.loop import build_loop
+    from pipeline.track import tracking
+
+    cfg, root = prepared(words)
+    graph = build_loop(cfg, root)
+    print(f"{len(graph.nodes)} stages in {root}; each says how long it will take after its first steps")
+    with owning(root, "run"), tracking(cfg, root) as tracker:
+        manifests = graph.run(tracker=tracker)
+        result = json.loads((root / "result.json").read_text())
+        tracker.summarise(result)
+    minutes = sum(manifest["seconds"] for manifest in manifests.values()) / 60
+    print(f"\n{result['verdict']}\n{root}/report.html, {root}/result.json; {minutes:.1f} min of work")
+
+
+def rl(words: Words) -> None:
+    """the loop up to its last policy, on any launch: worldloop rl launch=ray launch.actors=4
+    experiment=quickstart
+    """
+    from pipeline.config import load_config
+    from pipeline.loop import last_round
+
+    last = f"rl-{last_round(load_config(words))}"
+    folder = _run_until(last, words)
+    print(f"\nthe policy lies in {folder}; worldloop evaluate policy={last} {' '.join(words)}")
+
+
+def stage(words: Words) -> None:
+    """run one stage and what it needs: worldloop stage simulator-1 experiment=quickstart"""
+    if not words or "=" in words[0]:
+        raise ConfigError(
+            "say which stage: worldloop stage imitation experiment=quickstart; `worldloop stages` lists them"
+        )
+    _run_until(words[0], words[1:])
+
+
+def stages(words: Words) -> None:
+    """list the stages of an experiment, their folders, which are finished, and why others will run again"""
+    from pipeline.config import load_config
+    from pipeline.loop import build_loop
+
+    cfg = load_config(words)
+    graph = build_loop(cfg, root_of(cfg))
+    for name in graph.nodes:
+        folder = graph.folder(name)
+        done = (folder / "manifest.json").exists()
+        mark = "done" if done else "half" if folder.exists() else "    "
+        print(f"{mark}  {name:<18} {folder}")
+        if why := graph.why(name):
+            print(f"      {why}")
+
+
+def evaluate(words: Words) -> None:
+    """success of a policy: worldloop evaluate policy=<stage|folder> world=physics|imagined experiment=...;
+    one that needs no weights is a choice of configs/policy: policy=openpi policy.url=ws://...
+    """
+    from pipeline.commands.evaluate import evaluate_policy
+    from pipeline.config import choices
+
+    own, rest = {"weights": "", "world": "physics"}, []
+    for word in words:
+        key, _, value = word.partition("=")
+        if key == "world":
+            own["world"] = value
+        elif key == "policy" and value not in choices("policy"):
+            own["weights"] = value
+        else:
+            rest.append(word)
+    cfg, root = prepared(rest)
+    print(evaluate_policy(cfg, root, **own))
+
+
+def controls(words: Words) -> None:
+    """whose gain is it: beside a finished run the loop without RL iterations, RL in physics, filtered BC"""
+    from pipeline.commands.controls import run_controls, table_text
+    from pipeline.graph.owner import owning
+    from pipeline.track import tracking
+
+    cfg, root = prepared(words)
+    with owning(root, "controls"), tracking(cfg, root) as tracker:
+        table = run_controls(cfg, root, tracker)
+    print(f"{table_text(table)}\n{root}/controls.json, {root}/report.html")
+
+
+def compare(words: Words) -> None:
+    """finished runs side by side as Markdown: worldloop compare runs/quickstart runs/quickstart_dit"""
+    from pipeline.evaluation.compare import compare as table
+
+    if not words:
+        raise ConfigError("say which runs: worldloop compare runs/quickstart runs/quickstart_dit")
+    print(table([Path(word) for word in words]))
+
+
+def finetune(words: Words) -> None:
+    """train a simulator on any LeRobot data: worldloop finetune simulator=gesim simulator.checkpoint=<folder>
+    finetune.data=[<folder>]
+    """
+    from pipeline.commands.finetune import build_finetune
+    from pipeline.graph.owner import owning
+    from pipeline.track import tracking
+
+    cfg, root = prepared(words)
+    graph = build_finetune(cfg, root)
+    with owning(root, "finetune"), tracking(cfg, root / "finetune") as tracker:
+        graph.run(tracker=tracker)
+    print(f"weights in {graph.folder('simulator')} and {graph.folder('state')}")
+
+
+def _run_until(name: str, words: Words) -> Path:
+    """Run a stage and what it needs; returns its folder."""
+    from pipeline.graph.owner import owning
+    from pipeline.loop import build_loop
+    from pipeline.track import tracking
+
+    cfg, root = prepared(words)
+    graph = build_loop(cfg, root)
+    if name not in graph.nodes:
+        raise ConfigError(f"no stage {name}{nearest(name, graph.nodes)}")
+    with owning(root, f"stage {name}"), tracking(cfg, root) as tracker:
+        graph.run(name, tracker)
+    return graph.folder(name)

@@ -1,0 +1,179 @@
+"""Commands around learning: servers, data, benches, clusters, and what there is on this machine."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from envs.targets import ConfigError
+from pipeline.cli.words import Words, prepared, without_given
+
+
+def serve(words: Words) -> None:
+    """serve a simulator to many sessions by GE-Sim's protocol: worldloop serve simulator=gesim
+    simulator.checkpoint=<folder>
+    """
+    from actors.serving.app import listening
+    from actors.serving.app import serve as run_server
+    from actors.serving.sessions import ServeConfig
+    from envs.targets import options
+    from pipeline.commands.serving import build_session_host
+
+    cfg, root = prepared(words)
+    config = options(ServeConfig, cfg["serve"], "serve")
+    with listening(config) as server:
+        host = build_session_host(cfg, root, config)
+        name, port = cfg["simulator"]["_target_"].rpartition(".")[2], server.getsockname()[1]
+        print(
+            f"{name} at http://{config.host}:{port}, up to {config.sessions} sessions; look at it in a"
+            " browser, end with Ctrl-C",
+            flush=True,
+        )
+        run_server(host, name, server)
+
+
+def convert(words: Words) -> None:
+    """GE-Sim, AgiBot or Bridge recordings to LeRobot v3.0, and LeRobot back to GE-Sim 2.0 bundles: worldloop
+    convert SRC DST [frames=N] [size=[H,W]]
+    """
+    from pipeline.commands.convert import convert as write
+
+    usage = "say from where to where: worldloop convert SRC DST [frames=N] [size=[H,W]]"
+    paths, cut, _ = _source_and_cut(words, usage)
+    print(f"{write(paths[0], paths[1], cut)} episodes in {paths[1]}")
+
+
+def inspect(words: Words) -> None:
+    """pictures of recordings with the commanded grippers drawn over them: worldloop inspect SRC DST
+    [frames=N] [tool_offset=0.15]
+    """
+    from envs.conditioning import PoseMapStyle
+    from pipeline.commands.convert import inspect as draw
+
+    usage = "say from where to where: worldloop inspect SRC DST [frames=N] [size=[H,W]] [tool_offset=0.15]"
+    paths, cut, own = _source_and_cut(words, usage)
+    style = PoseMapStyle(tool_offset=float(own.get("tool_offset", 0.15)))
+    for path in draw(paths[0], paths[1], cut, style):
+        print(path)
+
+
+def bench(words: Words) -> None:
+    """measure performance: worldloop bench
+    conditioning|physics|world|actors|learning|serving|gesim|overfit|pretrained
+    """
+    from pipeline.benches.bench import run_bench
+
+    run_bench(words)
+
+
+def verify(words: Words) -> None:
+    """see that every file of a run is what its stage left: worldloop verify runs/quickstart; or compare our
+    network with a public one's outputs: worldloop verify gesim FIXTURE.safetensors
+    """
+    from pipeline.commands.verify import verify_run
+
+    if len(words) == 1 and words[0] != "gesim":
+        print(verify_run(Path(words[0])))
+        return
+    if len(words) != 2 or words[0] != "gesim":
+        raise ConfigError("say what: worldloop verify runs/quickstart, or gesim FIXTURE.safetensors")
+    from envs.simulators.gesim.fixture import verify as errors_of
+
+    errors = errors_of(Path(words[1]))
+    for name, error in errors.items():
+        print(f"{name:<14} max abs error {error:.2e}")
+    if max(errors.values()) > 1e-5:
+        print("more than 1e-5: this is not the same network", file=sys.stderr)
+        sys.exit(1)
+
+
+def submit(words: Words) -> None:
+    """run a command on a Ray cluster: worldloop submit http://head:8265 rl launch=ray launch.actors=8"""
+    from pipeline.commands.submit import submit as send
+    from pipeline.config import load_config
+
+    if not words or not words[0].startswith("http"):
+        raise ConfigError(
+            "say where: worldloop submit http://head:8265 rl experiment=quickstart launch=ray launch.actors=8"
+        )
+    load_config([word for word in words[2:] if "=" in word])  # mistakes are better found here than there
+    send(words[0], words[1:])
+
+
+def chaos(words: Words) -> None:
+    """disturb a small run by a seeded schedule and check all that is promised: worldloop chaos
+    chaos.events=1000
+    """
+    from pipeline.chaos.fleet import ChaosFailure, run_chaos
+    from pipeline.chaos.soak import Soak
+    from pipeline.config import load_config
+
+    base = ("experiment=smoke", "algorithm=grpo", "launch=ray", "launch.judge_service=true", "launch.cpus=8")
+    fleet = [*without_given(base, words), *words]
+    cfg = load_config(fleet)
+    folder, section = Path(cfg["runs"]) / f"chaos-{cfg['seed']}", cfg["chaos"]
+    try:
+        if section["events"]:
+            soak = Soak(cfg, [*without_given(("experiment=soak",), words), *words], folder / "soak")
+            print(json.dumps(asdict(soak.run(section["events"])), indent=1))
+        if section["seconds"]:
+            print(json.dumps(run_chaos(cfg, fleet, folder / "fleet"), indent=1))
+    except ChaosFailure as error:
+        print(f"worldloop chaos: {error}", file=sys.stderr)
+        sys.exit(1)
+
+
+def tasks(words: Words) -> None:
+    """list what can be tried in physics: suites, robots, tasks, scenes; of one all: worldloop tasks
+    task=metaworld
+    """
+    from pipeline.commands.tasks import table
+
+    if len(words) > 1 or (words and not words[0].startswith("task=")):
+        raise ConfigError("say worldloop tasks, or worldloop tasks task=metaworld")
+    print(table(words[0].removeprefix("task=") if words else ""))
+
+
+def config(words: Words) -> None:
+    """print the resolved config"""
+    from omegaconf import OmegaConf
+
+    from pipeline.config import load_config
+
+    print(OmegaConf.to_yaml(OmegaConf.create(load_config(words))), end="")
+
+
+def doctor(words: Words) -> None:
+    """say what this machine has and what is missing"""
+    from pipeline.commands.doctor import examine
+
+    sys.exit(examine())
+
+
+def completion(words: Words) -> None:
+    """print what completes commands and choices in a shell: eval "$(worldloop completion bash)", or zsh"""
+    from pipeline.commands.completion import SHELLS, script
+
+    if len(words) != 1 or words[0] not in SHELLS:
+        raise ConfigError(f"say which shell: worldloop completion {'|'.join(SHELLS)}")
+    from pipeline.cli.main import COMMANDS
+
+    print(script(words[0], COMMANDS))
+
+
+def _source_and_cut(words: Words, usage: str) -> tuple[list[Path], Any, dict[str, str]]:
+    """Two paths, the Cut that frames= and size= ask for, and all options of convert and inspect."""
+    from envs.episodes.formats.foreign import Cut
+
+    paths = [Path(word) for word in words if "=" not in word]
+    own = {key: value for key, _, value in (word.partition("=") for word in words if "=" in word)}
+    if len(paths) != 2 or set(own) - {"frames", "size", "tool_offset"}:
+        raise ConfigError(usage)
+    try:
+        size = tuple(int(n) for n in own.get("size", "").strip("[]").split(",") if n)
+        return paths, Cut(int(own.get("frames", 0)), size), own
+    except ValueError as error:
+        raise ConfigError(f"{usage}: {error}") from error

@@ -1,0 +1,31 @@
+"""What the commands share: overrides, the run's folder, and a process made ready for work."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+Words = list[str]
+
+
+def without_given(base: Sequence[str], words: Sequence[str]) -> list[str]:
+    """Those overrides of `base` whose keys the words do not set themselves."""
+    given = {word.split("=")[0] for word in words}
+    return [word for word in base if word.split("=")[0] not in given]
+
+
+def root_of(cfg: dict[str, Any]) -> Path:
+    """The run's folder."""
+    return Path(cfg["runs"]) / cfg["name"]
+
+
+def prepared(words: Words) -> tuple[dict[str, Any], Path]:
+    """The config and the run's folder, with this process made ready for work."""
+    from actors.factory import device_of, prepare_process
+    from pipeline.config import load_config
+
+    cfg = load_config(words)
+    device_of(cfg)  # one that is not there is told before any work
+    prepare_process(cfg["seed"])
+    return cfg, root_of(cfg)
