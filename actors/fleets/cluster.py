@@ -154,6 +154,7 @@ def connect(launch: Mapping[str, Any]) -> list[Mapping[str, float]]:
             if launch["address"] == "local":
                 cpus = launch["cpus"] or None
                 store = int(launch["object_store_mb"]) * 2**20
+                reap_after_me()
                 ray.init(
                     address="local",
                     num_cpus=cpus,
@@ -163,7 +164,6 @@ def connect(launch: Mapping[str, Any]) -> list[Mapping[str, float]]:
                     log_to_driver=False,
                     configure_logging=False,
                 )
-                reap_after_me()
             else:
                 ray.init(address=launch["address"], log_to_driver=True, configure_logging=False)
         except Exception as error:

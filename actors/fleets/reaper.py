@@ -1,64 +1,77 @@
-"""Ends what a local Ray leaves running when the process that started it is killed.
+"""Ends what a local Ray leaves running when the process that started it ends, however early and however hard.
 
-Ray's own processes die with their driver, but two of its agents do not always notice. `reap_after_me` starts
-a small process that waits for this one's end and then ends the agents; after a clean exit it finds none.
+Ray's own processes die with their driver, but two of its agents do not always notice, least of all those of a
+Ray that was interrupted while it started. `reap_after_me` marks what this process starts from now on, and
+starts a small process that keeps in mind whatever descends from the marked, waits for this one's end, and
+then ends what is left; after a clean exit that is nothing.
 """
 
 from __future__ import annotations
 
 import os
+import select
 import signal
 import subprocess
 import sys
 import time
+import uuid
 from pathlib import Path
 
-
-def descendants(root: int) -> list[int]:
-    """Process ids of all descendants of a process (Linux; elsewhere none)."""
-    parents: dict[int, list[int]] = {}
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
-        except OSError:
-            continue  # it ended while we looked
-        parents.setdefault(parent, []).append(int(entry.name))
-    found, queue = [], [root]
-    while queue:
-        children = parents.get(queue.pop(), [])
-        found += children
-        queue += children
-    return found
+MARK = "WORLDLOOP_RAY_OF"  # environment variable by which they are known
+_EVERY = 1.0  # seconds between looks
 
 
 def reap_after_me() -> None:
-    """Let the Ray processes that descend from this one be ended when it ends, however that happens."""
-    mine = [pid for pid in descendants(os.getpid()) if "ray" in _command(pid)]
-    if mine:
+    """Let the Ray processes that this process starts from now on be ended when it ends, however that
+    happens.
+    """
+    if _REAPERS.get(os.getpid()) is None:
+        os.environ[MARK] = uuid.uuid4().hex
         # The pipe stays open as long as we live; nobody else holds its other end.
-        child = subprocess.Popen(
-            [sys.executable, "-S", __file__, *map(str, mine)], stdin=subprocess.PIPE, start_new_session=True
+        _REAPERS[os.getpid()] = subprocess.Popen(
+            [sys.executable, "-S", __file__], stdin=subprocess.PIPE, start_new_session=True
         )
-        _PIPES.append(child)
 
 
-_PIPES: list[subprocess.Popen[bytes]] = []
+_REAPERS: dict[int, subprocess.Popen[bytes]] = {}  # by the process that they wait for
 
 
-def _command(pid: int) -> str:
+def marked(mark: str) -> set[int]:
+    """Ids of living Ray processes with a mark and of those that descend from them (Linux; elsewhere none).
+
+    The agents write their names over their environment, so they are known by their parents alone.
+    """
+    wanted, found, parents = f"{MARK}={mark}".encode(), set(), {}
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            parents[int(entry.name)] = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
+            if wanted in (entry / "environ").read_bytes().split(b"\0") and _is_ray(int(entry.name)):
+                found.add(int(entry.name))
+        except OSError:
+            continue  # it ended while we looked, or is none of ours
+    while more := {pid for pid, parent in parents.items() if parent in found and pid not in found}:
+        found |= more
+    return found
+
+
+def _is_ray(pid: int) -> bool:
     try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        command = Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
-        return ""
+        return False
+    return command.startswith(b"ray::") or b"/ray/" in command
 
 
 def main() -> None:
-    """Wait until standard input closes, give Ray two seconds to end by itself, end what is left."""
+    """Look until standard input closes, give Ray two seconds to end by itself, end what is left."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    sys.stdin.buffer.read()
+    mark, known = os.environ[MARK], set()
+    while not select.select([sys.stdin], [], [], _EVERY)[0]:
+        known |= marked(mark)
+    known |= marked(mark)
     time.sleep(2)
-    for pid in map(int, sys.argv[1:]):
-        if "ray" in _command(pid):  # not another process that got its number
+    for pid in known | marked(mark):
+        if _is_ray(pid):  # not another process that got its number
             try:
                 os.kill(pid, signal.SIGKILL)
             except OSError:

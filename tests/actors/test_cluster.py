@@ -25,6 +25,7 @@ from actors.fleets.launch import build_fleet
 from actors.fleets.ray_fleet import RayFleet
 from actors.rollouts.host import Job, trained_weights
 from actors.rollouts.recipe import Recipe
+from pipeline.chaos.processes import belonging, nothing_left
 from pipeline.commands.submit import entrypoint
 from pipeline.config import load_config
 
@@ -71,6 +72,25 @@ def test_a_lost_node_costs_no_job(recipe: Recipe) -> None:
     finally:
         ray.shutdown()
         cluster.shutdown()
+
+
+def test_a_ray_that_is_killed_while_it_starts_leaves_nothing() -> None:
+    script = (
+        "from actors.fleets.cluster import connect; from pipeline.config import load_config;"
+        " connect(load_config(['experiment=smoke', 'launch=ray'])['launch'])"
+    )
+    command = subprocess.Popen(
+        [sys.executable, "-c", script],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 90
+    while not any("Agent" in line for line in belonging("", command.pid)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    command.kill()
+    command.wait()
+    nothing_left("", command.pid, AssertionError)
 
 
 def test_a_wrong_token_is_named() -> None:
