@@ -33,7 +33,10 @@ class Offscreen:
             # Asked for by name: mujoco.GLContext was chosen when somebody first imported mujoco, perhaps for
             # a window.
             backend = os.environ.get("MUJOCO_GL", "egl")
-            self._gl = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
+            gl_context = importlib.import_module(f"mujoco.{backend}").GLContext
+            # its destructor reads the field, which a constructor that a signal interrupts has not set
+            gl_context._context = None
+            self._gl = gl_context(width, height)
             self._gl.make_current()
             self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
         except Exception as error:
