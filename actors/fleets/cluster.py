@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import platform
+import signal
 import socket
-from collections.abc import Mapping
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -151,27 +154,49 @@ def connect(launch: Mapping[str, Any]) -> list[Mapping[str, float]]:
     if not ray.is_initialized():
         _knock(str(launch["address"]))
         try:
-            if launch["address"] == "local":
-                cpus = launch["cpus"] or None
-                store = int(launch["object_store_mb"]) * 2**20
-                reap_after_me()
-                ray.init(
-                    address="local",
-                    num_cpus=cpus,
-                    include_dashboard=False,
-                    object_store_memory=store,
-                    _node_ip_address="127.0.0.1",
-                    log_to_driver=False,
-                    configure_logging=False,
-                )
-            else:
-                ray.init(address=launch["address"], log_to_driver=True, configure_logging=False)
+            with _our_sigterm():
+                _start(launch)
         except Exception as error:
             raise ConfigError(_advice(str(launch["address"]), error)) from error
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     if launch["address"] != "local":
         _compare(len(nodes))
     return nodes
+
+
+def _start(launch: Mapping[str, Any]) -> None:
+    if launch["address"] != "local":
+        ray.init(address=launch["address"], log_to_driver=True, configure_logging=False)
+        return
+    reap_after_me()
+    ray.init(
+        address="local",
+        num_cpus=launch["cpus"] or None,
+        include_dashboard=False,
+        object_store_memory=int(launch["object_store_mb"]) * 2**20,
+        _node_ip_address="127.0.0.1",
+        log_to_driver=False,
+        configure_logging=False,
+    )
+
+
+@contextmanager
+def _our_sigterm() -> Iterator[None]:
+    """Within, Ray starts; it takes SIGTERM for itself, and would end a driver with status 15 where shells and
+    schedulers expect 143.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    except SystemExit as asked:
+        if asked.code == signal.SIGTERM:
+            raise SystemExit(128 + signal.SIGTERM) from None
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _knock(address: str) -> None:

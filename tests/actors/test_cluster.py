@@ -74,22 +74,34 @@ def test_a_lost_node_costs_no_job(recipe: Recipe) -> None:
         cluster.shutdown()
 
 
-def test_a_ray_that_is_killed_while_it_starts_leaves_nothing() -> None:
+@pytest.mark.parametrize(
+    ("when", "number", "status"),
+    [("starting", signal.SIGKILL, -9), ("starting", signal.SIGTERM, 143), ("up", signal.SIGTERM, 143)],
+)
+def test_an_ended_driver_leaves_no_ray_and_the_status_that_shells_expect(
+    when: str, number: int, status: int
+) -> None:
     script = (
-        "from actors.fleets.cluster import connect; from pipeline.config import load_config;"
-        " connect(load_config(['experiment=smoke', 'launch=ray'])['launch'])"
+        "import time; from learners.training.interrupt import clean_ending;"
+        " from actors.fleets.cluster import connect; from pipeline.config import load_config\n"
+        "with clean_ending():\n"
+        "    connect(load_config(['experiment=smoke', 'launch=ray'])['launch']); print('up', flush=True)\n"
+        "    time.sleep(100)"
     )
     command = subprocess.Popen(
         [sys.executable, "-c", script],
-        stdout=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
+    assert command.stdout is not None
+    if when == "up":
+        assert command.stdout.readline() == b"up\n"
     deadline = time.monotonic() + 90
     while not any("Agent" in line for line in belonging("", command.pid)) and time.monotonic() < deadline:
         time.sleep(0.05)
-    command.kill()
-    command.wait()
+    command.send_signal(number)
+    assert command.wait(60) == status
     nothing_left("", command.pid, AssertionError)
 
 
