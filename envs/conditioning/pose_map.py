@@ -24,6 +24,7 @@ _AXIS = 0.1  # m
 # (its right); further arms, of which GE-Sim has none, begin anew.
 AXIS_RGB = (((0, 0, 255), (255, 255, 0), (0, 255, 255)), ((255, 0, 255), (255, 0, 0), (0, 255, 0)))
 _COLOUR_MAPS = ("Greens", "Reds")
+_FRACTION = 4  # bits of a pixel's fraction that are drawn
 _REFERENCE_HEIGHT = 384  # the picture height for which radii and thickness are given
 
 
@@ -37,12 +38,15 @@ class PoseMapStyle:
             0.07)/0.73, 0, 1).
         cull_behind: leave out what lies behind the camera; the released code does not ask.
         scale: factor on radii and thickness; None scales them with the picture's height.
+        antialias: draw to a fraction of a pixel, with soft edges, instead of cutting positions and radii off to
+            whole pixels. In small pictures a whole pixel is more than what an action changes.
     """
 
     tool_offset: float = 0.15
     radius_law: Literal["released", "paper"] = "released"
     cull_behind: bool = False
     scale: Positive | None = None
+    antialias: bool = False
 
 
 @lru_cache(maxsize=1)
@@ -90,6 +94,9 @@ def render_pose_map(
     pixels, radii, shades, visible = layout(poses, c2w, intrinsic, size, style)
     scale = size[0] / _REFERENCE_HEIGHT if style.scale is None else style.scale
     thickness = max(1, round(8 * scale))
+    # OpenCV takes fractions as fixed point numbers, from the middle of the first pixel on.
+    edges, bits, middle = (cv2.LINE_AA, _FRACTION, 0.5) if style.antialias else (cv2.LINE_8, 0, 0.0)
+    pixels, radii = fixed_point(pixels - middle, bits), fixed_point(radii, bits)
     total = int(np.prod(lead)) * views * steps
     canvas = np.full((total, 3, *size), CANVAS, np.uint8)
     lut = arm_shades().tolist()
@@ -106,12 +113,18 @@ def render_pose_map(
             plane = planes[channel]
             for arm in arms:
                 shade = lut[arm % 2][flat_shades[n][arm]][channel]
-                circle(plane, points[arm][0], flat_radii[n][arm], shade, -1)
+                circle(plane, points[arm][0], flat_radii[n][arm], shade, -1, edges, bits)
             for arm in arms:
                 origin = points[arm][0]
                 for axis in range(3):
-                    line(plane, origin, points[arm][axis + 1], AXIS_RGB[arm % 2][axis][channel], thickness)
+                    colour = AXIS_RGB[arm % 2][axis][channel]
+                    line(plane, origin, points[arm][axis + 1], colour, thickness, edges, bits)
     return torch.from_numpy(canvas).reshape(*lead, views, steps, 3, *size)
+
+
+def fixed_point(values: np.ndarray, bits: int) -> np.ndarray:
+    """Pixels as OpenCV's drawing takes them: whole numbers of 2 ** -bits, cut off; int64 like values."""
+    return np.trunc(values * 2**bits).astype(np.int64)
 
 
 def layout(
@@ -120,8 +133,8 @@ def layout(
     """Where things are drawn; arguments as of `render_pose_map`.
 
     Returns:
-        Integer pixels [..., V, T, arms, 4, 2] of origin and axis tips, radii, shade indices and visibility
-        [..., V, T, arms].
+        Pixels float64 [..., V, T, arms, 4, 2] of origin and axis tips, the first pixel from 0 to 1; radii
+        float64, shade indices and visibility [..., V, T, arms].
     """
     height, width = size
     wrist = pose_transforms(poses.double())  # [..., T, arms, 4, 4]
@@ -137,17 +150,15 @@ def layout(
         (image[..., :2] / image[..., 2:])
         .nan_to_num(nan=-1e6, posinf=-1e6, neginf=-1e6)
         .clamp(-30000, 30000)
-        .trunc()
-        .long()
     )
-    at = pixels[..., 0, :]
+    at = pixels[..., 0, :].trunc()
     visible = (at[..., 0] >= 0) & (at[..., 0] < width) & (at[..., 1] >= 0) & (at[..., 1] < height)
     if style.cull_behind:
         visible &= depth[..., 0] > 0
     distance = (c2w.double()[..., None, :3, 3] - wrist[..., :3, 3].unsqueeze(-4)).norm(dim=-1)
     law = 1 - distance - 0.07 / 0.73 if style.radius_law == "released" else 1 - (distance - 0.07) / 0.73
     scale = height / _REFERENCE_HEIGHT if style.scale is None else style.scale
-    radii = (100 * scale * law.clamp(0, 1)).long()
+    radii = 100 * scale * law.clamp(0, 1)
     shades = (((poses.double()[..., 6] * 85 + 35) / 120) * 256).long().clamp(0, 255)
     shades = shades.unsqueeze(-3).expand(radii.shape)
     return pixels.numpy(), radii.numpy(), shades.numpy(), visible.numpy()

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from envs.conditioning import PoseMapStyle, render_pose_map, render_ray_map
-from envs.conditioning.pose_map import AXIS_RGB, CANVAS, arm_shades, layout
+from envs.conditioning.pose_map import AXIS_RGB, CANVAS, arm_shades, fixed_point, layout
 from pipeline.benches.timing import best
 
 _SIZE, _STEPS, _VIEWS = (384, 512), 10, 3
@@ -49,6 +49,7 @@ def scene() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 def plain_pose_map(poses: torch.Tensor, c2w: torch.Tensor, intrinsic: torch.Tensor) -> np.ndarray:
     """The same pictures uint8 [V * T, 3, H, W], drawn on interleaved canvases one after the other."""
     pixels, radii, shades, visible = layout(poses, c2w, intrinsic, _SIZE, PoseMapStyle())
+    pixels, radii = fixed_point(pixels, 0), fixed_point(radii, 0)
     lut, out = arm_shades(), []
     for v in range(len(intrinsic)):
         for t in range(len(poses)):
