@@ -38,8 +38,8 @@ class PoseMapStyle:
             0.07)/0.73, 0, 1).
         cull_behind: leave out what lies behind the camera; the released code does not ask.
         scale: factor on radii and thickness; None scales them with the picture's height.
-        antialias: draw to a fraction of a pixel, with soft edges, instead of cutting positions and radii off to
-            whole pixels. In small pictures a whole pixel is more than what an action changes.
+        antialias: draw to a fraction of a pixel, with soft edges, instead of cutting positions and radii off
+            to whole pixels. In small pictures a whole pixel is more than what an action changes.
     """
 
     tool_offset: float = 0.15
@@ -147,9 +147,7 @@ def layout(
     image = camera @ intrinsic.double()[..., :, None, None, :, :].transpose(-1, -2)
     depth = camera[..., 2]
     pixels = (
-        (image[..., :2] / image[..., 2:])
-        .nan_to_num(nan=-1e6, posinf=-1e6, neginf=-1e6)
-        .clamp(-30000, 30000)
+        (image[..., :2] / image[..., 2:]).nan_to_num(nan=-1e6, posinf=-1e6, neginf=-1e6).clamp(-30000, 30000)
     )
     at = pixels[..., 0, :].trunc()
     visible = (at[..., 0] >= 0) & (at[..., 0] < width) & (at[..., 1] >= 0) & (at[..., 1] < height)

@@ -84,6 +84,28 @@ def test_options_change_what_they_say() -> None:
     assert bool((render_pose_map(behind, c2w, intrinsic, (64, 64)) != 50).any())
 
 
+def test_soft_edges_say_where_a_gripper_is_to_a_fraction_of_a_pixel() -> None:
+    poses, c2w, intrinsic = scene(1)
+    soft, size = PoseMapStyle(antialias=True), (64, 64)
+
+    def drawn(shift: float, style: PoseMapStyle) -> torch.Tensor:
+        moved = poses.clone()
+        moved[..., 0] += shift
+        return render_pose_map(moved, c2w, intrinsic, size, style)
+
+    step = 1e-3  # m, a tenth of a pixel or so
+    assert len({drawn(k * step, PoseMapStyle()).numpy().tobytes() for k in range(4)}) < 4
+    assert len({drawn(k * step, soft).numpy().tobytes() for k in range(4)}) == 4
+    # Both draw the same thing, one of them cut off to whole pixels.
+    middles = []
+    for style in (PoseMapStyle(), soft):
+        mark = (drawn(0.0, style)[0, 0].float() - 50).abs().sum(0)
+        across = (mark.sum(0) * torch.arange(64)).sum() / mark.sum()
+        down = (mark.sum(1) * torch.arange(64)).sum() / mark.sum()
+        middles.append(torch.stack((across, down)))
+    assert float((middles[0] - middles[1]).abs().max()) < 1.0
+
+
 def test_bad_input_is_named() -> None:
     poses, c2w, intrinsic = scene()
     with pytest.raises(ValueError, match="arms, 7"):
