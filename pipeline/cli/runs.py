@@ -83,6 +83,26 @@ def evaluate(words: Words) -> None:
     print(evaluate_policy(cfg, root, **own))
 
 
+def trust(words: Words) -> None:
+    """how far a round's imagined world tells better actions from worse ones: worldloop trust round=1
+    [moments=160] [futures=8] [depth=3] experiment=...
+    """
+    from pipeline.commands.trust import trust as table
+
+    own, rest = {"round": 1, "moments": 160, "futures": 8, "depth": 3}, []
+    for word in words:
+        key, _, value = word.partition("=")
+        if key not in own:
+            rest.append(word)
+        elif not value.isdigit() or not int(value):
+            raise ConfigError(f"{word}: say a whole number above 0")
+        else:
+            own[key] = int(value)
+    cfg, root = prepared(rest)
+    number = own.pop("round")
+    print(table(cfg, root, number, **own))
+
+
 def controls(words: Words) -> None:
     """whose gain is it: beside a finished run the loop without RL iterations, RL in physics, filtered BC"""
     from pipeline.commands.controls import run_controls, table_text

@@ -1,0 +1,89 @@
+"""worldloop trust: how far a run's imagined world tells better actions from worse ones."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from actors.factory import (
+    build_judge,
+    build_physics,
+    build_policy,
+    build_simulator,
+    build_state_decoder,
+    build_world,
+)
+from actors.policies.safe import SafePolicyWrapper
+from envs.files import write_text
+from envs.initial_states import DecisionPoints
+from envs.targets import ConfigError
+from pipeline.evaluation.branches import agreement, branch
+from pipeline.loop import build_loop, has_physics
+from pipeline.stages.given import open_store
+
+_SIDE_BY_SIDE = 100  # true episodes
+
+
+def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures: int, depth: int) -> str:
+    """A table of correlations (see branches.agreement) for the world and the deployed policy of a round.
+
+    Args:
+        cfg: the resolved config.
+        root: the run's folder.
+        number: of the round; its simulator, state expert, judge, and the policy deployed in it are asked.
+        moments, futures: of held-out deployed episodes, and of each moment.
+        depth: chunks that are imagined.
+
+    Raises:
+        ConfigError: without physics, or if the run has not come so far.
+    """
+    if not has_physics(cfg):
+        raise ConfigError(
+            "this task is known from recordings alone, and nobody can try other actions in those"
+        )
+    graph = build_loop(cfg, root)
+    if f"gap-{number}" not in graph.nodes:
+        raise ConfigError(f"round={number}: the rounds of this run are 1 to {cfg['rounds']['count']}")
+    inputs = graph.inputs(f"gap-{number}")
+    store = open_store(cfg, inputs)
+    held = store.split("held_out")
+    held = held[torch.isin(held, store.select([f"policy-{number}"]))]
+    points = DecisionPoints(store, held)
+    whole = int(cfg["task"]["horizon"]) // int(cfg["task"]["chunk"])
+    some = (points.frame // int(cfg["task"]["chunk"]) <= whole - depth).nonzero().flatten()
+    order = torch.randperm(len(some), generator=torch.Generator().manual_seed(cfg["seed"]))
+    which = some[order[:moments]]
+    simulator = build_simulator(cfg, inputs.weights("simulator"))
+    decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
+    judge = build_judge(cfg, inputs.weights("judge"))
+    world = build_world(
+        *(cfg, simulator, decoder, judge, points, len(which) * futures),
+        horizon=depth * int(cfg["task"]["chunk"]),
+    )
+    physics = build_physics(cfg, min(_SIDE_BY_SIDE, len(which) * futures))
+    policy = SafePolicyWrapper(build_policy(cfg, inputs.weights("policy")), physics.spec, physics.mode)
+    torch.manual_seed(cfg["seed"])
+    try:
+        rows = agreement(branch(world, physics, policy, judge, which, futures), cfg["seed"])
+    finally:
+        physics.close()
+    write_text(root / f"trust-{number}.json", json.dumps({"moments": len(which), "depths": rows}, indent=1))
+    return _table(rows, len(which), futures)
+
+
+def _table(rows: list[dict[str, list[float]]], moments: int, futures: int) -> str:
+    """Markdown."""
+    lines = [
+        f"Correlations among {futures} futures of each of {moments} moments [95% interval]",
+        "",
+        "| chunks on | imagined frames with true | true frames with outcome | imagined with outcome |",
+        "| --- | --- | --- | --- |",
+    ]
+    for number, row in enumerate(rows, 1):
+        cells = [f"{value:.2f} [{low:.2f}, {high:.2f}]" for value, low, high in row.values()]
+        lines.append(f"| {number} | {' | '.join(cells)} |")
+    return "\n".join(lines)

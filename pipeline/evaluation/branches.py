@@ -1,0 +1,173 @@
+"""How much of what an action changes survives in imagination.
+
+From moments inside recorded episodes a policy draws several futures. Each is imagined, and carried out in
+physics: the episode is replayed from its seed by its recorded commands up to that moment, and goes on with
+the same chunks. Among the futures of one moment everything but the actions is equal, so what is compared is
+what reinforcement learning learns from; rates of success and errors of pixels say little of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+
+from actors.policies.safe import SafePolicyWrapper
+from envs.episodes.clips import ClipStore
+from envs.initial_states import DecisionPoints
+from envs.judges.base import Judge
+from envs.physics.env import PhysicsEnv
+from envs.specs import CHUNK, IMAGE, PROGRESS, SUCCESS, to_chunk
+
+_RESAMPLES = 400  # of the moments, for intervals
+
+
+@dataclass
+class Branches:
+    """Futures of N moments, G of each, by the number of chunks D since then; all float32.
+
+    imagined [D, N, G]: the judge's progress on generated frames; seen [D, N, G]: the same judge's on the true
+    frames of the same actions; outcome [N, G]: whether the true episode succeeded in the end, the policy
+    going on in physics after the D chunks.
+    """
+
+    imagined: Tensor
+    seen: Tensor
+    outcome: Tensor
+
+
+@torch.no_grad()
+def branch(
+    world: TransformedEnv,
+    physics: PhysicsEnv,
+    policy: SafePolicyWrapper,
+    judge: Judge,
+    which: Tensor,
+    futures: int,
+) -> Branches:
+    """Imagine and carry out `futures` futures of some moments.
+
+    Args:
+        world: imagined, of len(which) * futures slots that begin at DecisionPoints, D chunks long.
+        physics: of the episodes' own task; of any number of slots.
+        policy: whose stochastic chunks are tried.
+        judge: of the imagined world.
+        which: of the decision points, int64 [N], with at least D chunks of the task left.
+    """
+    points = world.base_env.starts
+    assert isinstance(points, DecisionPoints)
+    slots = which.repeat_interleave(futures)
+    with set_exploration_type(ExplorationType.RANDOM):
+        imagined, chunks = _imagine(world, policy, slots)
+        width = physics.batch_size[0]
+        parts = [
+            _carry_out(physics, policy, judge, points, some, made)
+            for some, made in zip(slots.split(width), chunks.split(width, 1), strict=True)
+        ]
+    seen, outcome = (torch.cat(values, -1) for values in zip(*parts, strict=True))
+    shape = (len(which), futures)
+    return Branches(imagined.unflatten(-1, shape), seen.unflatten(-1, shape), outcome.reshape(shape))
+
+
+def _imagine(world: EnvBase, policy: SafePolicyWrapper, slots: Tensor) -> tuple[Tensor, Tensor]:
+    """Progress [D, W] and the chunks [D, W, K, A] that led to it; a success stays one."""
+    base = world.base_env
+    base.schedule(slots.tolist())
+    now, progress, chunks = world.reset(), [], []
+    won = torch.zeros(len(slots), dtype=torch.bool)
+    for _ in range(base.horizon // base.chunk):
+        after = world.step(policy(now))
+        won |= after["next", SUCCESS].squeeze(-1).cpu()
+        progress.append(torch.where(won, 1.0, after["next", PROGRESS].squeeze(-1).cpu()))
+        chunks.append(after[CHUNK].cpu())
+        now = step_mdp(after)
+    return torch.stack(progress), torch.stack(chunks)
+
+
+def _carry_out(
+    physics: PhysicsEnv,
+    policy: SafePolicyWrapper,
+    judge: Judge,
+    points: DecisionPoints,
+    which: Tensor,
+    chunks: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Progress [D, W] as the judge sees it and outcome [W] of the decision points `which` [W], followed by
+    chunks [D, W, K, A].
+    """
+    store, count, depth = points.store, len(which), len(chunks)
+    which = torch.cat((which, which[-1:].expand(physics.batch_size[0] - count)))  # fills the batch
+    episode, moment = points.episode[which], points.frame[which]
+    seeds = [int(store.episodes[number]["seed"]) for number in episode.tolist()]
+    first = store.frames(store.start[episode])
+    texts = [store.instructions[number] for number in episode.tolist()]
+    seen = torch.full((depth, len(which)), torch.nan)
+    over = torch.zeros(len(which), dtype=torch.bool)
+    won = over.clone()
+    physics.schedule(seeds)
+    now = physics.reset()
+    for begin in range(0, physics.horizon, physics.chunk):
+        acted = policy(now)
+        chunk, since = acted[CHUNK].clone(), (begin - moment) // physics.chunk
+        chunk[since < 0] = _recorded(store, episode, begin, physics)[since < 0].to(chunk.device)
+        for number in range(depth):
+            mine = (since[:count] == number).nonzero().flatten()
+            chunk[mine] = chunks[number, mine].to(chunk.device)
+        acted[CHUNK] = chunk
+        after = physics.step(acted)
+        told = judge.score(after["next", IMAGE].unsqueeze(1), first, texts).progress[:, 0].cpu()
+        won |= ~over & after["next", SUCCESS].squeeze(-1)
+        told = torch.where(won, 1.0, told)
+        for number in range(depth):
+            at = since == number
+            seen[number, at] = told[at]
+        over |= after["next", "done"].squeeze(-1)
+        now = step_mdp(after)
+    return seen[:, :count], won[:count].float()
+
+
+def _recorded(store: ClipStore, episode: Tensor, begin: int, physics: PhysicsEnv) -> Tensor:
+    """The chunks [B, K, A] that episodes [B] record from frame `begin` on, in the world's mode."""
+    last, start = store.length[episode] - 1, store.start[episode]
+    commands = store.arrays["commands"]
+    ahead = begin + torch.arange(1, physics.chunk + 1)
+    rows = start[:, None] + torch.minimum(ahead[None], last[:, None])
+    in_force = commands[start + torch.minimum(torch.tensor(begin), last)]
+    return to_chunk(commands[rows], in_force, physics.mode)
+
+
+def agreement(branches: Branches, seed: int = 0) -> list[dict[str, list[float]]]:
+    """Correlations among the futures of one moment, by chunks since then.
+
+    Of each depth: "frames", imagined progress with what the judge makes of the true frames (what the
+    simulator loses); "judged", that with the outcome (what judge and chance lose); "imagined", imagined
+    progress with the outcome. Each [value, low, high], 95% by resampling moments.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    moments, out = len(branches.outcome), []
+    draws = torch.randint(moments, (_RESAMPLES, moments), generator=generator)
+    for imagined, seen in zip(branches.imagined, branches.seen, strict=True):
+        pairs = {
+            "frames": (imagined, seen),
+            "judged": (seen, branches.outcome),
+            "imagined": (imagined, branches.outcome),
+        }
+        out.append({name: _interval(*pair, draws) for name, pair in pairs.items()})
+    return out
+
+
+def _interval(one: Tensor, other: Tensor, draws: Tensor) -> list[float]:
+    """[value, low, high] of the correlation within rows of [N, G], by rows resampled as draws [R, N] say."""
+    one, other = (values - values.mean(1, keepdim=True) for values in (one, other))
+    sums = torch.stack([(one * other).sum(1), one.square().sum(1), other.square().sum(1)])  # [3, N]
+    some = sums[:, draws].sum(-1)  # [3, R]
+    value = _ratio(sums.sum(-1))
+    low, high = torch.quantile(_ratio(some), torch.tensor([0.025, 0.975]))
+    return [round(float(x), 3) for x in (value, low, high)]
+
+
+def _ratio(sums: Tensor) -> Tensor:
+    return sums[0] / (sums[1] * sums[2]).sqrt().clamp(min=1e-9)
