@@ -146,7 +146,6 @@ class Embodiment:
                 )
 
     # -- sizes
-    # -----------------------------------------------------------------------------------------------------
     @property
     def action_dim(self) -> int:
         """Numbers of an action, A."""
@@ -196,7 +195,6 @@ class Embodiment:
         return tuple(arm.gripper for arm in self.arms if arm.gripper is not None)
 
     # -- what it allows
-    # --------------------------------------------------------------------------------------------
     @property
     def calibrated(self) -> bool:
         """Whether every camera is calibrated: ray maps can be made."""
@@ -212,7 +210,6 @@ class Embodiment:
         return self.action_kind is ActionKind.JOINTS and self.kinematics is not None
 
     # -- LeRobot's info.json
-    # -----------------------------------------------------------------------------------------
     def to_info(self) -> dict[str, Any]:
         """What stands in features.action.info.worldloop: all that feature names and shapes do not say."""
         plain = asdict(self)

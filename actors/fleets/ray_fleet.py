@@ -139,7 +139,6 @@ class RayFleet:
         self._thread.start()
 
     # -- the learner's side
-    # --------------------------------------------------------------------------------------
     def publish(self, version: int, weights: Weights) -> dict[str, float]:
         """See Fleet.publish."""
         watch = Stopwatch()
@@ -215,7 +214,6 @@ class RayFleet:
         self._members.clear()
 
     # -- the supervisor's side
-    # -----------------------------------------------------------------------------------
     def _build(self) -> _Member:
         actor = self._actor_class.options(max_restarts=0, **self._resources).remote(self._recipe)
         self._count += 1

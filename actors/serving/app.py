@@ -103,7 +103,6 @@ class Server:
             raise ProtocolError(f"the body cannot be read: {error or type(error).__name__}") from error
 
     # -- JSON endpoints
-    # --------------------------------------------------------------------------------------------
     async def init(self, request: web.Request) -> web.Response:
         """Open a session."""
         body = parse(await self._body(request))
@@ -151,7 +150,6 @@ class Server:
         return json_answer(200, {"success": True})
 
     # -- binary endpoints
-    # ------------------------------------------------------------------------------------------
     async def set_episode_data(self, request: web.Request) -> web.Response:
         """The first frame; whatever came of an earlier one is forgotten."""
         picture, said = unpack(await self._body(request), 2)
@@ -244,7 +242,6 @@ class Server:
         return web.Response(body=answer, content_type="application/octet-stream")
 
     # -- to look at
-    # ------------------------------------------------------------------------------------------------
     async def healthz(self, request: web.Request) -> web.Response:
         """Whether it lives, how many sessions it holds, and that repeated steps are known apart."""
         return json_answer(200, {"status": "ok", "sessions": self.host.config.sessions, "repeatable": True})

@@ -152,7 +152,6 @@ class SessionHost:
         self._busy = threading.Lock()  # one forward pass at a time, whichever event loop asks
 
     # -- sessions
-    # ------------------------------------------------------------------------------------------------
     def open(self, user: str, seed: int | None) -> Session:
         """A new session.
 
@@ -204,7 +203,6 @@ class SessionHost:
             self.simulator.release(session.state, torch.ones(1, dtype=torch.bool))
 
     # -- steps
-    # ---------------------------------------------------------------------------------------------------
     async def step(
         self, session: Session, actions: NDArray[np.float32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None]:

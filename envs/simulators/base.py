@@ -57,7 +57,6 @@ class Simulator(nn.Module):
         return torch.device("cpu") if tensor is None else tensor.device
 
     # -- what an engine gives
-    # ----------------------------------------------------------------------------------------
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """Generate the frames of one chunk.
 
@@ -101,7 +100,6 @@ class Simulator(nn.Module):
         """The sessions of `mask` [B] end; what is held for them elsewhere can go. Here nothing is."""
 
     # -- the contract
-    # --------------------------------------------------------------------------------------------------
     def reset(self, first: TensorDict, seed: Tensor, capacity: int = 1) -> TensorDict:
         """Begin sessions from first frames.
 
