@@ -107,7 +107,7 @@ def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 
 def _imagined(success: Tensor, judged: Tensor) -> dict[str, Any]:
-    """A rate entry of what the judge gave a verdict on, and how many it dropped."""
+    """A rate entry of what the judge gave a judgement on, and how many it dropped."""
     return {**rate_entry(success[judged]), "dropped": int((~judged).sum())}
 
 

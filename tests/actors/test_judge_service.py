@@ -1,4 +1,4 @@
-"""The judge as a service: same verdicts, remembered, within its budget, and an ERROR when it is gone."""
+"""The judge as a service: same judgements, remembered, within its budget, and an ERROR when it is gone."""
 
 from __future__ import annotations
 
