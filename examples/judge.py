@@ -1,8 +1,6 @@
 """Your own judge: the task is done when a camera's picture looks like a goal picture.
 
-judge:
-  _target_: examples.judge.GoalPicture hold: 2 picture: goal.png sharpness: 30.0 rewards: {progress: 1.0,
-  success: 1.0}
+worldloop run experiment=smoke 'hydra.searchpath=[file://examples/configs]' judge=goal_picture
 """
 
 from __future__ import annotations
