@@ -24,6 +24,7 @@ from torchrl.envs import TransformedEnv
 from envs.conditioning import PoseMapStyle
 from envs.embodiment import Embodiment, EmbodimentError, Robot
 from envs.episodes.clips import ClipStore
+from envs.episodes.formats.lerobot_info import from_info
 from envs.geometry.kinematics import Kinematics, KinematicsError
 from envs.initial_states import InitialStates
 from envs.judges.base import Judge
@@ -144,7 +145,7 @@ def _recorded_robot(folder: Path) -> Embodiment:
     if not path.is_file():
         raise ConfigError(f"task.data: {path} does not exist; name folders of LeRobot v3.0 data sets")
     try:
-        return Embodiment.from_info(json.loads(path.read_text()))
+        return from_info(json.loads(path.read_text()))
     except (EmbodimentError, KeyError, ValueError) as error:
         raise ConfigError(f"task.data: {path}: {error}") from error
 

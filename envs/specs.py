@@ -48,7 +48,7 @@ TEXT_BYTES = 256  # of an instruction; longer ones are cut
 
 
 class Status(Enum):
-    """What a judge says of its own judgement; ERROR is never a zero reward: the episode is dropped, counted."""
+    """What a judgement is worth. ERROR is never a zero reward: the episode is dropped and counted."""
 
     OK = 0
     ABSTAIN = 1

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.embodiment import IMAGE_PREFIX, INFO_KEY, Embodiment
+from envs.embodiment import Embodiment
 from envs.episodes.episode import Episode
+from envs.episodes.formats.lerobot_info import IMAGE_PREFIX, INFO_KEY, to_info
 
 VERSION = "v3.0"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -80,7 +81,7 @@ def features_of(episode: Episode) -> dict[str, dict[str, Any]]:
         kind = "string" if value.dtype == object else str(value.dtype)
         shape = [1] if value.ndim == 1 else [value.shape[1]]
         features[name] = {"dtype": kind, "shape": shape, "names": names.get(name)}
-    features["action"]["info"] = {INFO_KEY: robot.to_info()}
+    features["action"]["info"] = {INFO_KEY: to_info(robot)}
     for name, value in episode.privileged.items():
         features[PRIVILEGED + name]["info"] = {INFO_KEY: {"shape": list(value.shape[1:])}}
     for name in INDICES:

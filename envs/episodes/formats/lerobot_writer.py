@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from envs.embodiment import IMAGE_PREFIX, Embodiment, EmbodimentError
+from envs.embodiment import Embodiment, EmbodimentError
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.formats import lerobot_columns as names
 from envs.episodes.formats.lerobot_columns import (
@@ -34,6 +34,7 @@ from envs.episodes.formats.lerobot_columns import (
     plain_rate,
 )
 from envs.episodes.formats.lerobot_files import open_parquet, read_episode_rows, read_info, read_tasks
+from envs.episodes.formats.lerobot_info import IMAGE_PREFIX
 from envs.episodes.formats.lerobot_robot import agreed_robot
 from envs.episodes.formats.lerobot_stats import column_stats, merge_stats, picture_stats
 from envs.episodes.video import write_video
