@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from envs.embodiment import Embodiment
@@ -61,6 +62,33 @@ def columns_of(episode: Episode) -> dict[str, NDArray[Any]]:
         name: value[:, 0] if value.ndim == 2 and value.shape[1] == 1 else value
         for name, value in columns.items()
     }
+
+
+def indexed_columns(
+    episode: Episode, number: int, row: int, task: int, features: dict[str, Any]
+) -> dict[str, NDArray[Any]]:
+    """The columns of an episode in a data set of these features, with its number, first row and task."""
+    columns, length = columns_of(episode), len(episode)
+    if PRESENT in features:
+        columns[PRESENT] = episode.present
+    columns["episode_index"] = np.full(length, number)
+    columns["index"] = np.arange(row, row + length)
+    columns["task_index"] = np.full(length, task)
+    return {name: columns[name] for name in features if name in columns}
+
+
+def arrow_table(columns: dict[str, NDArray[Any]]) -> pa.Table:
+    """Columns [T] or [T, n] as a table; n numbers become a list of fixed size."""
+    return pa.table({name: _column(value) for name, value in columns.items()})
+
+
+def _column(values: NDArray[Any]) -> pa.Array:
+    if values.dtype == object:
+        return pa.array(values.tolist(), pa.string())
+    if values.ndim == 1:
+        return pa.array(values)
+    flat = pa.array(np.ascontiguousarray(values, np.float32).reshape(-1))
+    return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
 
 def features_of(episode: Episode) -> dict[str, dict[str, Any]]:
