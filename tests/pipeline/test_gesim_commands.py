@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from actors.factory import ConfigError, build_simulator, build_state_decoder
-from envs.simulators.dit.network import DiTShape
+from envs.simulators.dit.shape import DiTShape
 from pipeline.benches.gesim import FULL
 from pipeline.benches.gesim_floor import count_flops
 from pipeline.cli import tools
