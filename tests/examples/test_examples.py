@@ -10,10 +10,12 @@ import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from envs.episodes import LeRobotDataset
 from envs.physics.suite import build_suite
 from envs.simulators.state_experts.head import StateHead
 from envs.specs import CHUNK, LOG_PROB, Status
 from envs.targets import ConfigError, build
+from examples import recordings
 from pipeline.config import load_config
 from tests.embodiments import EMBODIMENTS, observations, world_spec
 from tests.envs.simulators.clips import clip, first_of, future_of
@@ -107,3 +109,13 @@ def test_the_example_judge_knows_its_goal(tmp_path: Path) -> None:
     assert judged.progress[0].diff().gt(0).all() and int(judged.status) == Status.OK.value
     with pytest.raises(ConfigError, match=r"nothing\.png"):
         build({**section, "picture": str(tmp_path / "nothing.png")}, "judge", spec=spec)
+
+
+def test_the_example_recordings_are_a_data_set(tmp_path: Path) -> None:
+    recordings.write(tmp_path / "data")
+    found = LeRobotDataset(tmp_path / "data")
+    assert len(found) == sum(recordings.SPLITS.values())
+    by_source = {episode.source: [] for episode in found}
+    for episode in found:
+        by_source[episode.source].append(bool(episode.success.any()))
+    assert all(by_source["expert"]) and not all(by_source["noisy"])
