@@ -6,9 +6,9 @@ import uuid
 from dataclasses import replace
 from typing import Any
 
-from actors.factory import ConfigError, options
 from actors.fleets.fleet import Fleet, LocalFleet
 from actors.rollouts.recipe import Recipe, build_host
+from envs.targets import ConfigError, options
 
 
 def build_fleet(recipe: Recipe) -> Fleet:

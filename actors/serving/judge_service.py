@@ -25,8 +25,9 @@ import torch
 from ray.exceptions import GetTimeoutError, RayActorError, RayTaskError
 from torch import Tensor
 
-from actors.factory import build_judge, prepare_process
+from actors.factory import build_judge
 from actors.policies.contract import device_of
+from actors.process import prepare_process
 from envs.judges.base import Judge, Judgement
 from envs.ranges import Count, Natural, NonNegative, Positive
 from envs.specs import Status

@@ -8,8 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from actors.factory import build_kinematics, build_simulator, build_state_decoder, world_spec
+from actors.factory import build_simulator, build_state_decoder
 from actors.serving.sessions import ServeConfig, SessionHost
+from actors.world_config import build_kinematics, world_spec
 from envs.conditioning.joint_commands import JointCommands
 from envs.embodiment import ActionKind
 from envs.simulators.remote.engine import RemoteSimulator

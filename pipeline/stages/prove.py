@@ -9,14 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from actors.factory import (
-    build_judge,
-    build_physics,
-    build_policy,
-    build_simulator,
-    build_state_decoder,
-    prepare_process,
-)
+from actors.factory import build_judge, build_physics, build_policy, build_simulator, build_state_decoder
+from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
 from envs.simulators.replay import replay
 from pipeline.evaluation import measurement

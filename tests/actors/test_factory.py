@@ -9,7 +9,9 @@ from typing import Any
 import pytest
 import torch
 
-from actors.factory import build_policy, device_of, prepare_process, world_spec
+from actors.factory import build_policy
+from actors.process import device_of, prepare_process
+from actors.world_config import world_spec
 from envs.embodiment import Embodiment
 from envs.episodes.formats.lerobot_info import INFO_KEY, to_info
 from envs.targets import ConfigError

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from actors.factory import ConfigError, build_simulator, build_state_decoder
+from actors.factory import build_simulator, build_state_decoder
 from envs.simulators.dit.shape import DiTShape
+from envs.targets import ConfigError
 from pipeline.benches.gesim import FULL
 from pipeline.benches.gesim_floor import count_flops
 from pipeline.cli import tools
