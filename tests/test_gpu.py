@@ -1,4 +1,4 @@
-"""The loop, fine-tuning and serving on a GPU; each algorithm alone is tested in learners/rl/test_algorithms.py."""
+"""The loop, fine-tuning and serving on a GPU; algorithms alone: learners/rl/test_algorithms.py."""
 
 from __future__ import annotations
 
