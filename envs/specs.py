@@ -153,6 +153,12 @@ def check_chunk(chunk: Tensor, embodiment: Embodiment) -> None:
         )
 
 
+def memory_indices(length: Tensor, count: int) -> Tensor:
+    """Which of the first `length` [...] frames are remembered, [..., count]: evenly spread, both ends too."""
+    share = torch.linspace(0, 1, count, dtype=torch.float64, device=length.device)
+    return ((length.unsqueeze(-1) - 1) * share).round().long()
+
+
 def text_to_bytes(texts: Sequence[str]) -> Tensor:
     """Texts as uint8 [N, TEXT_BYTES], UTF-8 padded with zeros; longer ones are cut at a character."""
     out = torch.zeros(len(texts), TEXT_BYTES, dtype=torch.uint8)

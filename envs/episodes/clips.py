@@ -19,8 +19,7 @@ from envs.conditioning import PoseMapStyle
 from envs.episodes.cache import CachedSet, open_cached
 from envs.episodes.episode import EpisodeError
 from envs.episodes.splits import range_of
-from envs.simulators.memory import memory_indices
-from envs.specs import WorldSpec, text_to_bytes
+from envs.specs import WorldSpec, memory_indices, text_to_bytes
 
 
 @dataclass(frozen=True)
