@@ -1,21 +1,14 @@
 """What a robot is, as data: the names and kinds of its action and state, its cameras, its rate.
 
-Every shape, head, encoder, transform, server and test is built from an `Embodiment`. It is written to and
-read from the `info.json` of a LeRobot v3.0 data set: feature names and shapes are most of it, the rest stands
-in features.action.info.worldloop, which LeRobot's tools carry along, and may be missing. Nothing here imports
-torch, so physics workers start fast.
+Every shape, head, encoder, transform, server and test is built from an `Embodiment`. Data sets carry it along
+(envs/episodes/formats/lerobot_info.py). Nothing here imports torch, so physics workers start fast.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
-from math import prod
-from typing import Any
-
-INFO_KEY = "worldloop"  # of a feature's info in info.json, for what LeRobot has no place for
-IMAGE_PREFIX = "observation.images."
 
 
 class EmbodimentError(ValueError):
@@ -146,7 +139,6 @@ class Embodiment:
                 )
 
     # -- sizes
-    # -----------------------------------------------------------------------------------------------------
     @property
     def action_dim(self) -> int:
         """Numbers of an action, A."""
@@ -196,7 +188,6 @@ class Embodiment:
         return tuple(arm.gripper for arm in self.arms if arm.gripper is not None)
 
     # -- what it allows
-    # --------------------------------------------------------------------------------------------
     @property
     def calibrated(self) -> bool:
         """Whether every camera is calibrated: ray maps can be made."""
@@ -211,75 +202,6 @@ class Embodiment:
             return all(len(arm.numbers) == 6 for arm in self.arms)
         return self.action_kind is ActionKind.JOINTS and self.kinematics is not None
 
-    # -- LeRobot's info.json
-    # -----------------------------------------------------------------------------------------
-    def to_info(self) -> dict[str, Any]:
-        """What stands in features.action.info.worldloop: all that feature names and shapes do not say."""
-        plain = asdict(self)
-        for known in ("robot", "action_names", "state_names", "fps"):
-            plain.pop(known)
-        if self.kinematics is not None and self.kinematics.model.startswith(PYTHON):
-            plain["kinematics"] = None  # data name no code
-        plain["action_kind"] = self.action_kind.value
-        plain["cameras"] = {
-            camera.name: {"wrist": camera.wrist, "calibrated": camera.calibrated} for camera in self.cameras
-        }
-        return plain
-
-    @classmethod
-    def from_info(cls, info: Mapping[str, Any]) -> Embodiment:
-        """The robot that a LeRobot v3.0 data set was recorded with.
-
-        Args:
-            info: its info.json.
-
-        Raises:
-            EmbodimentError: naming the feature that is missing.
-        """
-        features = info["features"]
-        missing = [name for name in ("action", "observation.state") if name not in features]
-        cameras = camera_features(features)
-        if not cameras:
-            missing.append(f"{IMAGE_PREFIX}*")
-        if missing:
-            raise EmbodimentError(
-                f"features {missing} are missing from info.json, which has {sorted(features)};"
-                " Worldloop needs images, action and observation.state"
-            )
-        own = (features["action"].get("info") or {}).get(INFO_KEY, {})
-        action, state = (feature_names(features[name]) for name in ("action", "observation.state"))
-        about = own.get("cameras", {})
-        arms = tuple(
-            Arm(a["name"], tuple(a["numbers"]), a["gripper"], tuple(a["gripper_range"]))
-            for a in own.get("arms", ())
-        )
-        views = [
-            Camera(name, _image_size(features[key]), **about.get(name, {})) for name, key in cameras.items()
-        ]
-        kind, delta = guess_action(action)
-        robot = own.get("kinematics")
-        if robot is not None and str(robot["model"]).startswith(PYTHON):
-            raise EmbodimentError(
-                f"kinematics.model={robot['model']} of a data set names code, which is never run; remove it"
-                " from info.json and say simulator.kinematics in the config"
-            )
-        return cls(
-            robot=str(info.get("robot_type") or "unknown"),
-            action_names=action,
-            action_kind=ActionKind(own.get("action_kind", kind)),
-            delta=bool(own.get("delta", delta)),
-            arms=arms,
-            state_names=state,
-            cameras=tuple(views),
-            fps=float(info["fps"]),
-            main_camera=own.get("main_camera", ""),
-            kinematics=None
-            if robot is None
-            else Robot(
-                robot["model"], tuple(map(tuple, robot["joints"])), tuple(robot["flanges"]), robot["held"]
-            ),
-        )
-
     def at(self, size: tuple[int, int]) -> Embodiment:
         """The same robot whose pictures are brought to one size (height, width)."""
         return replace(self, cameras=tuple(replace(camera, size=size) for camera in self.cameras))
@@ -293,62 +215,3 @@ class Embodiment:
             if mine != theirs:
                 return f"{name} is {mine} of {self.robot}, but {theirs} of {other.robot}"
         return ""
-
-
-def camera_features(features: Mapping[str, Any]) -> dict[str, str]:
-    """The feature of each camera by the camera's name, in order: every feature of images or video but depth.
-
-    LeRobot's observation.images.top is the camera "top"; pusht's observation.image is the camera "image".
-    """
-    cameras: dict[str, str] = {}
-    for key, feature in features.items():
-        about = {**(feature.get("video_info") or {}), **(feature.get("info") or {})}
-        if feature.get("dtype") not in ("image", "video"):
-            continue
-        if about.get("is_depth_map") or about.get("video.is_depth_map"):
-            continue
-        name = key.removeprefix(IMAGE_PREFIX).removeprefix("observation.")
-        cameras[key if name in cameras else name] = key
-    return cameras
-
-
-def feature_names(feature: Mapping[str, Any]) -> tuple[str, ...]:
-    """A name for every number of a feature of info.json.
-
-    LeRobot has lists, nested lists, dictionaries of lists ({"motors": [...]}, {"axes": [...]}) and
-    dictionaries of positions ({"delta_x": 0, ...}); numbers without fitting names are called by position.
-    """
-    size = prod(feature["shape"])
-    names = feature.get("names")
-    if isinstance(names, Mapping):
-        if all(isinstance(part, int) for part in names.values()):
-            names = sorted(names, key=names.__getitem__)
-        else:
-            names = [name for part in names.values() for name in part]
-    if names and isinstance(names[0], (list, tuple)):
-        names = [name for part in names for name in part]
-    if not names or len(names) != size:
-        return tuple(f"{k}" for k in range(size))
-    return tuple(str(name) for name in names)
-
-
-def guess_action(names: tuple[str, ...]) -> tuple[ActionKind, bool]:
-    """Kind of an action and whether it is a change, as far as its names tell; OTHER where they do not."""
-    words = [name.lower() for name in names]
-    delta = any("delta" in word for word in words)
-    tails = {word.replace("delta", "").split(".")[-1].split("_")[-1] for word in words}
-    if {"x", "y", "z"} <= tails:
-        return ActionKind.END_EFFECTOR, delta
-    jointed = ("joint", "waist", "shoulder", "elbow", "wrist", "forearm", "motor", ".pos")
-    if sum(any(part in word for part in jointed) for word in words) > len(words) // 2:
-        return ActionKind.JOINTS, delta
-    return ActionKind.OTHER, delta
-
-
-def _image_size(feature: Mapping[str, Any]) -> tuple[int, int]:
-    """(height, width) of an image feature, whose shape may be [H, W, C] or [C, H, W]; `names` says which."""
-    shape, names = list(feature["shape"]), list(feature.get("names") or ())
-    named = bool(names) and str(names[0]) in ("channel", "channels", "c")
-    if named or (not names and shape[0] in (1, 3) and shape[-1] not in (1, 3)):
-        return shape[1], shape[2]
-    return shape[0], shape[1]

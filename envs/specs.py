@@ -48,7 +48,7 @@ TEXT_BYTES = 256  # of an instruction; longer ones are cut
 
 
 class Status(Enum):
-    """What a judge says of its own verdict; ERROR is never a zero reward: the episode is dropped, counted."""
+    """What a judgement is worth. ERROR is never a zero reward: the episode is dropped and counted."""
 
     OK = 0
     ABSTAIN = 1
@@ -151,6 +151,12 @@ def check_chunk(chunk: Tensor, embodiment: Embodiment) -> None:
         raise ValueError(
             f"an action chunk holds {bad} values that are NaN or infinite; the policy has diverged"
         )
+
+
+def memory_indices(length: Tensor, count: int) -> Tensor:
+    """Which of the first `length` [...] frames are remembered, [..., count]: evenly spread, both ends too."""
+    share = torch.linspace(0, 1, count, dtype=torch.float64, device=length.device)
+    return ((length.unsqueeze(-1) - 1) * share).round().long()
 
 
 def text_to_bytes(texts: Sequence[str]) -> Tensor:

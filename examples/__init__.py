@@ -1,3 +1,4 @@
-"""One of each thing that people bring: a task suite, a simulator, a judge, a policy, an algorithm, a robot's
-data.
+"""One of each thing that people bring: recordings, task suite, simulator, judge, policy, algorithm.
+
+Their choices stand in configs/: worldloop run 'hydra.searchpath=[file://examples/configs]' policy=coarse
 """

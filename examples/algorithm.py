@@ -1,7 +1,6 @@
 """Your own algorithm: REINFORCE with the batch's mean return as its baseline.
 
-algorithm:
-  _target_: examples.algorithm.Reinforce entropy: 0.0
+worldloop run experiment=smoke 'hydra.searchpath=[file://examples/configs]' algorithm=reinforce
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """Your own judge: the task is done when a camera's picture looks like a goal picture.
 
-judge:
-  _target_: examples.judge.GoalPicture hold: 2 picture: goal.png sharpness: 30.0 rewards: {progress: 1.0,
-  success: 1.0}
+worldloop run experiment=smoke 'hydra.searchpath=[file://examples/configs]' judge=goal_picture
 """
 
 from __future__ import annotations
@@ -12,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envs.judges.base import Judge, Verdict, verdict_status
+from envs.judges.base import Judge, Judgement, judgement_status
 from envs.specs import WorldSpec
 
 
@@ -45,13 +43,13 @@ class GoalPicture(Judge):
             "goal", torch.from_numpy(np.ascontiguousarray(small.transpose(2, 0, 1))).float() / 255
         )
 
-    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Verdict:
+    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Judgement:
         """See Judge.score."""
         now = self._away(frames[:, :, self.view])
         begin = self._away(first[:, self.view])[:, None].clamp(min=1e-3)
         progress = (1 - now / begin).clamp(0, 1)
         success = (self.sharpness * (progress - 0.9)).sigmoid()
-        return Verdict(success, progress, verdict_status(success))
+        return Judgement(success, progress, judgement_status(success))
 
     def _away(self, pictures: Tensor) -> Tensor:
         """Mean absolute difference [...] of pictures uint8 [..., 3, H, W] from the goal, 0..1."""

@@ -1,8 +1,6 @@
-"""Your own policy: a multilayer perceptron on the main camera's coarse picture, the robot's state and the
-words.
+"""Your own policy: a multilayer perceptron on the main camera's coarse picture, state and words.
 
-    policy:
-      _target_: examples.policy.CoarsePolicy width: 128 std: 0.3
+worldloop run experiment=smoke 'hydra.searchpath=[file://examples/configs]' policy=coarse
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Your own simulator: the last frame, moved as one by what the actions say.
 
-simulator:
-  _target_: examples.simulator.ShiftingWorld memory_frames: 1
+worldloop run experiment=smoke 'hydra.searchpath=[file://examples/configs]' simulator=shifting
 """
 
 from __future__ import annotations
@@ -43,8 +42,8 @@ class ShiftingWorld(Simulator):
 
     def _draw(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """Frames float [B, K, V, 3, H, W] in about 0..1, and features."""
-        told = self.vector(inputs["future", "commands"], inputs["now", "command"]).flatten(1)
-        moves = self.says(told).unflatten(1, (self.spec.chunk, self.spec.views, 3))
+        actions = self.vector(inputs["future", "commands"], inputs["now", "command"]).flatten(1)
+        moves = self.says(actions).unflatten(1, (self.spec.chunk, self.spec.views, 3))
         last = inputs["memory", "frames"][:, -1:].expand(-1, self.spec.chunk, -1, -1, -1, -1).float() / 255
         flat, shift = last.flatten(0, 2), moves.flatten(0, 2)
         theta = torch.eye(2, 3, device=flat.device).repeat(len(flat), 1, 1)
@@ -54,7 +53,7 @@ class ShiftingWorld(Simulator):
             F.grid_sample(flat, grid, padding_mode="border", align_corners=False)
             + shift[:, 2, None, None, None]
         )
-        return drawn.view_as(last), told
+        return drawn.view_as(last), actions
 
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean squared error of the clip's first chunk."""

@@ -1,7 +1,6 @@
 """Your own task suite: a dot that moves to the square which the words name.
 
-    worldloop run experiment=smoke '~task' '+task={suite: {_target_: examples.task_suite.DotToSquare}, \
-        name: reach, size: [32,32], chunk: 4, horizon: 12, mode: absolute}'
+worldloop run experiment=smoke 'hydra.searchpath=[file://examples/configs]' task=dot
 """
 
 from __future__ import annotations
@@ -15,11 +14,8 @@ from envs.embodiment import ActionKind, Arm, Camera, Embodiment
 from envs.physics.suite import Expert, HeldCondition, Observation, TaskSuite, check_noise_level, check_task
 
 COLOURS = {"red": (220, 50, 40), "green": (40, 190, 70), "blue": (50, 90, 220)}
-SIZE, STEP, NEAR = (
-    32,
-    0.15,
-    0.12,
-)  # pixels; largest move per action and distance of success, in widths of the picture
+SIZE = 32  # pixels a side
+STEP, NEAR = 0.15, 0.12  # largest move per action and distance of success, in widths of the picture
 
 
 class DotToSquare(TaskSuite):

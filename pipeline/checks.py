@@ -114,7 +114,7 @@ def _launch(launch: Cfg) -> Iterator[str]:
         yield from _of(sections.LocalSection, launch, "launch")
         return
     # Ray takes seconds to import, which runs in one process need not spend.
-    from actors.fleets.ray_fleet import Patience
+    from actors.fleets.fleet import Patience
     from actors.serving.judge_service import ServiceConfig
 
     yield from _of(sections.RaySection, launch, "launch")

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from envs.embodiment import Embodiment
+from envs.episodes.formats.lerobot_info import from_info
 from tests.envs.episodes.lerobot_sets import FakeSet, write_set
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -38,7 +39,7 @@ def worldloop(command: str, folder: Path, *words: str) -> None:
 def robot_of(folder: Path) -> Embodiment:
     """The robot of what was collected."""
     (info,) = (folder / "smoke/stages").glob("collect-*/dataset/meta/info.json")
-    return Embodiment.from_info(json.loads(info.read_text()))
+    return from_info(json.loads(info.read_text()))
 
 
 @pytest.mark.slow

@@ -12,7 +12,10 @@ ROOT = Path(__file__).resolve().parent.parent
 ORDER = ["envs", "actors", "learners", "pipeline"]
 FILES = [path for room in ORDER for path in sorted((ROOT / room).rglob("*.py"))]
 # Where robots learn, act and are judged: nothing here may open what only physics knows.
-UNPRIVILEGED = ("envs/simulators", "envs/judges", "envs/transforms", "envs/world.py", "actors", "learners")
+UNPRIVILEGED = (
+    *("envs/simulators", "envs/judges", "envs/transforms", "envs/world.py", "actors", "learners"),
+    *("pipeline/stages", "pipeline/loop.py"),
+)
 # What physics workers import; torch takes seconds and hundreds of megabytes in each of them.
 TORCH_FREE = ("envs/physics", "envs/embodiment.py", "envs/targets.py", "envs/files.py")
 WITH_TORCH = ("envs/physics/env.py", "envs/physics/toy_tracking.py")

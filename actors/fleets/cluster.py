@@ -15,8 +15,8 @@ import ray
 import tensordict
 import torch
 
-from actors.factory import ConfigError
 from actors.fleets.reaper import reap_after_me
+from envs.targets import ConfigError
 
 ROLES = ("learner", "actors", "judge", "evaluator")
 

@@ -10,6 +10,7 @@ from typing import Protocol
 from tensordict import TensorDict
 
 from actors.rollouts.host import Host, Job, Stopwatch, Weights, size_of
+from envs.ranges import Natural, Positive
 
 HARMLESS = ("stale", "unused", "learner died")  # reasons to drop episodes that say nothing against the hosts
 
@@ -73,6 +74,26 @@ class EpisodeLedger:
         more.
         """
         return sum(count for reason, count in self.dropped.items() if reason not in HARMLESS)
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long the supervisor waits before it acts, in seconds, and how often it tries.
+
+    Args:
+        job: for a rollout.
+        start: for a host to be built.
+        retries: times a job that raised is tried again.
+        stage: for a whole stage that runs elsewhere.
+        rebuilds: times in a row and per host that building may raise before the run stops; being killed
+            meanwhile counts a tenth.
+    """
+
+    job: Positive
+    start: Positive
+    stage: Positive
+    retries: Natural
+    rebuilds: Natural
 
 
 class Fleet(Protocol):

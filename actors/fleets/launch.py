@@ -6,9 +6,9 @@ import uuid
 from dataclasses import replace
 from typing import Any
 
-from actors.factory import ConfigError, options
-from actors.fleets.fleet import Fleet, LocalFleet
+from actors.fleets.fleet import Fleet, LocalFleet, Patience
 from actors.rollouts.recipe import Recipe, build_host
+from envs.targets import ConfigError, options
 
 
 def build_fleet(recipe: Recipe) -> Fleet:
@@ -26,7 +26,7 @@ def build_fleet(recipe: Recipe) -> Fleet:
         )
     # Ray takes seconds to import, which a local run need not spend.
     from actors.fleets.cluster import Plan, connect
-    from actors.fleets.ray_fleet import Patience, RayFleet
+    from actors.fleets.ray_fleet import RayFleet
     from actors.serving.judge_service import ServiceConfig, start_service
 
     plan = Plan.of(launch)

@@ -12,15 +12,12 @@ died and keeps what came back; the learner only submits and takes.
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass
 from typing import Any
 
 import ray
-from ray.actor import ActorHandle
 from ray.exceptions import (
     GetTimeoutError,
     ObjectStoreFullError,
@@ -31,70 +28,11 @@ from ray.exceptions import (
 )
 from tqdm import tqdm
 
-from actors.fleets.fleet import EpisodeLedger, FleetError, Result
-from actors.rollouts.host import Host, Job, Stopwatch, Weights, pack, size_of, unpack
-from actors.rollouts.recipe import Recipe, build_host_process
-from envs.ranges import Natural, Positive
+from actors.fleets.fleet import EpisodeLedger, FleetError, Patience, Result
+from actors.fleets.host_actor import HostActor, Member
+from actors.rollouts.host import Job, Stopwatch, Weights, size_of, unpack
+from actors.rollouts.recipe import Recipe
 from envs.targets import options
-
-
-class HostActor:
-    """A Host in a Ray actor; see rollouts.Host."""
-
-    def __init__(self, recipe: dict[str, Any]):
-        self.host: Host = build_host_process(recipe)
-
-    def ready(self) -> int:
-        """This process's id, once built."""
-        return os.getpid()
-
-    def run(self, job: Job, version: int, weights: list[Any]) -> tuple[Weights, float, float, float]:
-        """The rollout's arrays, seconds of all of it, of taking over weights and inside the networks;
-        `weights` holds a reference, fetched only if needed.
-        """
-        watch = Stopwatch()
-        if self.host.version != version:
-            self.host.load(version, ray.get(weights[0]))
-        loaded, forward = watch.read(), self.host.meter.seconds
-        arrays = pack(self.host.run(job))
-        return arrays, loaded + watch.read(), loaded, self.host.meter.seconds - forward
-
-
-@dataclass
-class _Member:
-    """One host: an actor that is being built or works on a job or waits for one."""
-
-    number: int
-    actor: ActorHandle
-    ref: Any
-    since: float
-    job: Job | None = None
-    version: int = -1
-    pid: int = 0
-
-    @property
-    def built(self) -> bool:
-        return self.pid != 0
-
-
-@dataclass(frozen=True)
-class Patience:
-    """How long the supervisor waits before it acts, in seconds, and how often it tries.
-
-    Args:
-        job: for a rollout.
-        start: for a host to be built.
-        retries: times a job that raised is tried again.
-        stage: for a whole stage that runs elsewhere.
-        rebuilds: times in a row and per host that building may raise before the run stops; being killed
-            meanwhile counts a tenth.
-    """
-
-    job: Positive
-    start: Positive
-    stage: Positive
-    retries: Natural
-    rebuilds: Natural
 
 
 class RayFleet:
@@ -139,7 +77,6 @@ class RayFleet:
         self._thread.start()
 
     # -- the learner's side
-    # --------------------------------------------------------------------------------------
     def publish(self, version: int, weights: Weights) -> dict[str, float]:
         """See Fleet.publish."""
         watch = Stopwatch()
@@ -215,11 +152,10 @@ class RayFleet:
         self._members.clear()
 
     # -- the supervisor's side
-    # -----------------------------------------------------------------------------------
-    def _build(self) -> _Member:
+    def _build(self) -> Member:
         actor = self._actor_class.options(max_restarts=0, **self._resources).remote(self._recipe)
         self._count += 1
-        return _Member(self._count, actor, actor.ready.remote(), time.monotonic())
+        return Member(self._count, actor, actor.ready.remote(), time.monotonic())
 
     def _supervise(self) -> None:
         try:
@@ -255,7 +191,7 @@ class RayFleet:
                 member.job, member.version, member.since = self._queue.popleft(), version, time.monotonic()
                 member.ref = member.actor.run.remote(member.job, version, [weights])
 
-    def _finish(self, member: _Member) -> None:
+    def _finish(self, member: Member) -> None:
         ref, member.ref = member.ref, None
         try:
             value = ray.get(ref, timeout=self.patience.job)
@@ -279,7 +215,7 @@ class RayFleet:
             self._tries.pop(member.job.number, None)
             member.job = None
 
-    def _raised(self, member: _Member, error: RayTaskError) -> None:
+    def _raised(self, member: Member, error: RayTaskError) -> None:
         job, member.job = member.job, None
         if job is None:  # the host could not be built
             self._died(member, error)
@@ -291,7 +227,7 @@ class RayFleet:
         cause = error.cause
         self._done.append(Result(job, member.version, None, failure=f"{type(cause).__name__}: {cause}"))
 
-    def _died(self, member: _Member, error: Exception) -> None:
+    def _died(self, member: Member, error: Exception) -> None:
         if not member.built:
             # Our own code that raises will raise again; a process that was killed while it began had bad
             # luck.
@@ -313,13 +249,13 @@ class RayFleet:
         self._requeue(member)
         self._members[place] = self._build()
 
-    def _requeue(self, member: _Member) -> None:
+    def _requeue(self, member: Member) -> None:
         if member.job is not None:
             self.ledger.rerun += self.episodes
             self._queue.appendleft(member.job)
             member.job = None
 
-    def _retire(self, member: _Member, why: str) -> None:
+    def _retire(self, member: Member, why: str) -> None:
         ray.kill(member.actor, no_restart=True)
         self._requeue(member)
         self._members.remove(member)

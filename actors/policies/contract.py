@@ -13,8 +13,8 @@ Whatever else a policy has is used if it is there:
 - `trained`: the part that learners train and score, if that is not all of it;
 - `freeze_perception()`: for rl.freeze_perception;
 - `normalise(chunks [N, K, A], states [N, S])`: takes units from demonstrations;
-- `policy_features(observed)` [B, width] and `width`: perception is taught on all recorded frames through
-them;
+- `policy_features(observed)` [B, width] and `width`: through them perception is taught on all recorded
+  frames;
 - `imitation_loss(observed, chunks [B, K, A])`: a better one than the negative log-likelihood.
 """
 

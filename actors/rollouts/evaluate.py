@@ -19,7 +19,7 @@ from envs.specs import JUDGE_STATUS, PROGRESS, SUCCESS, Status
 class Outcome:
     """Results per episode, in the order of the seeds.
 
-    success bool [N], progress float [N], judged bool [N]: whether a judge gave a verdict.
+    success bool [N], progress float [N], judged bool [N]: whether a judge gave a judgement.
     """
 
     seeds: list[int]

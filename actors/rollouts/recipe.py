@@ -19,9 +19,9 @@ from actors.factory import (
     build_state_decoder,
     build_world,
     open_clips,
-    prepare_process,
 )
 from actors.policies.contract import freeze_perception
+from actors.process import prepare_process
 from actors.rollouts.host import Host
 from envs.initial_states import DecisionPoints, InitialStates
 from envs.judges.base import Judge

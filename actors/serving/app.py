@@ -1,4 +1,4 @@
-"""The HTTP side of a served simulator: GE-Sim's endpoints, their status codes, and the live page.
+"""The HTTP side of a served simulator: GE-Sim's endpoints and their status codes.
 
 Clients written for the released server work unchanged. What is new is overlooked by them: many sessions
 instead of one, `seed` and `bound` in /init, `state` beside the first frame, `chunk` in /step (a repeated step
@@ -9,21 +9,21 @@ from __future__ import annotations
 
 import asyncio
 import json
-import re
 import socket
 import zlib
 from collections.abc import AsyncIterator
 from typing import Any
 
-import cv2
 import numpy as np
 from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 from numpy.typing import NDArray
 
 from actors.serving.access import errors, json_answer, writes
-from actors.serving.page import PAGE, joint_table
-from actors.serving.sessions import ServeConfig, Session, SessionHost
+from actors.serving.page import LivePage
+from actors.serving.session import Session
+from actors.serving.sessions import ServeConfig, SessionHost
+from envs.episodes.pictures import resize_frames
 from envs.simulators.remote.protocol import (
     ProtocolError,
     decode_frame,
@@ -65,9 +65,7 @@ class Server:
             app.router.add_post(path, call)
         app.cleanup_ctx.append(self._sweep)
         app.router.add_get("/healthz", self.healthz)
-        app.router.add_get("/", self.page)
-        app.router.add_get("/api/status", self.status)
-        app.router.add_get("/api/preview.jpg", self.preview)
+        LivePage(self.host, self.name).add_to(app)
         return app
 
     async def _sweep(self, app: web.Application) -> AsyncIterator[None]:
@@ -103,7 +101,6 @@ class Server:
             raise ProtocolError(f"the body cannot be read: {error or type(error).__name__}") from error
 
     # -- JSON endpoints
-    # --------------------------------------------------------------------------------------------
     async def init(self, request: web.Request) -> web.Response:
         """Open a session."""
         body = parse(await self._body(request))
@@ -151,7 +148,6 @@ class Server:
         return json_answer(200, {"success": True})
 
     # -- binary endpoints
-    # ------------------------------------------------------------------------------------------
     async def set_episode_data(self, request: web.Request) -> web.Response:
         """The first frame; whatever came of an earlier one is forgotten."""
         picture, said = unpack(await self._body(request), 2)
@@ -159,7 +155,7 @@ class Server:
         session = self._session(request, meta)
         _, views, height, width = shape_in(meta, "frame_shape", f"3,{self.host.spec.views},H,W")
         frame = await asyncio.to_thread(
-            lambda: self._sized(decode_frame(picture, views, height, width)[None])[0]
+            lambda: resize_frames(decode_frame(picture, views, height, width)[None], self.host.spec.size)[0]
         )
         robot = self.host.robot
         sizes = {"state": robot.state_dim, "command": robot.action_dim}
@@ -191,29 +187,16 @@ class Server:
             if len(blocks) != count:
                 raise ProtocolError(f"traj_shape announces {count} pictures, {len(blocks)} came")
             return np.concatenate(
-                [self._sized(decode_frame(block, views, height, width)[None]) for block in blocks]
+                [
+                    resize_frames(decode_frame(block, views, height, width)[None], self.host.spec.size)
+                    for block in blocks
+                ]
             )
 
         maps = await asyncio.to_thread(read)
         async with session.lock:
             session.traj, session.c2w = maps, np.ascontiguousarray(c2w)
         return json_answer(200, {"success": True})
-
-    def _sized(self, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Frames [T, V, 3, H, W] at the simulator's size."""
-        size = self.host.spec.size
-        if frames.shape[-2:] == size:
-            return frames
-        small = [
-            [
-                cv2.resize(
-                    view.transpose(1, 2, 0), (size[1], size[0]), interpolation=cv2.INTER_LINEAR
-                ).transpose(2, 0, 1)
-                for view in frame
-            ]
-            for frame in frames
-        ]
-        return np.array(small, np.uint8)
 
     async def step(self, request: web.Request) -> web.Response:
         """One chunk: frames as JPEGs, and joint states."""
@@ -243,60 +226,9 @@ class Server:
         self.host.latest = session
         return web.Response(body=answer, content_type="application/octet-stream")
 
-    # -- to look at
-    # ------------------------------------------------------------------------------------------------
     async def healthz(self, request: web.Request) -> web.Response:
         """Whether it lives, how many sessions it holds, and that repeated steps are known apart."""
         return json_answer(200, {"status": "ok", "sessions": self.host.config.sessions, "repeatable": True})
-
-    async def page(self, request: web.Request) -> web.Response:
-        """The live page."""
-        return web.Response(text=PAGE, content_type="text/html")
-
-    def _chosen(self, request: web.Request) -> Session | None:
-        """The session whose number is asked for; without a number the one that stepped last."""
-        number = request.query.get("session")
-        known = list(self.host.sessions.values())
-        if number is None:
-            return self.host.latest if self.host.latest in known else (known[-1] if known else None)
-        if not re.fullmatch("[0-9]{1,12}", number):
-            raise ProtocolError(f"session must be the number of a session, got {number[:40]!r}")
-        return next((session for session in known if session.number == int(number)), None)
-
-    async def status(self, request: web.Request) -> web.Response:
-        """What the page shows: of one session what the released server says, and a line for each."""
-        session, robot = self._chosen(request), self.host.robot
-        action, state = (session.last_action, session.last_state) if session else (None, None)
-        one = {
-            "model": self.name,
-            "phase": "running" if any(s.lock.locked() for s in self.host.sessions.values()) else "idle",
-            "chunk_size": self.host.spec.chunk,
-            "session": session.number if session else None,
-            "step_count": session.chunk if session else 0,
-            "frames_generated": session.frames if session else 0,
-            "has_preview": bool(session and session.preview),
-            "state": state,
-            "action": action,
-            "joints": joint_table(robot.action_names, action, robot.state_names, state),
-            "task": session.task if session else "",
-        }
-        # no client_id: who knows one may drive it
-        rows = [
-            {"number": s.number, "user": s.user, "task": s.task, "steps": s.chunk, "frames": s.frames}
-            for s in self.host.sessions.values()
-        ]
-        return json_answer(
-            200, {**one, "sessions": rows, "passes": self.host.passes, "steps": self.host.steps}
-        )
-
-    async def preview(self, request: web.Request) -> web.Response:
-        """The last frame of a session."""
-        session = self._chosen(request)
-        if session is None or not session.preview:
-            return web.Response(status=204)
-        return web.Response(
-            body=session.preview, content_type="image/jpeg", headers={"Cache-Control": "no-store"}
-        )
 
 
 def _answer(frames: NDArray[np.uint8], states: NDArray[np.float32] | None) -> tuple[bytes, bytes]:

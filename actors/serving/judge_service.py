@@ -1,7 +1,7 @@
 """One judge for all hosts: a Ray actor that gathers clips from many callers into batches, and the Judge that
 asks it.
 
-Verdicts are remembered by content, so the same video is never paid for twice. A caller waits until a
+Judgements are remembered by content, so the same video is never paid for twice. A caller waits until a
 deadline, tries again with growing pauses, and then says ERROR, upon which learners drop the episode and count
 it; a spent budget says ABSTAIN. The service is a named actor that Ray restarts when it dies; callers find it
 again by name.
@@ -25,9 +25,10 @@ import torch
 from ray.exceptions import GetTimeoutError, RayActorError, RayTaskError
 from torch import Tensor
 
-from actors.factory import build_judge, prepare_process
+from actors.factory import build_judge
 from actors.policies.contract import device_of
-from envs.judges.base import Judge, Verdict
+from actors.process import prepare_process
+from envs.judges.base import Judge, Judgement
 from envs.ranges import Count, Natural, NonNegative, Positive
 from envs.specs import Status
 from envs.targets import ConfigError
@@ -42,7 +43,7 @@ class ServiceConfig:
     Args:
         batch: clips judged at once at most.
         wait_ms: how long the first clip of a batch waits for others.
-        cache: verdicts remembered.
+        cache: judgements remembered.
         budget: clips that may be judged, remembered ones not counted; 0 for any number.
         deadline: seconds a caller waits for an answer.
         retries: times it asks again.
@@ -125,7 +126,7 @@ class JudgeServer:
             self.waiting = [item for item in self.waiting if not any(item is other for other in chosen)]
             clips = [clip for clip, _ in chosen]
             try:
-                verdict = await asyncio.get_running_loop().run_in_executor(None, self._judge, clips)
+                judgement = await asyncio.get_running_loop().run_in_executor(None, self._judge, clips)
             except Exception as error:
                 for _, future in chosen:
                     future.set_exception(error)
@@ -133,15 +134,15 @@ class JudgeServer:
             self.counts["judged"] += len(chosen)
             self.counts["batches"] += 1
             rows = zip(
-                verdict.success.cpu().numpy(),
-                verdict.progress.cpu().numpy(),
-                verdict.status.tolist(),
+                judgement.success.cpu().numpy(),
+                judgement.progress.cpu().numpy(),
+                judgement.status.tolist(),
                 strict=True,
             )
             for (_, future), row in zip(chosen, rows, strict=True):
                 future.set_result(row)
 
-    def _judge(self, clips: list[Clip]) -> Verdict:
+    def _judge(self, clips: list[Clip]) -> Judgement:
         """Judge clips of equal shape on the judge's device."""
         device = device_of(self.judge)
         frames, first = (
@@ -181,7 +182,7 @@ class JudgeClient(Judge):
             ref = ray.get_actor(self.service).score.remote(*arrays)
         return arrays, ref, frames.device
 
-    def fetch(self, ticket: Any) -> Verdict:
+    def fetch(self, ticket: Any) -> Judgement:
         """See Judge.fetch; what no attempt answered is an ERROR."""
         arrays, ref, device = ticket
         for attempt in range(self.options.retries + 1):
@@ -194,16 +195,16 @@ class JudgeClient(Judge):
                 if attempt < self.options.retries:
                     time.sleep(self.options.pause * 2**attempt)
                 continue
-            return Verdict(
+            return Judgement(
                 torch.tensor(success, device=device),
                 torch.tensor(progress, device=device),
                 torch.tensor(status, device=device),
             )
         batch, count = arrays[0].shape[:2]
         nothing = torch.zeros(batch, count, device=device)
-        return Verdict(nothing, nothing.clone(), torch.full((batch,), Status.ERROR.value, device=device))
+        return Judgement(nothing, nothing.clone(), torch.full((batch,), Status.ERROR.value, device=device))
 
-    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Verdict:
+    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Judgement:
         """See Judge.score."""
         return self.fetch(self.submit(frames, first, instruction))
 

@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
+
+from aiohttp import web
+
+from actors.serving.access import json_answer
+from actors.serving.session import Session
+from actors.serving.sessions import SessionHost
+from envs.simulators.remote.protocol import ProtocolError
 
 
 def joint_table(
@@ -22,10 +30,77 @@ def joint_table(
     predicted = dict(zip(state_names, state, strict=True)) if state else {}
     rows = []
     for name in dict.fromkeys((*state_names, *action_names)):
-        told, found = commanded.get(name), predicted.get(name)
-        gap = None if told is None or found is None else found - told
-        rows.append({"name": name, "action": told, "state": found, "difference": gap})
+        command, found = commanded.get(name), predicted.get(name)
+        gap = None if command is None or found is None else found - command
+        rows.append({"name": name, "action": command, "state": found, "difference": gap})
     return rows
+
+
+class LivePage:
+    """The page at / and what it asks for.
+
+    Args:
+        host: the sessions.
+        name: of the simulator.
+    """
+
+    def __init__(self, host: SessionHost, name: str):
+        self.host, self.name = host, name
+
+    def add_to(self, app: web.Application) -> None:
+        """Its routes."""
+        app.router.add_get("/", self.page)
+        app.router.add_get("/api/status", self.status)
+        app.router.add_get("/api/preview.jpg", self.preview)
+
+    async def page(self, request: web.Request) -> web.Response:
+        """The live page."""
+        return web.Response(text=PAGE, content_type="text/html")
+
+    def _chosen(self, request: web.Request) -> Session | None:
+        """The session whose number is asked for; without a number the one that stepped last."""
+        number = request.query.get("session")
+        known = list(self.host.sessions.values())
+        if number is None:
+            return self.host.latest if self.host.latest in known else (known[-1] if known else None)
+        if not re.fullmatch("[0-9]{1,12}", number):
+            raise ProtocolError(f"session must be the number of a session, got {number[:40]!r}")
+        return next((session for session in known if session.number == int(number)), None)
+
+    async def status(self, request: web.Request) -> web.Response:
+        """What the page shows: of one session what the released server says, and a line for each."""
+        session, robot = self._chosen(request), self.host.robot
+        action, state = (session.last_action, session.last_state) if session else (None, None)
+        one = {
+            "model": self.name,
+            "phase": "running" if any(s.lock.locked() for s in self.host.sessions.values()) else "idle",
+            "chunk_size": self.host.spec.chunk,
+            "session": session.number if session else None,
+            "step_count": session.chunk if session else 0,
+            "frames_generated": session.frames if session else 0,
+            "has_preview": bool(session and session.preview),
+            "state": state,
+            "action": action,
+            "joints": joint_table(robot.action_names, action, robot.state_names, state),
+            "task": session.task if session else "",
+        }
+        # no client_id: who knows one may drive it
+        rows = [
+            {"number": s.number, "user": s.user, "task": s.task, "steps": s.chunk, "frames": s.frames}
+            for s in self.host.sessions.values()
+        ]
+        return json_answer(
+            200, {**one, "sessions": rows, "passes": self.host.passes, "steps": self.host.steps}
+        )
+
+    async def preview(self, request: web.Request) -> web.Response:
+        """The last frame of a session."""
+        session = self._chosen(request)
+        if session is None or not session.preview:
+            return web.Response(status=204)
+        return web.Response(
+            body=session.preview, content_type="image/jpeg", headers={"Cache-Control": "no-store"}
+        )
 
 
 PAGE = """<!doctype html>

@@ -6,7 +6,7 @@ import asyncio
 import threading
 import time
 import uuid
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,9 +15,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from actors.serving.batching import Company
+from actors.serving.session import Session, first_frame, needs_cameras, next_chunk
 from envs.conditioning.joint_commands import JointCommands
-from envs.embodiment import ActionKind
-from envs.geometry.cameras import resize_intrinsics
 from envs.precision import mixed_precision
 from envs.ranges import Count, Natural, NonNegative, Port, Positive
 from envs.simulators import memory
@@ -65,55 +64,6 @@ class ServeConfig:
 
 
 @dataclass
-class Session:
-    """One client's episode. Pictures are uint8 at the simulator's size; `state` is its row of the simulator's
-    state once it has stepped.
-
-    Attributes:
-        number: counts sessions as they were opened; the page names it, the client_id is a secret.
-        intrinsic: in pixels of the client's pictures, whose size is `frame_size`.
-        bound: whether it ends soon after the connection that last used it is lost; else only when it is idle.
-        reply: chunk number, request and answer of the last step, for a client that asks again.
-    """
-
-    client_id: str
-    number: int
-    user: str
-    seed: int
-    touched: float
-    bound: bool = False
-    connection: asyncio.Transport | None = None
-    task: str = ""
-    intrinsic: NDArray[np.float32] | None = None
-    extrinsic: NDArray[np.float32] | None = None
-    first: NDArray[np.uint8] | None = None
-    frame_size: tuple[int, int] = (0, 0)
-    joints: NDArray[np.float32] | None = None
-    command: NDArray[np.float32] | None = None
-    traj: NDArray[np.uint8] | None = None
-    c2w: NDArray[np.float32] | None = None
-    state: TensorDict | None = None
-    chunk: int = 0
-    frames: int = 0
-    last_action: list[float] | None = None
-    last_state: list[float] | None = None
-    preview: bytes = b""
-    reply: tuple[int, bytes, bytes] | None = None
-    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
-
-    @property
-    def left(self) -> bool:
-        """Whether whoever drives it is gone, as far as its connection says so."""
-        return self.bound and (self.connection is None or self.connection.is_closing())
-
-    def restart(self) -> None:
-        """Forget the episode; cameras stay."""
-        self.first = self.joints = self.command = self.traj = self.c2w = self.state = self.reply = None
-        self.last_action = self.last_state = None
-        self.chunk = self.frames = 0
-
-
-@dataclass
 class _Job:
     session: Session
     commands: Tensor  # [L, A]
@@ -140,9 +90,6 @@ class SessionHost:
     ):
         self.simulator, self.decoder, self.config, self.joints = simulator.eval(), decoder, config, joints
         self.bf16, self.spec, self.robot = bf16, simulator.spec, simulator.spec.embodiment
-        joint_targets = self.robot.action_kind is ActionKind.JOINTS and not self.robot.delta
-        self.needs_cameras = self.spec.pose_map or self.spec.ray_map
-        self.commands_are_states = joint_targets and self.robot.action_dim == self.robot.state_dim
         self.sessions: dict[str, Session] = {}
         self.latest: Session | None = None
         self.passes = self.steps = self.opened = 0
@@ -152,7 +99,6 @@ class SessionHost:
         self._busy = threading.Lock()  # one forward pass at a time, whichever event loop asks
 
     # -- sessions
-    # ------------------------------------------------------------------------------------------------
     def open(self, user: str, seed: int | None) -> Session:
         """A new session.
 
@@ -204,7 +150,6 @@ class SessionHost:
             self.simulator.release(session.state, torch.ones(1, dtype=torch.bool))
 
     # -- steps
-    # ---------------------------------------------------------------------------------------------------
     async def step(
         self, session: Session, actions: NDArray[np.float32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None]:
@@ -231,7 +176,7 @@ class SessionHost:
                 f"an action chunk of {len(actions)} rows exceeds this world's {self.spec.chunk}"
             )
         wanted: list[tuple[str, object]] = [("/set_episode_data", session.first)]
-        if self.needs_cameras:
+        if needs_cameras(self.spec):
             wanted = [
                 ("/set_camera_params", session.intrinsic),
                 *wanted,
@@ -288,11 +233,11 @@ class SessionHost:
     def _advance(self, jobs: list[_Job]) -> list[tuple[NDArray[np.uint8], NDArray[np.float32] | None]]:
         with self._busy:
             device, chunk = self.simulator.device, self.spec.chunk
-            future = torch.cat([self._future(job) for job in jobs]).to(device)
+            future = torch.cat([next_chunk(job.session, job.commands, self.spec) for job in jobs]).to(device)
             states = [
                 job.session.state
                 if job.session.state is not None
-                else self._begin(job.session, future[row : row + 1]).to(device)
+                else self._begin(job.session, future[row : row + 1])
                 for row, job in enumerate(jobs)
             ]
             state = memory.stack(states)
@@ -313,44 +258,7 @@ class SessionHost:
                 out.append((shown, None if decoded is None else decoded[row, :asked].float().cpu().numpy()))
             return out
 
-    def _future(self, job: _Job) -> TensorDict:
-        """What Simulator.step takes of one session, [1]: the last command repeated up to a chunk, and that
-        part of the trajectory.
-        """
-        session, asked, chunk = job.session, len(job.commands), self.spec.chunk
-        last = job.commands[-1:].expand(chunk - asked, -1)
-        future = {"commands": torch.cat([job.commands, last])[None]}
-        if self.needs_cameras:
-            assert session.traj is not None and session.c2w is not None
-            # a whole recording, or all of what was sent for this step
-            total = len(session.traj)
-            begin = session.chunk * chunk if total >= 2 * chunk else 0
-            rows = np.minimum(np.minimum(np.arange(begin, begin + chunk), begin + asked - 1), total - 1)
-            future["c2w"] = torch.from_numpy(session.c2w[rows])[None]
-            if self.spec.pose_map:
-                future["pose_map"] = torch.from_numpy(session.traj[rows])[None]
-        return TensorDict(future, [1])
-
     def _begin(self, session: Session, future: TensorDict) -> TensorDict:
-        """The first state of a session. What a client of the released server does not say begins with its
-        first command, as released.
-        """
-        assert session.first is not None
-        command = future["commands"][:, 0]
-        if session.command is not None:
-            command = torch.from_numpy(session.command)[None].to(command.device)
-        if session.joints is not None:
-            joints = torch.from_numpy(session.joints)[None]
-        else:
-            joints = command if self.commands_are_states else torch.zeros(1, self.robot.state_dim)
-        first = {"frames": torch.from_numpy(session.first)[None], "command": command, "state": joints}
-        if self.needs_cameras:
-            assert session.intrinsic is not None
-            intrinsic = torch.from_numpy(session.intrinsic)
-            first["intrinsic"] = resize_intrinsics(intrinsic, session.frame_size, self.spec.size)[None]
-            own = session.extrinsic
-            first["c2w"] = future["c2w"][:, 0] if own is None else torch.from_numpy(own)[None]
-        if self.spec.pose_map:
-            first["pose_map"] = future["pose_map"][:, 0]
-        rows = TensorDict(first, [1]).to(self.simulator.device)
-        return self.simulator.reset(rows, torch.tensor([session.seed]))
+        """The first state of a session, on the simulator's device."""
+        rows = first_frame(session, future, self.spec).to(self.simulator.device)
+        return self.simulator.reset(rows, torch.tensor([session.seed])).to(self.simulator.device)

@@ -18,9 +18,8 @@ from torch import Tensor
 from envs.conditioning import PoseMapStyle
 from envs.episodes.cache import CachedSet, open_cached
 from envs.episodes.episode import EpisodeError
-from envs.episodes.splits import episodes_of
-from envs.simulators.memory import memory_indices
-from envs.specs import WorldSpec, text_to_bytes
+from envs.episodes.splits import range_of
+from envs.specs import WorldSpec, memory_indices, text_to_bytes
 
 
 @dataclass(frozen=True)
@@ -157,8 +156,18 @@ class ClipStore:
         return torch.tensor(keep, dtype=torch.int64)
 
     def split(self, name: str) -> Tensor:
-        """Numbers int64 of the episodes of a split: train, held_out or calibration (see splits.py)."""
-        return episodes_of(self, name)
+        """Numbers int64 of the episodes of a split: train, held_out or calibration (see splits.py).
+
+        Raises:
+            EpisodeError: if a data set has splits, but none of that name.
+        """
+        chosen, first = [], 0
+        for part in self.parts:
+            count = len(part.info["episodes"])
+            numbers = range_of(part.info["splits"], name, count, part.folder)
+            chosen += [first + number for number in numbers]
+            first += count
+        return torch.tensor(chosen, dtype=torch.int64)
 
     def rows(self, episodes: Tensor) -> Tensor:
         """Rows int64 [N] of all frames of some episodes, one episode after the other."""

@@ -17,11 +17,13 @@ def resize_picture(picture: NDArray[np.uint8], size: tuple[int, int]) -> NDArray
 
 
 def resize_frames(
-    frames: NDArray[np.uint8], size: tuple[int, int], present: NDArray[np.bool_]
+    frames: NDArray[np.uint8], size: tuple[int, int], present: NDArray[np.bool_] | None = None
 ) -> NDArray[np.uint8]:
     """Frames uint8 [T, V, 3, H, W] at another (height, width); those not `present` [T] stay black."""
+    if frames.shape[-2:] == tuple(size):
+        return frames
     out = np.zeros((*frames.shape[:3], *size), np.uint8)
-    for t in np.flatnonzero(present):
+    for t in range(len(frames)) if present is None else np.flatnonzero(present):
         for v in range(frames.shape[1]):
             out[t, v] = resize_picture(frames[t, v].transpose(1, 2, 0), size).transpose(2, 0, 1)
     return out

@@ -10,34 +10,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import torch
-from torch import Tensor
 
 from envs.episodes.episode import EpisodeError
 from envs.episodes.formats.lerobot_files import read_info
 from envs.files import write_atomically
 
-if TYPE_CHECKING:
-    from envs.episodes.clips import ClipStore
-
 NAMES = ("train", "held_out", "calibration")
-
-
-def episodes_of(store: ClipStore, name: str) -> Tensor:
-    """Numbers int64 of a store's episodes in a split, over all its data sets.
-
-    Raises:
-        EpisodeError: if a data set has splits, but none of that name.
-    """
-    chosen, first = [], 0
-    for part in store.parts:
-        count = len(part.info["episodes"])
-        numbers = range_of(part.info["splits"], name, count, part.folder)
-        chosen += [first + number for number in numbers]
-        first += count
-    return torch.tensor(chosen, dtype=torch.int64)
 
 
 def range_of(splits: Mapping[str, str], name: str, count: int, folder: Path) -> list[int]:

@@ -32,14 +32,6 @@ def follow_wrists(c2w: Tensor, start: Tensor, poses: Tensor, wrists: tuple[int |
     return torch.stack(views, -3)
 
 
-def resize_intrinsics(intrinsic: Tensor, old: tuple[int, int], new: tuple[int, int]) -> Tensor:
-    """Intrinsics [..., 3, 3] of pictures of size `old` (height, width) that were brought to size `new`."""
-    height, width = new[0] / old[0], new[1] / old[1]
-    return intrinsic * torch.tensor(
-        [[width], [height], [1.0]], dtype=intrinsic.dtype, device=intrinsic.device
-    )
-
-
 def project(points: Tensor, intrinsic: Tensor, c2w: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels [..., N, 2] and depths [..., N] in metres of world points [..., N, 3] seen by a camera.
 

@@ -1,4 +1,4 @@
-"""The contract of a judge (reward model), and how verdicts on frames become an episode's success."""
+"""The contract of a judge (reward model), and how judgements on frames become an episode's success."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from envs.specs import Status
 
 
-class Verdict(NamedTuple):
+class Judgement(NamedTuple):
     """What a judge says of clips.
 
     success float32 [B, T] in 0..1, the probability that the task is done in a frame; progress float32 [B, T]
@@ -42,7 +42,7 @@ class Judge(nn.Module):
         self.hold = hold
         self.register_buffer("threshold", torch.tensor(threshold))
 
-    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Verdict:
+    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Judgement:
         """Judge clips.
 
         Args:
@@ -59,8 +59,8 @@ class Judge(nn.Module):
         """
         return frames, first, instruction
 
-    def fetch(self, ticket: Any) -> Verdict:
-        """The verdict on what `submit` was given."""
+    def fetch(self, ticket: Any) -> Judgement:
+        """The judgement on what `submit` was given."""
         return self.score(*ticket)
 
     def streak(self, success: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
@@ -86,7 +86,7 @@ class Judge(nn.Module):
         return done.any(1)
 
 
-def verdict_status(success: Tensor) -> Tensor:
+def judgement_status(success: Tensor) -> Tensor:
     """Status int64 [B] of probabilities [B, T]: ERROR where one is not finite, OK elsewhere."""
     bad = ~torch.isfinite(success).all(1)
     return torch.where(bad, Status.ERROR.value, Status.OK.value)

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from envs.encoders import MultiViewEncoder, to_signed
-from envs.judges.base import Judge, Verdict, verdict_status
+from envs.judges.base import Judge, Judgement, judgement_status
 from envs.language import TextEncoder
 from envs.ranges import Count, Discount, Share
 from envs.specs import Status, WorldSpec, text_to_bytes
@@ -77,8 +77,8 @@ class LearnedJudge(Judge):
         return success, progress
 
     @torch.no_grad()
-    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Verdict:
-        """See Judge.score; the verdict lies on the device of the frames."""
+    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Judgement:
+        """See Judge.score; the judgement lies on the device of the frames."""
         batch, count = frames.shape[:2]
         device, text = self.threshold.device, text_to_bytes(instruction)
         rows = torch.arange(batch).repeat_interleave(count)
@@ -88,11 +88,11 @@ class LearnedJudge(Judge):
             beside = first[some.to(first.device)]
             parts.append(torch.stack(self(seen.to(device), beside.to(device), text[some].to(device))))
         success, progress = torch.cat(parts, 1).sigmoid().to(frames.device).unflatten(1, (batch, count))
-        return Verdict(success, progress, self._status(success))
+        return Judgement(success, progress, self._status(success))
 
     def _status(self, success: Tensor) -> Tensor:
         """Status [B] of probabilities [B, T]."""
-        status = verdict_status(success)
+        status = judgement_status(success)
         if not self.margin:
             return status
         near = (success.amax(1) - self.threshold.to(success.device)).abs() < self.margin

@@ -1,21 +1,21 @@
-"""The judge that asks physics: a task suite's own success and progress as verdicts."""
+"""The judge that asks physics: a task suite's own success and progress as judgements."""
 
 from __future__ import annotations
 
 from torch import Tensor
 
-from envs.judges.base import Judge, Verdict, verdict_status
+from envs.judges.base import Judge, Judgement, judgement_status
 
 
 class RuleJudge(Judge):
-    """The verdict of a task suite itself; it can judge physics only, because no picture shows it.
+    """The judgement of a task suite itself; it can judge physics only, because no picture shows it.
 
     Args:
         hold: 1 where the suite counts the hold itself, as suites here do.
     """
 
-    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Verdict:
-        """Refused: see `verdict`.
+    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Judgement:
+        """Refused: see `judgement`.
 
         Raises:
             ValueError: always; generated video has no rule to ask.
@@ -25,7 +25,7 @@ class RuleJudge(Judge):
             " generated video"
         )
 
-    def verdict(self, success: Tensor, progress: Tensor) -> Verdict:
-        """Verdicts on what PhysicsEnv says: success bool [B, T] and progress float32 [B, T] in 0..1."""
+    def judgement(self, success: Tensor, progress: Tensor) -> Judgement:
+        """Judgements on what PhysicsEnv says: success bool [B, T] and progress float32 [B, T] in 0..1."""
         probability = success.float()
-        return Verdict(probability, progress.clamp(0, 1), verdict_status(progress + probability))
+        return Judgement(probability, progress.clamp(0, 1), judgement_status(progress + probability))

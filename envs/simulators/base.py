@@ -57,16 +57,17 @@ class Simulator(nn.Module):
         return torch.device("cpu") if tensor is None else tensor.device
 
     # -- what an engine gives
-    # ----------------------------------------------------------------------------------------
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """Generate the frames of one chunk.
 
         Args:
-            inputs: TensorDict [B], as memory.py and inputs.py build it, with memory: frames uint8 [M, V, 3,
-                H, W], commands [M, A], and pose_map uint8 [M, V, 3, H, W], c2w
-                    [M, V, 4, 4] where the spec asks for them;
-                future: commands [K, A], and pose_map, c2w likewise; now: command [A], state [S]; intrinsic
-                [V, 3, 3] pixels, if cameras are calibrated; seed int64 [], chunk_index int64 [].
+            inputs: TensorDict [B], as memory.py and inputs.py build it, with
+                memory: frames uint8 [M, V, 3, H, W], commands [M, A], and pose_map uint8 [M, V, 3, H, W],
+                c2w [M, V, 4, 4] where the spec asks for them;
+                future: commands [K, A], and pose_map, c2w likewise;
+                now: command [A], state [S];
+                intrinsic [V, 3, 3] in pixels, if cameras are calibrated;
+                seed int64 [], chunk_index int64 [].
 
         Returns:
             frames uint8 [B, K, V, 3, H, W] and features float32 [B, *feature_shape] for the state expert.
@@ -82,26 +83,29 @@ class Simulator(nn.Module):
         return self.predict(inputs)[1]
 
     def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
-        """Take units from data before the first training: commands [N, A], changes of absolute commands
-        within a chunk
-        [N, A] (zeros of delta actions), states [N, S]. Here there are none to take."""
+        """Take units from data before the first training; here there are none to take.
+
+        Args:
+            commands: [N, A].
+            moves: [N, A], changes of absolute commands within a chunk; zeros of delta actions.
+            states: [N, S].
+        """
 
     def fit_camera_statistics(self, frames: Tensor) -> None:
-        """Learn how cameras usually see, before the first training, from frames uint8 [N, V, 3, H, W] of
-        different
-        episodes. Here nothing is learned."""
+        """Learn how cameras usually see, before the first training; here nothing is learned.
+
+        Args:
+            frames: uint8 [N, V, 3, H, W] of different episodes.
+        """
 
     def recall(self, state: TensorDict, future: TensorDict) -> TensorDict:
-        """What is remembered for the next chunk, [B, M, ...]; evenly spread over the past, with the first
-        frame.
-        """
+        """Memory for the next chunk, [B, M, ...]: evenly spread over the past, with the first frame."""
         return memory.recall(state, self.memory_frames)
 
     def release(self, state: TensorDict, mask: Tensor) -> None:
         """The sessions of `mask` [B] end; what is held for them elsewhere can go. Here nothing is."""
 
     # -- the contract
-    # --------------------------------------------------------------------------------------------------
     def reset(self, first: TensorDict, seed: Tensor, capacity: int = 1) -> TensorDict:
         """Begin sessions from first frames.
 
@@ -151,6 +155,5 @@ class Simulator(nn.Module):
 
 def to_bytes(frames: Tensor) -> Tensor:
     """Float frames in 0..1, or somewhat beyond, as uint8."""
-    return (
-        frames.clamp(0, 1).mul_(255).round_().to(torch.uint8)
-    )  # in place: these are a rollout's largest tensors
+    # in place: these are a rollout's largest tensors
+    return frames.clamp(0, 1).mul_(255).round_().to(torch.uint8)

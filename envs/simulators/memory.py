@@ -14,17 +14,11 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from envs.specs import memory_indices
+
 # What a first frame or a chunk brings, by its name there, and the history's name for it.
 _FIRST = {"frames": "frames", "command": "commands", "state": "states", "pose_map": "pose_map", "c2w": "c2w"}
 _MEMORY = ("frames", "commands", "pose_map", "c2w")
-
-
-def memory_indices(length: Tensor, count: int) -> Tensor:
-    """Which `count` of the first `length` [...] frames to remember, [..., count]: evenly spread, both ends
-    included.
-    """
-    share = torch.linspace(0, 1, count, dtype=torch.float64, device=length.device)
-    return ((length.unsqueeze(-1) - 1) * share).round().long()
 
 
 def new_sessions(past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1) -> TensorDict:

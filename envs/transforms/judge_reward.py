@@ -11,20 +11,20 @@ from tensordict import TensorDictBase
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from envs.judges.base import Judge, Verdict
+from envs.judges.base import Judge, Judgement
 from envs.specs import FEATURES, FRAMES, IMAGE, JUDGE_STATUS, PROGRESS, SUCCESS, Rewards, Status
 
 
 class JudgeReward(Transform):
     """Success, progress and reward of imagined video; the frames themselves stay behind.
 
-    A verdict that is not OK ends the episode and is written to `judge_status`, by which learners drop and
+    A judgement that is not OK ends the episode and is written to `judge_status`, by which learners drop and
     count it.
 
     Args:
         judge: scores frames.
         rewards: turns progress and success into a number.
-        later: do not wait for verdicts. Episodes then run to their horizon, and `settle` writes rewards and
+        later: do not wait for judgements. Episodes then run to their horizon, and `settle` writes rewards and
             ends into the finished rollout; what a slot did after its success belongs to no episode.
     """
 
@@ -55,11 +55,11 @@ class JudgeReward(Transform):
         return next_tensordict.exclude(FRAMES, FEATURES, "world")
 
     def forget(self) -> None:
-        """Drop what waits for a verdict, of a rollout that came to nothing."""
+        """Drop what waits for a judgement, of a rollout that came to nothing."""
         self._tickets = []
 
     def settle(self, batch: TensorDictBase) -> None:
-        """Write the verdicts of a finished rollout [B, T] of whole episodes into it."""
+        """Write the judgements of a finished rollout [B, T] of whole episodes into it."""
         tickets, self._tickets = self._tickets, []
         if len(tickets) != batch.shape[1]:
             raise RuntimeError(
@@ -73,18 +73,18 @@ class JudgeReward(Transform):
             self._decide(self.judge.fetch(ticket), after)
             batch["next"][:, number] = after
 
-    def _decide(self, verdict: Verdict, next_tensordict: TensorDictBase) -> None:
+    def _decide(self, judgement: Judgement, next_tensordict: TensorDictBase) -> None:
         """Reward, success, progress, status and ends of one step; remembers progress and the run of
         successes.
         """
-        done, self._run = self.judge.streak(verdict.success, self._run)
-        failed = (verdict.status != Status.OK.value).unsqueeze(-1)
+        done, self._run = self.judge.streak(judgement.success, self._run)
+        failed = (judgement.status != Status.OK.value).unsqueeze(-1)
         success = done.any(1, keepdim=True) & ~failed
-        progress = torch.where(failed, self._progress, verdict.progress[:, -1:])
+        progress = torch.where(failed, self._progress, judgement.progress[:, -1:])
         next_tensordict["reward"] = self.rewards(self._progress, progress, success)
         self._progress = progress
         next_tensordict[SUCCESS], next_tensordict[PROGRESS] = success, progress
-        next_tensordict[JUDGE_STATUS] = verdict.status.unsqueeze(-1)
+        next_tensordict[JUDGE_STATUS] = judgement.status.unsqueeze(-1)
         next_tensordict["terminated"] = success | failed
         next_tensordict["truncated"] = next_tensordict["truncated"] & ~next_tensordict["terminated"]
         next_tensordict["done"] = next_tensordict["terminated"] | next_tensordict["truncated"]

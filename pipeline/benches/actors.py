@@ -10,13 +10,15 @@ from typing import Any
 
 import ray
 
-from actors.factory import build_policy, prepare_process, world_spec
+from actors.factory import build_policy
 from actors.fleets.cluster import Plan, connect
 from actors.fleets.fleet import Fleet, LocalFleet, Result
 from actors.fleets.ray_fleet import RayFleet
 from actors.policies.contract import freeze_perception
+from actors.process import prepare_process
 from actors.rollouts.host import Job, trained_weights
 from actors.rollouts.recipe import Recipe, build_host
+from actors.world_config import world_spec
 from envs.specs import TEXT_BYTES
 from pipeline.commands.demo_world import demo_recipe
 

@@ -9,7 +9,8 @@ import torch
 from diffusers import AutoencoderKLWan
 from torch.utils.flop_counter import FlopCounterMode
 
-from envs.simulators.dit.network import DiTShape, MultiViewDiT
+from envs.simulators.dit.network import MultiViewDiT
+from envs.simulators.dit.shape import DiTShape
 from envs.simulators.dit.state_network import StateDiT
 from envs.specs import WorldSpec
 

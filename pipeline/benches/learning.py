@@ -11,9 +11,9 @@ from typing import Any
 
 import torch
 
-from actors.factory import prepare_process
 from actors.fleets.fleet import LocalFleet
 from actors.policies.vla import ChunkPolicy
+from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
 from actors.rollouts.host import Host
 from envs.physics.toy_tracking import ToyTrackingEnv

@@ -18,7 +18,8 @@ import numpy as np
 from aiohttp import web
 from numpy.typing import NDArray
 
-from actors.factory import build_simulator, build_state_decoder, open_clips, prepare_process
+from actors.factory import build_simulator, build_state_decoder, open_clips
+from actors.process import prepare_process
 from actors.serving.app import Server, listening
 from actors.serving.sessions import ServeConfig, SessionHost
 from envs.episodes.clips import ClipStore

@@ -13,14 +13,9 @@ from typing import Any
 import torch
 from torch import nn
 
-from actors.factory import (
-    build_pool,
-    build_simulator,
-    build_state_decoder,
-    open_clips,
-    prepare_process,
-    world_spec,
-)
+from actors.factory import build_pool, build_simulator, build_state_decoder, open_clips
+from actors.process import prepare_process
+from actors.world_config import world_spec
 from envs.episodes import Episode, LeRobotWriter
 from envs.episodes.clips import ClipSpec, ClipStore
 from envs.rng import step_generator

@@ -9,7 +9,8 @@ from typing import Any
 
 import torch
 
-from actors.factory import build_simulator, open_clips, prepare_process
+from actors.factory import build_simulator, open_clips
+from actors.process import prepare_process
 from envs.physics.pool import TaskPool
 from envs.precision import mixed_precision
 from envs.simulators.replay import future_of

@@ -15,10 +15,11 @@ from typing import Any
 
 import ray
 
-from actors.factory import build_algorithm, build_policy, prepare_process
+from actors.factory import build_algorithm, build_policy
 from actors.fleets.launch import build_fleet
 from actors.fleets.ray_fleet import RayFleet
 from actors.policies.contract import freeze_perception
+from actors.process import prepare_process
 from learners.rl.loop import train_rl
 from pipeline.commands.demo_world import demo_recipe
 from pipeline.config import load_config

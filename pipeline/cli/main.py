@@ -5,6 +5,7 @@ What a command needs is imported when it runs, so that help and mistakes answer 
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 
@@ -49,8 +50,18 @@ def _explained(error: Exception) -> bool:
     return isinstance(error, OSError) or type(error).__module__.split(".")[0] in _ROOMS
 
 
+def _find_modules_here() -> None:
+    """Let a `_target_` name a class in the folder in which the command was typed, as `python -m` does.
+
+    What is installed is found first. Physics workers and Ray's processes on this machine look there too.
+    """
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+
+
 def main() -> None:
     """Entry point of `worldloop` and `python -m pipeline`."""
+    _find_modules_here()
     words = sys.argv[1:]
     if not words or words[0] in ("-h", "--help", "help"):
         print(_help())

@@ -22,7 +22,7 @@ def root_of(cfg: dict[str, Any]) -> Path:
 
 def prepared(words: Words) -> tuple[dict[str, Any], Path]:
     """The config and the run's folder, with this process made ready for work."""
-    from actors.factory import device_of, prepare_process
+    from actors.process import device_of, prepare_process
     from pipeline.config import load_config
 
     cfg = load_config(words)

@@ -13,15 +13,9 @@ from typing import Any
 import torch
 from torch import nn
 
-from actors.factory import (
-    build_judge,
-    build_policy,
-    build_pool,
-    build_simulator,
-    build_state_decoder,
-    world_spec,
-)
+from actors.factory import build_judge, build_policy, build_pool, build_simulator, build_state_decoder
 from actors.rollouts.recipe import Recipe
+from actors.world_config import world_spec
 from envs.episodes import Episode, LeRobotWriter
 from pipeline.graph.artefact import save_weights
 

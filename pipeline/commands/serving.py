@@ -1,6 +1,4 @@
-"""Which world `worldloop serve` serves: the experiment's last, what finetune made of it, or a released
-checkpoint.
-"""
+"""Which world `worldloop serve` serves: what finetune made, the experiment's last, or a released one."""
 
 from __future__ import annotations
 
@@ -8,34 +6,48 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from actors.factory import build_kinematics, build_simulator, build_state_decoder, world_spec
+from actors.factory import build_simulator, build_state_decoder
 from actors.serving.sessions import ServeConfig, SessionHost
+from actors.world_config import build_kinematics, world_spec
 from envs.conditioning.joint_commands import JointCommands
 from envs.embodiment import ActionKind
 from envs.simulators.remote.engine import RemoteSimulator
 from envs.targets import ConfigError, target
+from pipeline.commands.finetune import build_finetune
 from pipeline.loop import build_loop, last_round
 
 
 def build_session_host(cfg: Mapping[str, Any], root: Path, config: ServeConfig) -> SessionHost:
     """The sessions of the configured simulator.
 
+    With finetune.data it is what `worldloop finetune` made of those data; else the experiment's last, or,
+    where nothing was trained, a released checkpoint.
+
     Raises:
         ConfigError: if it has no weights yet, or is itself remote.
     """
     if issubclass(target(cfg["simulator"], "simulator"), RemoteSimulator):  # type: ignore[arg-type]
         raise ConfigError("simulator=remote is served already; serve unet, dit or gesim")
-    graph, last = build_loop(cfg, root), last_round(cfg)
-    weights, states = (
-        graph.folder(f"{stage}-{last}") / "weights.safetensors" for stage in ("simulator", "state")
-    )
-    if not weights.exists() and not cfg["simulator"].get("checkpoint"):
+    if cfg["finetune"]["data"]:
+        graph, stages, way = build_finetune(cfg, root), ("simulator", "state"), "worldloop finetune"
+    else:
+        last = last_round(cfg)
+        graph, stages, way = build_loop(cfg, root), (f"simulator-{last}", f"state-{last}"), "worldloop run"
+    cfg = graph.cfg  # of the data's robot, if it is a fine-tuned one
+    weights, states = (graph.folder(stage) / "weights.safetensors" for stage in stages)
+    released = cfg["simulator"].get("checkpoint") and not cfg["finetune"]["data"]
+    if not weights.exists() and not released:
         raise ConfigError(
-            f"{weights} does not exist; run this experiment first, or serve released weights by"
-            " simulator=gesim simulator.checkpoint=<folder>"
+            f"{weights} does not exist; run `{way}` with these words first, or serve released weights by"
+            " simulator=gesim simulator.checkpoint=<folder> without finetune.data"
+        )
+    if weights.exists() and not states.exists():
+        raise ConfigError(
+            f"{states} does not exist, so nobody knows the robot's state in what this simulator draws; let"
+            f" `{way}` with these words go on"
         )
     simulator = build_simulator(cfg, weights if weights.exists() else None)
-    decoder = build_state_decoder(cfg, simulator, states if states.exists() else None)
+    decoder = build_state_decoder(cfg, simulator, states if weights.exists() else None)
     return SessionHost(simulator, decoder.eval(), config, _joints(cfg), cfg["simulator"]["bf16"])
 
 

@@ -11,8 +11,9 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from actors.factory import build_physics, build_policy, build_pool, open_clips, world_spec
+from actors.factory import build_physics, build_policy, build_pool, open_clips
 from actors.rollouts.evaluate import evaluate
+from actors.world_config import world_spec
 from envs.episodes.episode import Episode
 from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.episodes.formats.lerobot_writer import LeRobotWriter

@@ -7,7 +7,8 @@ from typing import Any
 
 import torch
 
-from actors.factory import build_policy, prepare_process
+from actors.factory import build_policy
+from actors.process import prepare_process
 from learners.stages.imitation import Cloning, train_imitation
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage

@@ -7,7 +7,8 @@ from typing import Any
 
 import torch
 
-from actors.factory import build_simulator, build_state_decoder, open_clips, prepare_process
+from actors.factory import build_simulator, build_state_decoder, open_clips
+from actors.process import prepare_process
 from envs.targets import options
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state

@@ -7,7 +7,8 @@ from typing import Any
 
 import torch
 
-from actors.factory import build_policy, build_simulator, prepare_process
+from actors.factory import build_policy, build_simulator
+from actors.process import prepare_process
 from learners.stages.generated import generated_frames
 from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.perception import train_perception

@@ -9,14 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from actors.factory import (
-    build_judge,
-    build_physics,
-    build_policy,
-    build_simulator,
-    build_state_decoder,
-    prepare_process,
-)
+from actors.factory import build_judge, build_physics, build_policy, build_simulator, build_state_decoder
+from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
 from envs.simulators.replay import replay
 from pipeline.evaluation import measurement
@@ -107,7 +101,7 @@ def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 
 def _imagined(success: Tensor, judged: Tensor) -> dict[str, Any]:
-    """A rate entry of what the judge gave a verdict on, and how many it dropped."""
+    """A rate entry of what the judge gave a judgement on, and how many it dropped."""
     return {**rate_entry(success[judged]), "dropped": int((~judged).sum())}
 
 

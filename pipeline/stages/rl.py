@@ -7,10 +7,12 @@ from typing import Any
 
 import torch
 
-from actors.factory import build_algorithm, build_policy, prepare_process, rewards_of
+from actors.factory import build_algorithm, build_policy
 from actors.fleets.launch import build_fleet
 from actors.policies.contract import action_key, freeze_perception
+from actors.process import prepare_process
 from actors.rollouts.recipe import Recipe
+from actors.world_config import rewards_of
 from envs.episodes.clips import ClipStore
 from envs.initial_states import decision_points
 from envs.specs import CHUNK

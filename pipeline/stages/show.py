@@ -9,7 +9,9 @@ from typing import Any
 
 import torch
 
-from actors.factory import build_policy, build_simulator, open_clips, prepare_process, world_spec
+from actors.factory import build_policy, build_simulator, open_clips
+from actors.process import prepare_process
+from actors.world_config import world_spec
 from envs.episodes.clips import ClipStore
 from envs.episodes.episode import Episode
 from envs.episodes.formats.lerobot_writer import LeRobotWriter

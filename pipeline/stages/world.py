@@ -10,7 +10,8 @@ from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
-from actors.factory import build_judge, build_simulator, build_state_decoder, prepare_process
+from actors.factory import build_judge, build_simulator, build_state_decoder
+from actors.process import prepare_process
 from envs.episodes.clips import ClipStore
 from envs.simulators.base import Simulator
 from envs.targets import ConfigError, options

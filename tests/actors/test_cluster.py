@@ -19,12 +19,13 @@ import pytest
 import ray
 from ray.cluster_utils import Cluster
 
-from actors.factory import ConfigError, build_policy
+from actors.factory import build_policy
 from actors.fleets.cluster import _advice, check_versions, connect, versions
 from actors.fleets.launch import build_fleet
 from actors.fleets.ray_fleet import RayFleet
 from actors.rollouts.host import Job, trained_weights
 from actors.rollouts.recipe import Recipe
+from envs.targets import ConfigError
 from pipeline.chaos.processes import belonging, nothing_left
 from pipeline.commands.submit import entrypoint
 from pipeline.config import load_config

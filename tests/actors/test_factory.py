@@ -9,8 +9,11 @@ from typing import Any
 import pytest
 import torch
 
-from actors.factory import build_policy, device_of, prepare_process, world_spec
-from envs.embodiment import INFO_KEY, Embodiment
+from actors.factory import build_policy
+from actors.process import device_of, prepare_process
+from actors.world_config import world_spec
+from envs.embodiment import Embodiment
+from envs.episodes.formats.lerobot_info import INFO_KEY, to_info
 from envs.targets import ConfigError
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES
 from tests.sections import section
@@ -31,7 +34,7 @@ def recorded(robot: Embodiment, folder: Path) -> Path:
             "names": ["height", "width", "channels"],
         }
     (folder / "meta").mkdir(parents=True)
-    features["action"]["info"] = {INFO_KEY: robot.to_info()}
+    features["action"]["info"] = {INFO_KEY: to_info(robot)}
     info = {"robot_type": robot.robot, "fps": robot.fps, "features": features}
     (folder / "meta/info.json").write_text(json.dumps(info))
     return folder

@@ -1,4 +1,4 @@
-"""The judge as a service: same verdicts, remembered, within its budget, and an ERROR when it is gone."""
+"""The judge as a service: same judgements, remembered, within its budget, and an ERROR when it is gone."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ import pytest
 import ray
 import torch
 
-from actors.factory import ConfigError, build_judge
+from actors.factory import build_judge
 from actors.fleets.cluster import connect
 from actors.fleets.fleet import LocalFleet
 from actors.rollouts.host import Job
 from actors.rollouts.recipe import Recipe, build_host
 from actors.serving.judge_service import JudgeClient, ServiceConfig, start_service
 from envs.specs import EPISODE, JUDGE_STATUS, SUCCESS, Status
+from envs.targets import ConfigError
 from learners.rl.algorithm import first_episode
 from pipeline.graph.artefact import save_weights
 

@@ -14,14 +14,14 @@ import ray
 import torch
 from tensordict import TensorDict
 
-from actors.factory import ConfigError, build_algorithm, build_policy
+from actors.factory import build_algorithm, build_policy
 from actors.fleets.cluster import Plan, connect
-from actors.fleets.fleet import Fleet, FleetError, LocalFleet
+from actors.fleets.fleet import Fleet, FleetError, LocalFleet, Patience
 from actors.fleets.launch import build_fleet
-from actors.fleets.ray_fleet import Patience, RayFleet
+from actors.fleets.ray_fleet import RayFleet
 from actors.rollouts.host import Job, pack, trained_weights, unpack
 from actors.rollouts.recipe import Recipe, build_host
-from envs.targets import options
+from envs.targets import ConfigError, options
 from learners.rl.algorithm import RLConfig
 from learners.rl.loop import train_rl
 

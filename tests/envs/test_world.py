@@ -8,7 +8,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from envs.initial_states import InitialStates
-from envs.judges.base import Judge, Verdict
+from envs.judges.base import Judge, Judgement
 from envs.specs import (
     CHUNK,
     COMMAND,
@@ -34,7 +34,7 @@ STARTS = 8
 
 
 class Fixed(Judge):
-    """A judge whose verdicts are given, to test what becomes of them; it notes what it was shown."""
+    """A judge whose judgements are given, to test what becomes of them; it notes what it was shown."""
 
     def __init__(self, success: float, status: Status = Status.OK, hold: int = 1):
         super().__init__(hold)
@@ -42,11 +42,11 @@ class Fixed(Judge):
         self.shown: list[torch.Tensor] = []
         self.asked: list[list[str]] = []
 
-    def score(self, frames: torch.Tensor, first: torch.Tensor, instruction: list[str]) -> Verdict:
+    def score(self, frames: torch.Tensor, first: torch.Tensor, instruction: list[str]) -> Judgement:
         self.shown.append(first)
         self.asked.append(list(instruction))
         filled = torch.full(frames.shape[:2], self.value)
-        return Verdict(filled, filled, torch.full(frames.shape[:1], self.said.value))
+        return Judgement(filled, filled, torch.full(frames.shape[:1], self.said.value))
 
 
 def world(name: str, batch: int, judge: Judge | None = None, horizon: int = 12) -> TransformedEnv:

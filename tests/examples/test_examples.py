@@ -10,19 +10,33 @@ import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from envs.episodes import LeRobotDataset
 from envs.physics.suite import build_suite
 from envs.simulators.state_experts.head import StateHead
 from envs.specs import CHUNK, LOG_PROB, Status
 from envs.targets import ConfigError, build
+from examples import recordings
+from pipeline.config import load_config
 from tests.embodiments import EMBODIMENTS, observations, world_spec
 from tests.envs.simulators.clips import clip, first_of, future_of
 
-EXAMPLES = sorted((Path(__file__).resolve().parents[2] / "examples").glob("*.py"))
+FOLDER = Path(__file__).resolve().parents[2] / "examples"
+EXAMPLES = sorted(FOLDER.glob("*.py"))
+CHOICES = [f"{path.parent.name}={path.stem}" for path in sorted((FOLDER / "configs").glob("*/*.yaml"))]
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_examples_are_short(path: Path) -> None:
     assert len(path.read_text().splitlines()) < 100
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_examples_are_choices_like_any_other(choice: str) -> None:
+    """Names, values and class are checked as those of configs/ are."""
+    group, name = choice.split("=")
+    cfg = load_config(["experiment=smoke", f"hydra.searchpath=[file://{FOLDER / 'configs'}]", choice])
+    section = cfg[group].get("suite", cfg[group])
+    assert section["_target_"].startswith("examples."), name
 
 
 def test_the_words_decide_in_the_example_suite() -> None:
@@ -90,8 +104,18 @@ def test_the_example_judge_knows_its_goal(tmp_path: Path) -> None:
     shape = (spec.views, 3, *spec.size)
     first = torch.zeros(1, *shape, dtype=torch.uint8)
     frames = torch.stack([torch.full(shape, value, dtype=torch.uint8) for value in (0, 100, 200)])[None]
-    verdict = judge.score(frames, first, ["make it light"])
-    assert verdict.success[0].gt(0.5).tolist() == [False, False, True]
-    assert verdict.progress[0].diff().gt(0).all() and int(verdict.status) == Status.OK.value
+    judged = judge.score(frames, first, ["make it light"])
+    assert judged.success[0].gt(0.5).tolist() == [False, False, True]
+    assert judged.progress[0].diff().gt(0).all() and int(judged.status) == Status.OK.value
     with pytest.raises(ConfigError, match=r"nothing\.png"):
         build({**section, "picture": str(tmp_path / "nothing.png")}, "judge", spec=spec)
+
+
+def test_the_example_recordings_are_a_data_set(tmp_path: Path) -> None:
+    recordings.write(tmp_path / "data")
+    found = LeRobotDataset(tmp_path / "data")
+    assert len(found) == sum(recordings.SPLITS.values())
+    by_source = {episode.source: [] for episode in found}
+    for episode in found:
+        by_source[episode.source].append(bool(episode.success.any()))
+    assert all(by_source["expert"]) and not all(by_source["noisy"])

@@ -6,6 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from pipeline.cli.main import main
+
 ROOT = Path(__file__).resolve().parent.parent.parent
 
 
@@ -65,3 +69,18 @@ def test_tasks_are_listed_with_what_can_be_chosen() -> None:
     assert "task=push" in some.stdout and "hand_left" in some.stdout and "(50; " in some.stdout, some
     assert "window-open-v3" in one.stdout and "task=push" not in one.stdout
     assert "did you mean metaworld" in worldloop("tasks", "task=metawrld").stderr
+
+
+def test_choices_and_classes_of_the_folder_one_stands_in_are_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "found_here.py").write_text("class Mine:\n    def __init__(self, spec, width: int): ...\n")
+    (tmp_path / "choices/policy").mkdir(parents=True)
+    (tmp_path / "choices/policy/mine.yaml").write_text("_target_: found_here.Mine\nwidth: 3\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(ROOT), *sys.path])  # as it was, once this is over
+    monkeypatch.setattr(
+        sys, "argv", ["worldloop", "config", "hydra.searchpath=[file://choices]", "policy=mine"]
+    )
+    main()
+    assert "_target_: found_here.Mine" in capsys.readouterr().out

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import nn
 
-from actors.factory import load
+from actors.weights import load
 from envs.episodes.episode import EpisodeError
 from envs.episodes.formats.bridge import BRIDGE_CLIPS
 from envs.episodes.formats.recordings import Cut, read_numbers

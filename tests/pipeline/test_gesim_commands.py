@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file
 
-from actors.factory import ConfigError, build_simulator, build_state_decoder
-from envs.simulators.dit.network import DiTShape
+from actors.factory import build_simulator, build_state_decoder
+from envs.simulators.dit.shape import DiTShape
+from envs.targets import ConfigError
 from pipeline.benches.gesim import FULL
 from pipeline.benches.gesim_floor import count_flops
 from pipeline.cli import tools
@@ -60,10 +62,16 @@ def test_finetune_a_checkpoint_and_serve_what_came_of_it(shared: Path, tmp_path:
     assert set(done) == {"simulator", "state"}
     simulator = build_simulator(graph.cfg, graph.folder("simulator") / "weights.safetensors")
     build_state_decoder(graph.cfg, simulator, graph.folder("state") / "weights.safetensors")
-    host = build_session_host(graph.cfg, tmp_path / "runs/default", serve_config())
-    assert host.simulator.spec.chunk == 5 and host.decoder is not None
-    with pytest.raises(ConfigError, match="run this experiment first"):
+    host = build_session_host(cfg, tmp_path / "runs/default", serve_config())
+    assert host.simulator.spec.chunk == 5
+    for served, stage in ((host.simulator, "simulator"), (host.decoder, "state")):
+        tuned = load_file(graph.folder(stage) / "weights.safetensors")
+        for name, value in served.named_parameters():  # buffers of the mix are handed over by the decoder
+            assert torch.equal(value, tuned[name].to(value.dtype)), (stage, name)
+    with pytest.raises(ConfigError, match="worldloop run"):
         build_session_host(load_config(WORDS), tmp_path / "nowhere", serve_config())
+    with pytest.raises(ConfigError, match="worldloop finetune"):
+        build_session_host(cfg, tmp_path / "nowhere", serve_config())
     with pytest.raises(ConfigError, match=r"finetune\.data"):
         build_finetune(load_config(WORDS), tmp_path / "none").run()
 

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from actors.factory import prepare_process
+from actors.process import prepare_process
 from envs.manifest import write_manifest
 from pipeline.config import load_config
 from pipeline.loop import build_loop

@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.dataset as pads
 from numpy.typing import NDArray
 
-from envs.embodiment import INFO_KEY, Embodiment, EmbodimentError, camera_features
+from envs.embodiment import Embodiment, EmbodimentError
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.formats import lerobot_columns as names
 from envs.episodes.formats.lerobot_columns import PRIVILEGED, calibrated
@@ -28,6 +28,7 @@ from envs.episodes.formats.lerobot_files import (
     read_info,
     read_tasks,
 )
+from envs.episodes.formats.lerobot_info import INFO_KEY, camera_features
 from envs.episodes.formats.lerobot_robot import agreed_robot
 from envs.episodes.pictures import resize_intrinsics, resize_picture
 from envs.episodes.video import read_clip

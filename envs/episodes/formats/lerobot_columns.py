@@ -11,10 +11,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
-from envs.embodiment import IMAGE_PREFIX, INFO_KEY, Embodiment
+from envs.embodiment import Embodiment
 from envs.episodes.episode import Episode
+from envs.episodes.formats.lerobot_info import IMAGE_PREFIX, INFO_KEY, to_info
 
 VERSION = "v3.0"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -62,6 +64,33 @@ def columns_of(episode: Episode) -> dict[str, NDArray[Any]]:
     }
 
 
+def indexed_columns(
+    episode: Episode, number: int, row: int, task: int, features: dict[str, Any]
+) -> dict[str, NDArray[Any]]:
+    """The columns of an episode in a data set of these features, with its number, first row and task."""
+    columns, length = columns_of(episode), len(episode)
+    if PRESENT in features:
+        columns[PRESENT] = episode.present
+    columns["episode_index"] = np.full(length, number)
+    columns["index"] = np.arange(row, row + length)
+    columns["task_index"] = np.full(length, task)
+    return {name: columns[name] for name in features if name in columns}
+
+
+def arrow_table(columns: dict[str, NDArray[Any]]) -> pa.Table:
+    """Columns [T] or [T, n] as a table; n numbers become a list of fixed size."""
+    return pa.table({name: _column(value) for name, value in columns.items()})
+
+
+def _column(values: NDArray[Any]) -> pa.Array:
+    if values.dtype == object:
+        return pa.array(values.tolist(), pa.string())
+    if values.ndim == 1:
+        return pa.array(values)
+    flat = pa.array(np.ascontiguousarray(values, np.float32).reshape(-1))
+    return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+
+
 def features_of(episode: Episode) -> dict[str, dict[str, Any]]:
     """The `features` of info.json for episodes like this one: pictures, its columns, the indices."""
     robot = episode.embodiment
@@ -80,7 +109,7 @@ def features_of(episode: Episode) -> dict[str, dict[str, Any]]:
         kind = "string" if value.dtype == object else str(value.dtype)
         shape = [1] if value.ndim == 1 else [value.shape[1]]
         features[name] = {"dtype": kind, "shape": shape, "names": names.get(name)}
-    features["action"]["info"] = {INFO_KEY: robot.to_info()}
+    features["action"]["info"] = {INFO_KEY: to_info(robot)}
     for name, value in episode.privileged.items():
         features[PRIVILEGED + name]["info"] = {INFO_KEY: {"shape": list(value.shape[1:])}}
     for name in INDICES:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 
 from envs.episodes.episode import EpisodeError
 from envs.episodes.formats.lerobot_columns import VERSION
+
+_SUMS: dict[str, Any] = {"write_page_checksum": True}  # a flipped bit is an error, not another number
 
 
 def column_array(table: pa.Table, name: str) -> NDArray[Any]:
@@ -45,6 +48,13 @@ def open_parquet(path: Path) -> pq.ParquetFile:
         return pq.ParquetFile(path, page_checksum_verification=True)
     except (OSError, pa.ArrowInvalid) as error:
         raise EpisodeError(f"{path}: {error}; restore the file or collect its episodes again") from error
+
+
+def write_groups(path: Path, tables: Sequence[pa.Table]) -> None:
+    """Each table as a row group of its own, so that one episode can be read without the others."""
+    with pq.ParquetWriter(path, tables[0].schema, **_SUMS) as writer:
+        for table in tables:
+            writer.write_table(table)
 
 
 def read_info(root: Path) -> dict[str, Any]:
@@ -95,3 +105,19 @@ def read_tasks(root: Path) -> dict[str, int]:
     if column is None or "task_index" not in table.column_names:
         raise EpisodeError(f"{path}: has columns {table.column_names}, not task and task_index")
     return dict(zip(table[column].to_pylist(), table["task_index"].to_pylist(), strict=True))
+
+
+def write_tasks(path: Path, tasks: Mapping[str, int]) -> None:
+    """Tasks as LeRobot reads them: by pandas, with the instruction as index."""
+    table = pa.table({"task_index": pa.array(list(tasks.values()), pa.int64()), "task": list(tasks)})
+    kinds = [("task_index", "int64", "int64"), ("task", "unicode", "object")]
+    about = {
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": [
+            {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
+            for name, kind, numpy in kinds
+        ],
+        "pandas_version": "2.0.0",
+    }
+    write_groups(path, [table.replace_schema_metadata({"pandas": json.dumps(about)})])

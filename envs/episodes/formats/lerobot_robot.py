@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from envs.embodiment import INFO_KEY, Embodiment, EmbodimentError
+from envs.embodiment import Embodiment, EmbodimentError
 from envs.episodes.formats import lerobot_columns as names
 from envs.episodes.formats.lerobot_columns import calibrated
+from envs.episodes.formats.lerobot_info import INFO_KEY, from_info
 
 
 def agreed_robot(info: dict[str, Any], given: Embodiment | None = None) -> Embodiment:
@@ -21,7 +22,7 @@ def agreed_robot(info: dict[str, Any], given: Embodiment | None = None) -> Embod
     Raises:
         EmbodimentError: if they contradict each other.
     """
-    recorded = _known_cameras(Embodiment.from_info(info), info["features"])
+    recorded = _known_cameras(from_info(info), info["features"])
     if given is None:
         return recorded
     known = recorded

@@ -15,12 +15,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from envs.embodiment import IMAGE_PREFIX, Embodiment, EmbodimentError
+from envs.embodiment import Embodiment, EmbodimentError
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.formats import lerobot_columns as names
 from envs.episodes.formats.lerobot_columns import (
@@ -29,18 +27,26 @@ from envs.episodes.formats.lerobot_columns import (
     EPISODES_PATH,
     VERSION,
     VIDEO_PATH,
-    columns_of,
+    arrow_table,
     features_of,
+    indexed_columns,
     plain_rate,
 )
-from envs.episodes.formats.lerobot_files import open_parquet, read_episode_rows, read_info, read_tasks
+from envs.episodes.formats.lerobot_files import (
+    open_parquet,
+    read_episode_rows,
+    read_info,
+    read_tasks,
+    write_groups,
+    write_tasks,
+)
+from envs.episodes.formats.lerobot_info import IMAGE_PREFIX
 from envs.episodes.formats.lerobot_robot import agreed_robot
 from envs.episodes.formats.lerobot_stats import column_stats, merge_stats, picture_stats
 from envs.episodes.video import write_video
 from envs.files import write_atomically
 
 _JOURNAL = "meta/worldloop.writing.json"
-_SUMS: dict[str, Any] = {"write_page_checksum": True}  # a flipped bit is an error, not another number
 _FILE = re.compile(r"chunk-(\d+)/file-(\d+)\.")
 
 
@@ -119,8 +125,8 @@ class LeRobotWriter:
         first_row = int(rows[-1]["dataset_to_index"]) if rows else 0
         tables, records, clock, row = [], [], 0, first_row
         for number, episode in enumerate(episodes, len(rows)):
-            columns = _with_indices(episode, number, row, tasks[episode.instruction], features)
-            tables.append(pa.table({name: _column(value) for name, value in columns.items()}))
+            columns = indexed_columns(episode, number, row, tasks[episode.instruction], features)
+            tables.append(arrow_table(columns))
             record: dict[str, Any] = {
                 "episode_index": number,
                 "tasks": [episode.instruction],
@@ -136,11 +142,11 @@ class LeRobotWriter:
                 record[f"videos/{key}/to_timestamp"] = (clock + len(episode)) / self.embodiment.fps
             records.append(record | _stats(episode, columns))
             row, clock = row + len(episode), clock + len(episode)
-        write_atomically(self.root / data, lambda path: _write_groups(path, tables))
+        write_atomically(self.root / data, lambda path: write_groups(path, tables))
         if not rows:
             self._write_json("meta/info.json", self._info(features, [], {}))
         table = self._like_existing(pa.Table.from_pylist(records))
-        write_atomically(self.root / listing, lambda path: pq.write_table(table, path, **_SUMS))
+        write_atomically(self.root / listing, lambda path: write_groups(path, [table]))
         self._rows = [*rows, *records]
         self._describe(features)
         (self.root / _JOURNAL).unlink()
@@ -218,10 +224,7 @@ class LeRobotWriter:
         for episode in episodes:
             tasks.setdefault(episode.instruction, len(tasks))
         if len(tasks) > known:
-            table = _tasks_table(tasks)
-            write_atomically(
-                self.root / "meta/tasks.parquet", lambda path: pq.write_table(table, path, **_SUMS)
-            )
+            write_atomically(self.root / "meta/tasks.parquet", lambda path: write_tasks(path, tasks))
         return tasks
 
     def _describe(self, features: dict[str, Any]) -> None:
@@ -258,34 +261,6 @@ def _signature(feature: dict[str, Any]) -> tuple[Any, ...]:
     return feature["dtype"], tuple(feature["shape"]), tuple(feature.get("names") or ())
 
 
-def _with_indices(
-    episode: Episode, number: int, row: int, task: int, features: dict[str, Any]
-) -> dict[str, NDArray[Any]]:
-    columns, length = columns_of(episode), len(episode)
-    if names.PRESENT in features:
-        columns[names.PRESENT] = episode.present
-    columns["episode_index"] = np.full(length, number)
-    columns["index"] = np.arange(row, row + length)
-    columns["task_index"] = np.full(length, task)
-    return {name: columns[name] for name in features if name in columns}
-
-
-def _column(values: NDArray[Any]) -> pa.Array:
-    if values.dtype == object:
-        return pa.array(values.tolist(), pa.string())
-    if values.ndim == 1:
-        return pa.array(values)
-    flat = pa.array(np.ascontiguousarray(values, np.float32).reshape(-1))
-    return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
-
-
-def _write_groups(path: Path, tables: list[pa.Table]) -> None:
-    """Each episode as a row group of its own, so that one can be read without the others."""
-    with pq.ParquetWriter(path, tables[0].schema, **_SUMS) as writer:
-        for table in tables:
-            writer.write_table(table)
-
-
 def _stats(episode: Episode, columns: dict[str, NDArray[Any]]) -> dict[str, Any]:
     shown = episode.frames[episode.present] if episode.present.any() else episode.frames
     parts = {
@@ -293,19 +268,3 @@ def _stats(episode: Episode, columns: dict[str, NDArray[Any]]) -> dict[str, Any]
     }
     parts |= {name: column_stats(value) for name, value in columns.items() if value.dtype != object}
     return {f"stats/{name}/{stat}": value for name, part in parts.items() for stat, value in part.items()}
-
-
-def _tasks_table(tasks: dict[str, int]) -> pa.Table:
-    """Tasks as LeRobot reads them: by pandas, with the instruction as index."""
-    table = pa.table({"task_index": pa.array(list(tasks.values()), pa.int64()), "task": list(tasks)})
-    kinds = [("task_index", "int64", "int64"), ("task", "unicode", "object")]
-    about = {
-        "index_columns": ["task"],
-        "column_indexes": [],
-        "columns": [
-            {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
-            for name, kind, numpy in kinds
-        ],
-        "pandas_version": "2.0.0",
-    }
-    return table.replace_schema_metadata({"pandas": json.dumps(about)})

@@ -13,8 +13,9 @@ from torch import Tensor
 from envs.conditioning import ActionVector, render_ray_map
 from envs.ranges import Count, Natural, NonNegative, Positive, Share
 from envs.simulators.dit.latent_world import Diffusion, LatentWorld
-from envs.simulators.dit.network import DiTShape, MultiViewDiT
+from envs.simulators.dit.network import MultiViewDiT
 from envs.simulators.dit.prediction import PREDICTIONS
+from envs.simulators.dit.shape import DiTShape
 from envs.simulators.samplers import Euler
 from envs.simulators.tokenizers.autoencoder import STRIDE, Autoencoder
 from envs.specs import WorldSpec

@@ -94,7 +94,6 @@ class LatentWorld(Simulator):
         return self.diffusion.foreground
 
     # -- what a subclass gives
-    # -----------------------------------------------------------------------------------
     def conditioning(self, inputs: TensorDict, latent_hw: tuple[int, int]) -> Tensor:
         """Channels [B, V, C, M + T', h, w] beside the latents at latent_hw = (h, w): a memory mask, and the
         pose map and ray map that the spec asks for.
@@ -106,7 +105,6 @@ class LatentWorld(Simulator):
         return None
 
     # -- latents
-    # ---------------------------------------------------------------------------------------------------
     def encode_stills(self, frames: Tensor) -> Tensor:
         """Latents [B, V, C, M, h, w] of memory frames, float [B, M, V, 3, H, W] in 0..1, each encoded on its
         own.
@@ -129,7 +127,6 @@ class LatentWorld(Simulator):
         return clips.unflatten(0, latents.shape[:2]).transpose(1, 2)
 
     # -- contract
-    # --------------------------------------------------------------------------------------------------
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; noise comes from (seed, chunk_index), features from the last step."""
         latents, features = self._denoise(inputs)
@@ -175,7 +172,6 @@ class LatentWorld(Simulator):
         return value, {}
 
     # -- parts
-    # -----------------------------------------------------------------------------------------------------
     def _unroll(self, clip: TensorDict, chosen: int, generator: torch.Generator) -> TensorDict:
         """Inputs of chunk number `chosen`, whose memory shows the model's own frames of the chunks before."""
         own: Tensor | None = None

@@ -83,7 +83,7 @@ class Attention(nn.Module):
         )
         return self.to_out[0](out.transpose(1, 2).flatten(2))
 
-    def alone(self, value: Tensor) -> Tensor:
+    def of_one_token(self, value: Tensor) -> Tensor:
         """What everybody is told by a context of one token, from its value [B, heads, 1, head_dim]: the
         softmax over one key is 1, whoever asks. [B, 1, width].
         """

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from envs.simulators.dit.layers import Attention, FeedForward, TimestepMLP, rms, sinusoid
-from envs.simulators.dit.network import DiTShape
+from envs.simulators.dit.shape import DiTShape
 
 _ROPE_LENGTH = 57.0
 

@@ -19,7 +19,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from envs.simulators.dit.network import DiTShape, MultiViewDiT
+from envs.simulators.dit.network import MultiViewDiT
+from envs.simulators.dit.shape import DiTShape
 from envs.simulators.dit.state_network import StateDiT
 from envs.simulators.gesim.fixture import shape_of
 from envs.simulators.samplers import EDM

@@ -21,8 +21,9 @@ from torch import Tensor
 from envs.conditioning import render_ray_map
 from envs.ranges import Count, Natural, NonNegative, Positive, Share
 from envs.simulators.dit.latent_world import Diffusion, LatentWorld
-from envs.simulators.dit.network import DiTShape, MultiViewDiT
+from envs.simulators.dit.network import MultiViewDiT
 from envs.simulators.dit.prediction import Velocity
+from envs.simulators.dit.shape import DiTShape
 from envs.simulators.gesim.checkpoint import CheckpointError, load_released
 from envs.simulators.samplers import DISTILLED, EDM, Distilled, Sampler
 from envs.simulators.tokenizers.wan import WanCodec

@@ -17,7 +17,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from envs.simulators.dit.network import DiTShape, MultiViewDiT
+from envs.simulators.dit.network import MultiViewDiT
+from envs.simulators.dit.shape import DiTShape
 from envs.simulators.dit.state_network import StateDiT
 
 # What the public configuration may say besides sizes, and the only values that this network knows.

@@ -150,7 +150,7 @@ def test_learns_to_act_alike_on_other_pictures_of_the_same_moments(name: str) ->
 
 @pytest.mark.parametrize("name", POLICIES)
 def test_weights_saved_are_weights_loaded(name: str, tmp_path: Any) -> None:
-    from actors.factory import load
+    from actors.weights import load
 
     spec = world_spec(BIMANUAL_POSES)
     policy = policy_of(name, spec)

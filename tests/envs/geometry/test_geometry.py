@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from envs.geometry.cameras import follow_wrists, on_plane, project, resize_intrinsics
+from envs.geometry.cameras import follow_wrists, on_plane, project
 from envs.geometry.rotations import invert, pose_transforms, rpy_to_matrix
 
 
@@ -35,14 +35,6 @@ def test_wrist_cameras_follow_their_flange_and_others_stay() -> None:
     assert torch.allclose(out[1, 0], c2w[0])
     assert torch.allclose(out[1, 1, :3, 3], torch.tensor([0.4, 0.0, 0.0]))
     assert torch.allclose(out[1, 2, :3, 3], torch.tensor([0.1 * np.cos(0.5), 0.1 * np.sin(0.5), 0.0]).float())
-
-
-def test_resized_pictures_show_the_same_point_at_the_same_share() -> None:
-    intrinsic = torch.tensor([[50.0, 0, 32], [0, 40, 24], [0, 0, 1]])
-    point = torch.tensor([0.2, -0.1, 1.5])
-    small = resize_intrinsics(intrinsic, (48, 64), (96, 96))
-    before, after = intrinsic @ point, small @ point
-    assert torch.allclose(before[:2] / before[2] / torch.tensor([64, 48]), after[:2] / after[2] / 96)
 
 
 def test_projection_is_the_inverse_of_on_plane() -> None:

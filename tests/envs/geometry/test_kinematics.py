@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from envs.embodiment import INFO_KEY, Embodiment, EmbodimentError, Robot
+from envs.embodiment import EmbodimentError, Robot
+from envs.episodes.formats.lerobot_info import INFO_KEY, from_info, to_info
 from envs.geometry.kinematics import Kinematics, KinematicsError
 from tests.embodiments import BIMANUAL_JOINTS
 
@@ -88,12 +89,12 @@ def test_a_library_instead_of_a_description() -> None:
     with pytest.raises(KinematicsError, match=r"flange poses \[N, arms, 4, 4\]"):
         other.flanges([torch.zeros(1, 2)] * 2)
     own = replace(BIMANUAL_JOINTS, kinematics=robot)
-    assert own.to_info()["kinematics"] is None
+    assert to_info(own)["kinematics"] is None
     features = {"action": {"shape": [1], "info": {INFO_KEY: {"kinematics": asdict(robot)}}}}
     features["observation.state"] = {"shape": [1]}
     features["observation.images.a"] = {"shape": [8, 8, 3], "dtype": "video"}
     with pytest.raises(EmbodimentError, match="names code"):
-        Embodiment.from_info({"features": features, "fps": 10})
+        from_info({"features": features, "fps": 10})
 
 
 def nonsense(joints: list[np.ndarray], held: dict[str, float]) -> np.ndarray:

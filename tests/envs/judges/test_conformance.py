@@ -43,16 +43,16 @@ def clips(spec: WorldSpec, batch: int, frames: int) -> tuple[Tensor, Tensor, lis
     return video, video[:, 0], [INSTRUCTIONS[k % len(INSTRUCTIONS)] for k in range(batch)]
 
 
-def test_verdicts_are_probabilities_in_every_frame(judge: Judge, spec: WorldSpec) -> None:
-    verdict = judge.score(*clips(spec, 3, 5))
-    assert verdict.success.shape == verdict.progress.shape == (3, 5) and verdict.status.shape == (3,)
-    assert verdict.success.dtype == verdict.progress.dtype == torch.float32
-    assert verdict.status.dtype == torch.int64 and bool((verdict.status == Status.OK.value).all())
-    for value in (verdict.success, verdict.progress):
+def test_judgements_are_probabilities_in_every_frame(judge: Judge, spec: WorldSpec) -> None:
+    judgement = judge.score(*clips(spec, 3, 5))
+    assert judgement.success.shape == judgement.progress.shape == (3, 5) and judgement.status.shape == (3,)
+    assert judgement.success.dtype == judgement.progress.dtype == torch.float32
+    assert judgement.status.dtype == torch.int64 and bool((judgement.status == Status.OK.value).all())
+    for value in (judgement.success, judgement.progress):
         assert 0 <= float(value.min()) <= float(value.max()) <= 1
 
 
-def test_a_verdict_does_not_depend_on_the_rest_of_the_batch(judge: Judge, spec: WorldSpec) -> None:
+def test_a_judgement_does_not_depend_on_the_rest_of_the_batch(judge: Judge, spec: WorldSpec) -> None:
     frames, first, texts = clips(spec, 3, 4)
     together, alone = judge.score(frames, first, texts), judge.score(frames[1:2], first[1:2], texts[1:2])
     assert torch.allclose(together.success[1:2], alone.success, atol=1e-5)

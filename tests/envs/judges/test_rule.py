@@ -10,12 +10,12 @@ from envs.specs import Status
 from tests.embodiments import ARM_DELTAS, world_spec
 
 
-def test_physics_own_verdict_passes_through_and_pictures_are_refused() -> None:
+def test_physics_own_judgement_passes_through_and_pictures_are_refused() -> None:
     judge = RuleJudge(hold=1)
     success = torch.tensor([[False, True], [False, False]])
-    verdict = judge.verdict(success, torch.tensor([[0.5, 1.2], [0.1, torch.nan]]))
-    assert verdict.success.tolist() == [[0.0, 1.0], [0.0, 0.0]] and float(verdict.progress[0, 1]) == 1.0
-    assert verdict.status.tolist() == [Status.OK.value, Status.ERROR.value]
+    judgement = judge.judgement(success, torch.tensor([[0.5, 1.2], [0.1, torch.nan]]))
+    assert judgement.success.tolist() == [[0.0, 1.0], [0.0, 0.0]] and float(judgement.progress[0, 1]) == 1.0
+    assert judgement.status.tolist() == [Status.OK.value, Status.ERROR.value]
     with pytest.raises(ValueError, match="judge=learned"):
         judge.score(torch.zeros(1), torch.zeros(1), [""])
 

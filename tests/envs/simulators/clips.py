@@ -6,8 +6,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.simulators.memory import memory_indices
-from envs.specs import WorldSpec
+from envs.specs import WorldSpec, memory_indices
 from tests.embodiments import camera_poses, intrinsics
 
 

@@ -12,7 +12,8 @@ from diffusers import AutoencoderKLWan
 from safetensors.torch import save_file
 
 from envs.embodiment import Robot
-from envs.simulators.dit.network import DiTShape, MultiViewDiT
+from envs.simulators.dit.network import MultiViewDiT
+from envs.simulators.dit.shape import DiTShape
 from envs.simulators.dit.state_network import StateDiT
 from envs.simulators.gesim.engine import GESimulator
 from envs.specs import WorldSpec

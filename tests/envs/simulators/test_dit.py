@@ -10,7 +10,8 @@ import torch
 from envs.simulators import memory
 from envs.simulators.dit.engine import DiTSimulator
 from envs.simulators.dit.layers import Attention
-from envs.simulators.dit.network import DiTShape, MultiViewDiT
+from envs.simulators.dit.network import MultiViewDiT
+from envs.simulators.dit.shape import DiTShape
 from envs.simulators.inputs import build_inputs
 from envs.simulators.state_experts.flow import StateExpert, StateTokens
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES, EMBODIMENTS, world_spec
@@ -210,7 +211,7 @@ def test_one_token_tells_everybody_the_same() -> None:
     torch.manual_seed(0)
     attention = Attention(24, 2, 8, context=12)
     asking, context = torch.randn(3, 5, 24), torch.randn(3, 1, 12)
-    said = attention.alone(attention.keys_of(context)[1])
+    said = attention.of_one_token(attention.keys_of(context)[1])
     assert said.shape == (3, 1, 24) and torch.allclose(
         attention(asking, context), said.expand(-1, 5, -1), atol=1e-6
     )

@@ -1,0 +1,104 @@
+"""What a config says of the robot and of the worlds around it, before anything is built."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from envs.conditioning import PoseMapStyle
+from envs.embodiment import Embodiment, EmbodimentError, Robot
+from envs.episodes.formats.lerobot_info import from_info
+from envs.geometry.kinematics import Kinematics, KinematicsError
+from envs.physics.suite import SuiteError, build_suite
+from envs.specs import Rewards, WorldSpec
+from envs.targets import ConfigError, options, to_plain
+
+_robots: dict[str, Embodiment] = {}
+
+
+def embodiment_of(cfg: Mapping[str, Any]) -> Embodiment:
+    """The robot: that of the task suite (task.suite), or of the data where there is no physics (task.data).
+
+    Raises:
+        ConfigError: if neither is given, or does not describe a robot.
+    """
+    task = cfg["task"]
+    if task.get("suite") is not None:
+        section = task["suite"]
+        known = json.dumps(to_plain(section), sort_keys=True)
+        if known not in _robots:  # building a suite compiles its models
+            try:
+                _robots[known] = build_suite(section).embodiment
+            except (SuiteError, EmbodimentError) as error:
+                raise ConfigError(str(error)) from error
+        return _robots[known]
+    if not task.get("data"):
+        raise ConfigError(
+            "task.suite and task.data are both empty, so no robot is known; choose task=push or another"
+            " suite, or name LeRobot data sets by task.data=[folder]"
+        )
+    robots = [(str(folder), _recorded_robot(Path(folder))) for folder in task["data"]]
+    first, robot = robots[0]
+    for folder, other in robots[1:]:
+        if difference := robot.differs(other):
+            raise ConfigError(f"task.data: {first} and {folder} are of different robots: {difference}")
+    return robot
+
+
+def _recorded_robot(folder: Path) -> Embodiment:
+    path = folder / "meta" / "info.json"
+    if not path.is_file():
+        raise ConfigError(f"task.data: {path} does not exist; name folders of LeRobot v3.0 data sets")
+    try:
+        return from_info(json.loads(path.read_text()))
+    except (EmbodimentError, KeyError, ValueError) as error:
+        raise ConfigError(f"task.data: {path}: {error}") from error
+
+
+def world_spec(cfg: Mapping[str, Any]) -> WorldSpec:
+    """What the worlds of this config show, and how their simulators are conditioned.
+
+    Raises:
+        ConfigError: if the robot is unknown, or does not allow the conditioning that is asked for.
+    """
+    task, section = cfg["task"], cfg["simulator"]
+    robot = embodiment_of(cfg)
+    if section["kinematics"]:
+        robot = replace(robot, kinematics=options(Robot, section["kinematics"], "simulator.kinematics"))
+    drawn = _resolve(section["pose_map"], robot.calibrated and robot.commands_poses, "simulator.pose_map")
+    rays = _resolve(section["ray_map"], robot.calibrated, "simulator.ray_map")
+    try:
+        return WorldSpec(robot, tuple(task["size"]), task["chunk"], drawn, rays)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _resolve(value: Any, auto: bool, key: str) -> bool:
+    """`auto` is whatever the robot allows."""
+    if value not in ("auto", True, False):
+        raise ConfigError(f"{key}={value!r} must be auto, true or false")
+    return auto if value == "auto" else bool(value)
+
+
+def pose_style(cfg: Mapping[str, Any]) -> PoseMapStyle:
+    """How this config's pose maps are drawn."""
+    return options(PoseMapStyle, cfg["simulator"]["pose_map_style"], "simulator.pose_map_style")
+
+
+def build_kinematics(cfg: Mapping[str, Any]) -> Kinematics | None:
+    """Forward kinematics of the robot, if its description or simulator.kinematics names a model."""
+    robot = world_spec(cfg).embodiment.kinematics
+    if robot is None:
+        return None
+    try:
+        return Kinematics(robot)
+    except KinematicsError as error:
+        raise ConfigError(str(error)) from error
+
+
+def rewards_of(cfg: Mapping[str, Any]) -> Rewards:
+    """What progress and success are worth in both worlds."""
+    return options(Rewards, cfg["judge"]["rewards"], "judge.rewards")

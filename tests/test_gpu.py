@@ -1,0 +1,63 @@
+"""The loop, fine-tuning and serving on a GPU; algorithms alone: learners/rl/test_algorithms.py."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from actors.serving.sessions import SessionHost
+from envs.embodiment import Embodiment
+from tests.actors.serving import Running, Stranger, serve_config, tiny_expert, tiny_world
+from tests.embodiments import ARM_JOINTS
+
+ROOT = Path(__file__).resolve().parent.parent
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+]
+
+
+def worldloop(*words: str) -> None:
+    """Run a command on the GPU; it must end well."""
+    line = [sys.executable, "-m", "pipeline", *words, "launch.device=cuda", "track=disabled"]
+    out = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert out.returncode == 0, out.stderr[-3000:]
+
+
+def test_the_loop_at_its_smallest(tmp_path: Path) -> None:
+    worldloop("run", "experiment=smoke", f"runs={tmp_path}")
+    result = json.loads((tmp_path / "smoke/result.json").read_text())
+    assert result["physics_after"]["episodes"] == 20 and len(result["rounds"]) == 2
+
+
+@pytest.mark.parametrize("simulator", ["unet_small", "dit_small"])
+def test_finetune(simulator: str, tiny_data: Callable[[Embodiment], Path], tmp_path: Path) -> None:
+    data = tiny_data(ARM_JOINTS)
+    worldloop(
+        *("finetune", f"simulator={simulator}", "task=lerobot", f"task.data=[{data}]"),
+        *(f"finetune.data=[{data}]", "task.size=[32,32]", f"runs={tmp_path}", "name=tuned"),
+        *("finetune.simulator.fit.steps=2", "finetune.state.fit.steps=2"),
+    )
+    assert len(list((tmp_path / "tuned/finetune").glob("*/weights.safetensors"))) == 2
+
+
+def test_serve() -> None:
+    world = tiny_world()
+    expert = tiny_expert(world).cuda()
+    server = Running(SessionHost(world.cuda(), expert, serve_config()))
+    try:
+        client = Stranger(server.url)
+        client.prepare(frames=12)
+        for _ in range(2):
+            actions = np.full((4, 14), 0.2, np.float32)
+            frames, state = client.step(actions)
+            assert frames.shape == (4, 3, 3, 32, 32) and state is not None and np.isfinite(state).all()
+    finally:
+        server.stop()
