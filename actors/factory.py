@@ -30,7 +30,7 @@ from envs.judges.base import Judge
 from envs.manifest import check_part
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import TaskPool, available_cores
-from envs.physics.suite import SuiteError, build_suite
+from envs.physics.suite import SuiteError, build_suite, check_task, task_names
 from envs.simulators.base import WORLD_OPTIONS, Simulator
 from envs.simulators.state_experts.base import StateDecoder
 from envs.specs import ActionMode, Rewards, WorldSpec
@@ -50,6 +50,7 @@ __all__ = [
     "build_simulator",
     "build_state_decoder",
     "build_world",
+    "check_world",
     "device_of",
     "embodiment_of",
     "load",
@@ -63,7 +64,7 @@ __all__ = [
 
 T = TypeVar("T")
 
-_robots: dict[str, Embodiment] = {}
+_suites: dict[str, tuple[Embodiment, tuple[str, ...]]] = {}  # robot and tasks of each section
 
 
 def prepare_process(seed: int, threads: int = 0) -> None:
@@ -118,14 +119,7 @@ def embodiment_of(cfg: Mapping[str, Any]) -> Embodiment:
     """
     task = cfg["task"]
     if task.get("suite") is not None:
-        section = task["suite"]
-        known = json.dumps(to_plain(section), sort_keys=True)
-        if known not in _robots:  # building a suite compiles its models
-            try:
-                _robots[known] = build_suite(section).embodiment
-            except (SuiteError, EmbodimentError) as error:
-                raise ConfigError(str(error)) from error
-        return _robots[known]
+        return _suite(task["suite"])[0]
     if not task.get("data"):
         raise ConfigError(
             "task.suite and task.data are both empty, so no robot is known; choose task=push or another"
@@ -137,6 +131,40 @@ def embodiment_of(cfg: Mapping[str, Any]) -> Embodiment:
         if difference := robot.differs(other):
             raise ConfigError(f"task.data: {first} and {folder} are of different robots: {difference}")
     return robot
+
+
+def _suite(section: Mapping[str, Any]) -> tuple[Embodiment, tuple[str, ...]]:
+    """Robot and tasks of a suite; building one compiles its models."""
+    known = json.dumps(to_plain(section), sort_keys=True)
+    if known not in _suites:
+        try:
+            suite = build_suite(section)
+        except (SuiteError, EmbodimentError) as error:
+            raise ConfigError(str(error)) from error
+        _suites[known] = suite.embodiment, tuple(suite.tasks)
+    return _suites[known]
+
+
+def check_world(cfg: Mapping[str, Any]) -> None:
+    """See that robot and tasks are there as the config names them, which reading the config cannot tell.
+
+    Raises:
+        ConfigError: with a line for each thing that is wrong.
+    """
+    robot, wrong = world_spec(cfg).embodiment, []
+    if cfg["task"].get("suite") is not None:
+        for name in task_names(cfg["task"]["name"]):
+            try:
+                check_task(name, _suite(cfg["task"]["suite"])[1])
+            except SuiteError as error:
+                wrong.append(str(error))
+    for key in ("policy", "judge"):
+        try:
+            robot.views_of(cfg[key].get("cameras", "all"))
+        except ValueError as error:
+            wrong.append(f"{key}.{error}")
+    if wrong:
+        raise ConfigError("\n".join(wrong))
 
 
 def _recorded_robot(folder: Path) -> Embodiment:
