@@ -134,13 +134,22 @@ class Soak:
 
     # -- the runs
     def _reference(self) -> None:
-        known = (self.folder / "reference/result.json").exists()
-        if not known and (status := self._end(self._begin(random.Random(0), "reference"))):
-            raise self._failure(f"the undisturbed run ended with {status}")
+        for run in ("reference", self.name):
+            self._forget_older_code(run)
         manifests = {
             name: self._folder(name, "reference") / MANIFEST for name in self._graph("reference").nodes
         }
+        known = all(path.exists() for path in manifests.values())
+        if not known and (status := self._end(self._begin(random.Random(0), "reference"))):
+            raise self._failure(f"the undisturbed run ended with {status}")
         self.takes = {name: json.loads(path.read_text())["seconds"] for name, path in manifests.items()}
+
+    def _forget_older_code(self, run: str) -> None:
+        """Remove the stages of a soak that was interrupted before the code changed."""
+        own = {self._folder(name, run) for name in self._graph(run).nodes}
+        for folder in (self.folder / run / "stages").glob("*"):
+            if folder not in own:
+                shutil.rmtree(folder)
 
     @property
     def name(self) -> str:
