@@ -125,6 +125,7 @@ def test_drawn_overrides_are_understood_or_refused(seed: int) -> None:
         ("task.name=psh", r"task\.name='psh' is unknown.*'push'"),
         ("task.suite.cameras=[hed]", r"task\.suite\.cameras holds \['hed'\]"),
         ("task.suite.actions=thoughts", r"task\.suite\.actions='thoughts'"),
+        ("cameras=[hed]", r"^cameras=\['hed'\] must be some of"),
         ("policy.cameras=[hed]", r"policy\.cameras=\['hed'\] must be some of .*head"),
         ("judge.cameras=most", r"judge\.cameras='most' must be all, main or"),
     ],
