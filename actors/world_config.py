@@ -12,11 +12,11 @@ from envs.conditioning import PoseMapStyle
 from envs.embodiment import Embodiment, EmbodimentError, Robot
 from envs.episodes.formats.lerobot_info import from_info
 from envs.geometry.kinematics import Kinematics, KinematicsError
-from envs.physics.suite import SuiteError, build_suite
+from envs.physics.suite import SuiteError, build_suite, check_task, task_names
 from envs.specs import Rewards, WorldSpec
-from envs.targets import ConfigError, options, to_plain
+from envs.targets import TARGET, ConfigError, options, to_plain
 
-_robots: dict[str, Embodiment] = {}
+_suites: dict[str, tuple[Embodiment, tuple[str, ...]]] = {}  # robot and tasks of each section
 
 
 def embodiment_of(cfg: Mapping[str, Any]) -> Embodiment:
@@ -27,14 +27,7 @@ def embodiment_of(cfg: Mapping[str, Any]) -> Embodiment:
     """
     task = cfg["task"]
     if task.get("suite") is not None:
-        section = task["suite"]
-        known = json.dumps(to_plain(section), sort_keys=True)
-        if known not in _robots:  # building a suite compiles its models
-            try:
-                _robots[known] = build_suite(section).embodiment
-            except (SuiteError, EmbodimentError) as error:
-                raise ConfigError(str(error)) from error
-        return _robots[known]
+        return _suite(task["suite"])[0]
     if not task.get("data"):
         raise ConfigError(
             "task.suite and task.data are both empty, so no robot is known; choose task=push or another"
@@ -46,6 +39,43 @@ def embodiment_of(cfg: Mapping[str, Any]) -> Embodiment:
         if difference := robot.differs(other):
             raise ConfigError(f"task.data: {first} and {folder} are of different robots: {difference}")
     return robot
+
+
+def _suite(section: Mapping[str, Any]) -> tuple[Embodiment, tuple[str, ...]]:
+    """Robot and tasks of a suite; building one compiles its models."""
+    known = json.dumps(to_plain(section), sort_keys=True)
+    if known not in _suites:
+        try:
+            suite = build_suite(section)
+        except (SuiteError, EmbodimentError) as error:
+            raise ConfigError(str(error)) from error
+        _suites[known] = suite.embodiment, tuple(suite.tasks)
+    return _suites[known]
+
+
+def check_world(cfg: Mapping[str, Any]) -> None:
+    """See that robot and tasks are there as the config names them, which reading the config cannot tell.
+
+    Raises:
+        ConfigError: with a line for each thing that is wrong.
+    """
+    robot, wrong = world_spec(cfg).embodiment, []
+    if cfg["task"].get("suite") is not None:
+        for name in task_names(cfg["task"]["name"]):
+            try:
+                check_task(name, _suite(cfg["task"]["suite"])[1])
+            except SuiteError as error:
+                wrong.append(str(error))
+    named = {"": cfg, "policy.": cfg["policy"], "judge.": cfg["judge"]}
+    for key, section in named.items():
+        # what other packages' classes mean by the word is theirs
+        if "cameras" in section and str(section.get(TARGET, "envs.")).startswith(("actors.", "envs.")):
+            try:
+                robot.views_of(section["cameras"])
+            except ValueError as error:
+                wrong.append(f"{key}{error}")
+    if wrong:
+        raise ConfigError("\n".join(wrong))
 
 
 def _recorded_robot(folder: Path) -> Embodiment:

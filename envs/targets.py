@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, is_dataclass
 from functools import lru_cache, partial
@@ -207,9 +208,18 @@ def _sentences(found: Iterable[Mapping[str, Any]], value: Any, key: str) -> list
             named = isinstance(inner, Mapping) and part in inner
             if named or (isinstance(part, int) and _has(inner, part)):
                 path, inner = f"{path}.{part}", inner[part]
-        said = error["msg"].replace("Input should be ", "").replace("an instance of Sequence", "a list")
-        places.setdefault(path, (inner, []))[1].append(said)
-    return [f"{path}={wrong!r} should be {' or '.join(said)}" for path, (wrong, said) in places.items()]
+        places.setdefault(path, (inner, []))[1].append(_allowed(error))
+    return [f"{path}={wrong!r} should {' or '.join(said)}" for path, (wrong, said) in places.items()]
+
+
+def _allowed(error: Mapping[str, Any]) -> str:
+    """What pydantic wants instead, as it goes on after "should"."""
+    if error["type"] == "missing":
+        last = error["loc"][-1]
+        return "be longer" if isinstance(last, int) else f"have {last}"
+    said = str(error["msg"]).replace("an instance of Sequence", "a list")
+    wanted = re.sub(r"^\w+ should ", "", said)
+    return wanted if wanted != said else f"be something else: {said}"
 
 
 def _has(value: Any, position: int) -> bool:

@@ -110,6 +110,8 @@ def _of(kind: type[Any], section: Any, key: str, given: tuple[str, ...] = ()) ->
 
 
 def _launch(launch: Cfg) -> Iterator[str]:
+    if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", str(launch.get("device"))):
+        yield f"launch.device={launch.get('device')!r} should be auto, cpu, cuda or cuda:<number>"
     if launch.get("backend") != "ray":
         yield from _of(sections.LocalSection, launch, "launch")
         return

@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from envs.targets import ConfigError, nearest
 from pipeline.checks import faults
@@ -29,13 +27,8 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
     """
     try:
         cfg = composed(overrides)
-    except (HydraException, OmegaConfBaseException) as error:
-        hint = _unknown_key(overrides)
-        text = str(error).split("\nSee https")[0].split("\nfull_key")[0]
-        raise ConfigError(
-            hint
-            or f"{text}\nGroups are {', '.join(groups())}; `worldloop config` prints every key and its value."
-        ) from error
+    except Exception as error:  # for simulator=null and the like Hydra raises a bare ValueError
+        raise ConfigError(_unknown_key(overrides) or _unreadable(overrides, error)) from error
     if wrong := faults(cfg):
         raise ConfigError("\n".join(wrong))
     return cfg
@@ -64,7 +57,7 @@ def _unknown_key(overrides: Sequence[str]) -> str:
     choices = [word for word in overrides if word.split("=")[0] in groups()]
     try:
         base = composed(choices)
-    except (HydraException, OmegaConfBaseException):
+    except Exception:  # a choice is what is wrong
         return ""
     paths = list(_paths(base))
     for word in overrides:
@@ -79,6 +72,23 @@ def _unknown_key(overrides: Sequence[str]) -> str:
             return f"{key} is not a key; did you mean {' or '.join((near + same)[:3])}?"
         return f"{key} is not a key{nearest(key, siblings or [*base, *groups()])}"
     return ""
+
+
+def _unreadable(overrides: Sequence[str], error: Exception) -> str:
+    """What to say of the first override that does not go with those before it; choices come first."""
+    taken: list[str] = []
+    where = ""
+    for word in sorted(overrides, key=lambda word: word.split("=")[0] not in groups()):
+        try:
+            composed([*taken, word])
+        except Exception as found:
+            where, error = f"{word} cannot be read: ", found
+            break
+        taken.append(word)
+    text = str(error).split("\nSee https")[0].split("\nfull_key")[0].strip()
+    return (
+        f"{where}{text}\nGroups are {', '.join(groups())}; `worldloop config` prints every key and its value."
+    )
 
 
 def _paths(section: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

@@ -127,6 +127,7 @@ class ChaosSection:
     """Section chaos."""
 
     events: Natural
+    patience: Positive
     seconds: NonNegative
     every: Positive
     learner_every: Positive

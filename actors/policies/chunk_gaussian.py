@@ -4,7 +4,7 @@ time.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -130,7 +130,15 @@ class ChunkGaussianHead(Head):
     gain: Tensor
     offset: Tensor
 
-    def __init__(self, width: int, chunk: int, actions: int, knots: Count, std: Positive, mode: str):
+    def __init__(
+        self,
+        width: int,
+        chunk: int,
+        actions: int,
+        knots: Count,
+        std: Positive,
+        mode: Literal["relative", "absolute"],
+    ):
         super().__init__()
         if not 1 <= knots <= chunk:
             raise ValueError(f"knots={knots} must be between 1 and task.chunk={chunk}")

@@ -1,4 +1,4 @@
-"""Faults of a disk, at a chosen moment of a process: it is killed, or the disk is full, at its n-th write.
+"""Faults at a chosen moment of a process: it is killed, or its disk is full, at its n-th write.
 
 Python tells audit hooks of every file that is opened, renamed, made or removed, before it is done; what a
 library writes by itself is met at the next of these.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,9 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+Kind = Literal["stop", "die", "full"]
 
-class Killed(BaseException):
-    """Stands for SIGKILL within a process: nothing on the disk can be changed any more."""
+
+class Stopped(BaseException):
+    """Stands for SIGKILL within a process that lives on: nothing on the disk can be changed any more."""
 
 
 @dataclass
@@ -27,25 +30,32 @@ class Fault:
     Args:
         folder: writes elsewhere are not counted, and succeed.
         after: writes that still succeed.
-        kind: "kill" lets nothing be changed any more, "full" nothing be added.
+        kind: "stop" lets nothing be changed any more, "die" is SIGKILL, "full" lets nothing be added.
+        since: writes are counted from the first one below this path on.
         tripped: whether the moment has come.
     """
 
-    folder: str
+    folder: Path
     after: int
-    kind: Literal["kill", "full"]
+    kind: Kind
+    since: Path | None = None
     tripped: bool = False
 
     def meet(self, path: str, removes: bool) -> None:
         """A write is about to happen."""
-        if not path.startswith(self.folder) or (removes and self.kind == "full"):
+        if not path.startswith(str(self.folder)) or (removes and self.kind == "full"):
             return
+        if self.since is not None and not path.startswith(str(self.since)):
+            return
+        self.since = None
         self.after -= 1
         if self.after >= 0:
             return
         self.tripped = True
-        if self.kind == "kill":
-            raise Killed(path)
+        if self.kind == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.kind == "stop":
+            raise Stopped(path)
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
 
 
@@ -54,13 +64,12 @@ _hooked = False
 
 
 @contextmanager
-def faulty_disk(folder: Path, after: int, kind: Literal["kill", "full"]) -> Iterator[Fault]:
-    """Within, the disk under a folder fails after so many writes, and goes on failing."""
+def faulty(fault: Fault) -> Iterator[Fault]:
+    """Within, the fault waits for its moment; once that has come, it stays."""
     global _hooked
     if not _hooked:
         sys.addaudithook(_hear)
         _hooked = True
-    fault = Fault(str(folder.resolve()), after, kind)
     _waiting.append(fault)
     try:
         yield fault

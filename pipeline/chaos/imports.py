@@ -1,6 +1,13 @@
-"""What every life needs, imported once by the server that lives are forked from."""
+"""What every life needs, done once by the server that lives are forked from: imports, and what is found out
+about sources and options, which is the same in every life.
+"""
 
-import pipeline.config
-import pipeline.loop
-import pipeline.stages.collect
+from pathlib import Path
+
+import matplotlib.pyplot  # noqa: F401
+
 import pipeline.track  # noqa: F401
+from pipeline.config import load_config
+from pipeline.loop import build_loop
+
+build_loop(load_config(["experiment=soak"]), Path())

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import random
+import signal
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from pipeline.chaos.life import MARK
-
-_PATIENCE = 30.0  # seconds; what was told to end may take a moment
 
 
 def belonging(mark: str, session: int) -> list[str]:
@@ -29,14 +31,32 @@ def belonging(mark: str, session: int) -> list[str]:
     return found
 
 
-def nothing_left(mark: str, session: int, failure: Callable[[str], Exception]) -> None:
-    """Wait until none of them lives.
+def nothing_left(
+    mark: str, session: int, failure: Callable[[str], Exception], patience: float = 30.0
+) -> None:
+    """Wait until none of them lives, for as long as what was told to end may take.
 
     Raises:
         Exception: what `failure` makes of it, if some stay.
     """
-    deadline = time.monotonic() + _PATIENCE
+    deadline = time.monotonic() + patience
     while left := belonging(mark, session):
         if time.monotonic() > deadline:
             raise failure(f"processes outlive it: {left[:5]}")
         time.sleep(0.1)
+
+
+def kill_worker(mark: str, session: int, chance: random.Random) -> bool:
+    """Kill one of the workers of a life that can be replaced: a physics process, a host or an evaluator on
+    Ray; returns whether there was one.
+    """
+    workers = [
+        line
+        for line in belonging(mark, session)
+        if "envs.physics.worker" in line or ("ray::" in line and "Agent" not in line)
+    ]
+    if not workers:
+        return False
+    with suppress(ProcessLookupError):  # it ended while we chose
+        os.kill(int(chance.choice(workers).split()[0]), signal.SIGKILL)
+    return True

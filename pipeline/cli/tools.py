@@ -110,17 +110,20 @@ def chaos(words: Words) -> None:
     from pipeline.chaos.fleet import ChaosFailure, run_chaos
     from pipeline.chaos.soak import Soak
     from pipeline.config import load_config
+    from pipeline.graph.owner import owning
 
     base = ("experiment=smoke", "algorithm=grpo", "launch=ray", "launch.judge_service=true", "launch.cpus=8")
-    fleet = [*without_given(base, words), *words]
-    cfg = load_config(fleet)
+    runs, fleet = ([*without_given(some, words), *words] for some in (("experiment=soak",), base))
+    cfg = load_config(runs)
     folder, section = Path(cfg["runs"]) / f"chaos-{cfg['seed']}", cfg["chaos"]
+    hosts = load_config(fleet) if section["seconds"] else {}
     try:
-        if section["events"]:
-            soak = Soak(cfg, [*without_given(("experiment=soak",), words), *words], folder / "soak")
-            print(json.dumps(asdict(soak.run(section["events"])), indent=1))
-        if section["seconds"]:
-            print(json.dumps(run_chaos(cfg, fleet, folder / "fleet"), indent=1))
+        with owning(folder, "chaos"):
+            if section["events"]:
+                soak = Soak(runs, cfg["seed"], folder / "soak", section["patience"])
+                print(json.dumps(asdict(soak.run(section["events"])), indent=1))
+            if hosts:
+                print(json.dumps(run_chaos(hosts, fleet, folder / "fleet"), indent=1))
     except ChaosFailure as error:
         print(f"worldloop chaos: {error}", file=sys.stderr)
         sys.exit(1)

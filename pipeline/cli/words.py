@@ -23,9 +23,11 @@ def root_of(cfg: dict[str, Any]) -> Path:
 def prepared(words: Words) -> tuple[dict[str, Any], Path]:
     """The config and the run's folder, with this process made ready for work."""
     from actors.process import device_of, prepare_process
+    from actors.world_config import check_world
     from pipeline.config import load_config
 
     cfg = load_config(words)
-    device_of(cfg)  # one that is not there is told before any work
+    device_of(cfg)  # what is not there is told before any work
+    check_world(cfg)
     prepare_process(cfg["seed"])
     return cfg, root_of(cfg)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,8 @@ import pytest
 
 from envs.targets import ConfigError
 from pipeline.checks import faults
-from pipeline.config import choices, load_config
+from pipeline.cli.words import prepared
+from pipeline.config import choices, groups, load_config
 from pipeline.loop import build_loop
 
 
@@ -38,6 +41,13 @@ from pipeline.loop import build_loop
         (["algorithm=grpo", "rl.envs=40"], r"algorithm\.group"),
         (["imitation.fit.batch=7", "microbatches=2"], r"imitation\.fit: batch=7 must be a multiple of micro"),
         (["collect.noise_level=[0.6,0.1]"], r"collect\.noise_level"),
+        (["simulator=null"], r"simulator=null cannot be read"),
+        (["=3"], r"=3 cannot be read"),
+        (["name="], r"name='' should have at least 1 character"),
+        (["collect.episodes=5"], r"collect\.episodes"),
+        (["launch.device=gpu"], r"launch\.device='gpu' should be auto, cpu, cuda or"),
+        (["policy.head.mode=sideways"], r"policy\.head\.mode='sideways' should be 'relative' or"),
+        (["simulator=dit", "simulator.denoising.prediction=noise"], r"denoising\.prediction='noise' should"),
     ],
 )
 def test_mistakes_name_the_key(words: list[str], match: str) -> None:
@@ -54,37 +64,75 @@ def test_all_mistakes_are_told_at_once() -> None:
 
 WRONG: dict[type, list[Any]] = {
     bool: ["perhaps", None, 3],
-    int: ["many", -7, [1], {}],
-    float: ["much", [1.0], {}, float("nan")],
-    str: [3, {}],
-    list: [3, {}, {"a": 1}],
-    dict: [3, "none", [1]],
+    int: ["many", None, -7, [1], {}, 10**30],
+    float: ["much", None, [1.0], -1e9, float("nan"), float("inf")],
+    str: [3, None, {}],
+    list: [3, None, {}, {"a": 1}],
+    dict: [3, None, "none", [1]],
 }
-FREE = ("simulator.scratch", "policy.policy", "finetune.weights")  # other packages' classes; null or a path
+# other packages' options; where null has a meaning
+FREE, NULLABLE = ("simulator.scratch", "policy.policy"), ("rl.chunks", "task.suite", "finetune.weights")
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["experiment=quickstart"],
-        ["experiment=smoke", "algorithm=grpo", "launch=ray", "policy=chunk_tokens", "simulator=dit_small"],
-        ["simulator=gesim_tiny", "task=metaworld", "algorithm=filtered_bc", "policy=tiny_vla"],
-    ],
-)
-def test_hundreds_of_wrong_values_are_all_found(words: list[str]) -> None:
-    """Every value of the config in turn is replaced by values of other types; each is found and named."""
-    cfg = load_config(words)
+@pytest.mark.parametrize("word", [f"{group}={name}" for group in groups() for name in choices(group)])
+def test_hundreds_of_wrong_values_are_all_found(word: str) -> None:
+    """Every value of every choice in turn is replaced by values of other types and out of range; each is
+    found and named.
+    """
+    group = word.partition("=")[0]
+    cfg = load_config([word, "task.data=[recordings]"] if word == "task=lerobot" else [word])
     tried, missed = 0, []
-    for path, value in leaves(cfg):
-        if value is None or path.startswith(FREE) or path.endswith("_target_"):
+    # an experiment is the whole config
+    for path, value in leaves(cfg if group == "experiment" else {group: cfg[group]}):
+        if value is None or path.startswith(FREE):
             continue
         for wrong in WRONG[type(value)]:
+            if wrong is None and path in NULLABLE:
+                continue
             found = faults(replaced(cfg, path.split("."), wrong))
             tried += 1
             if not any(path in sentence for sentence in found):
                 missed.append((path, wrong))
-    assert tried > 300
+    assert tried > (500 if group == "experiment" else 5)
     assert not missed, missed
+
+
+WORDS = [
+    *("rl.lr=1e-4", "experiment=smoke", "task.size=[32,32]", "+foo=1", "~rl.lr", "launch=ray", "name=x"),
+    *("judge.rewards={progress: 1.0}", "policy._target_=a.b", "++rl.lr=3", "simulator=dit", "seed=3"),
+]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_drawn_overrides_are_understood_or_refused(seed: int) -> None:
+    """Whatever is typed is a config or a sentence, never another exception."""
+    chance = random.Random(seed)
+    for _ in range(15):
+        word = list(chance.choice(WORDS))
+        for _ in range(chance.randint(1, 3)):
+            at = chance.randrange(len(word))
+            if chance.random() < 0.4:
+                word[at] = ""
+            else:
+                word.insert(at, chance.choice("[]{}=+~:.,@$'\" \\/x1-_*()&é"))
+        with suppress(ConfigError):
+            assert load_config(["".join(word)])["name"]
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("task.name=psh", r"task\.name='psh' is unknown.*'push'"),
+        ("task.suite.cameras=[hed]", r"task\.suite\.cameras holds \['hed'\]"),
+        ("task.suite.actions=thoughts", r"task\.suite\.actions='thoughts'"),
+        ("cameras=[hed]", r"^cameras=\['hed'\] must be some of"),
+        ("policy.cameras=[hed]", r"policy\.cameras=\['hed'\] must be some of .*head"),
+        ("judge.cameras=most", r"judge\.cameras='most' must be all, main or"),
+    ],
+)
+def test_what_the_robot_has_not_is_told_before_any_work(word: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        prepared([word])
 
 
 def leaves(section: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import errno
 import itertools
+import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -14,27 +17,27 @@ import torch
 from envs.episodes import LeRobotDataset, LeRobotWriter
 from envs.episodes.clips import ClipStore
 from learners.training.checkpoint import Checkpoints
-from pipeline.chaos.faults import Fault, Killed, faulty_disk
+from pipeline.chaos.faults import Fault, Stopped, faulty
 from tests.embodiments import ARM_DELTAS, world_spec
 from tests.moving_square import SIZE, moving_square
 
-KINDS: list[Literal["kill", "full"]] = ["kill", "full"]
+KINDS: list[Literal["stop", "full"]] = ["stop", "full"]
 
 
 def at_every_write(
-    folder: Callable[[int], Path], kind: Literal["kill", "full"], work: Callable[[Path], Any]
+    folder: Callable[[int], Path], kind: Literal["stop", "full"], work: Callable[[Path], Any]
 ) -> list[Path]:
     """Do the work once for each of its writes, each time broken off there; the folders it left."""
     left = []
     for number in itertools.count():
         place = folder(number)
         place.mkdir()
-        fault: Fault
+        fault = Fault(place, number, kind)
         try:
-            with faulty_disk(place, number, kind) as fault:
+            with faulty(fault):
                 work(place)
-        except Killed:
-            assert kind == "kill"
+        except Stopped:
+            assert kind == "stop"
         except OSError as error:
             assert kind == "full" and error.errno == errno.ENOSPC and str(place) in str(error)
         else:
@@ -47,7 +50,7 @@ def at_every_write(
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_any_prefix_of_a_data_sets_writes_resumes_to_the_same_set(
-    kind: Literal["kill", "full"], tmp_path: Path
+    kind: Literal["stop", "full"], tmp_path: Path
 ) -> None:
     made = [moving_square(ARM_DELTAS, seed, length=6) for seed in range(4)]
 
@@ -72,7 +75,7 @@ def test_any_prefix_of_a_data_sets_writes_resumes_to_the_same_set(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_checkpoint_is_the_old_one_or_the_new_one(kind: Literal["kill", "full"], tmp_path: Path) -> None:
+def test_a_checkpoint_is_the_old_one_or_the_new_one(kind: Literal["stop", "full"], tmp_path: Path) -> None:
     def tensors(value: float) -> dict[str, Any]:
         return {"module": {"w": torch.full((3,), value)}}
 
@@ -95,7 +98,7 @@ def test_a_checkpoint_is_the_old_one_or_the_new_one(kind: Literal["kill", "full"
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_cache_is_whole_or_not_there(kind: Literal["kill", "full"], tmp_path: Path) -> None:
+def test_a_cache_is_whole_or_not_there(kind: Literal["stop", "full"], tmp_path: Path) -> None:
     data = tmp_path / "data"
     LeRobotWriter(data, ARM_DELTAS.at(SIZE)).write([moving_square(ARM_DELTAS, 1, length=6)])
     spec = world_spec(ARM_DELTAS)
@@ -114,7 +117,7 @@ def test_a_cache_is_whole_or_not_there(kind: Literal["kill", "full"], tmp_path: 
 
 def test_faults_count_what_python_writes_and_nothing_else(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
-    with faulty_disk(tmp_path / "in", 1, "full") as fault:
+    with faulty(Fault(tmp_path / "in", 1, "full")) as fault:
         (tmp_path / "elsewhere").write_text("fine")
         (tmp_path / "in/one").write_text("fine")
         assert (tmp_path / "in/one").read_text() == "fine" and not fault.tripped
@@ -122,5 +125,19 @@ def test_faults_count_what_python_writes_and_nothing_else(tmp_path: Path) -> Non
             (tmp_path / "in/two").write_text("no")
         (tmp_path / "in/one").unlink()  # a full disk lets files go
     (tmp_path / "in/two").write_text("room again")
-    with faulty_disk(tmp_path / "in", 0, "kill"), pytest.raises(Killed):
+    with faulty(Fault(tmp_path / "in", 0, "stop")), pytest.raises(Stopped):
         (tmp_path / "in/two").unlink()
+
+
+def test_a_disk_that_is_really_full_is_told_and_work_goes_on_when_there_is_room(tmp_path: Path) -> None:
+    own = ["unshare", "--map-root-user", "--mount"]
+    if not shutil.which("unshare") or subprocess.run([*own, "true"], capture_output=True).returncode:
+        pytest.skip("no small disk can be mounted here (unshare --map-root-user --mount)")
+    done = subprocess.run(
+        [*own, sys.executable, "-m", "tests.full_disk", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).resolve().parents[2],
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert int(done.stdout.split()[0]) >= 10, done.stdout

@@ -1,4 +1,6 @@
-"""Ctrl-C on every command that lasts: it ends soon, without a traceback, and nothing it began lives on."""
+"""SIGINT and SIGTERM on every command that lasts: it ends soon, without a traceback, and nothing it began
+lives on.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +15,7 @@ import pytest
 
 from pipeline.chaos import life
 from pipeline.chaos.processes import nothing_left
+from pipeline.cli.main import COMMANDS
 
 SOAK = ["experiment=soak", "track=disabled"]
 
@@ -30,23 +33,28 @@ def wait_for(pattern: str, log: Path, alive: life.BaseProcess) -> None:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A run that has a data set, a policy and a small world."""
+    """A finished run."""
     folder = tmp_path_factory.mktemp("runs")
-    words = ["stage", "state-1", *SOAK, f"runs={folder}", "name=known"]
-    process = life.begin(words, "known", folder / "known.log", folder)
+    words = ["run", *SOAK, f"runs={folder}", "name=known"]
+    process = life.begin(words, "known", folder / "known.log", cores=1)
     process.join(300)
     assert process.exitcode == 0, (folder / "known.log").read_text()
     yield folder / "known"
 
 
 ENDLESS = ["imitation.perception.steps=90000", "finetune.simulator.fit.steps=90000"]
-COMMANDS = {
+LASTS = {
     "run": (["run", *SOAK, "name=new", "collect.episodes.train=5000"], r"collect: +\d"),
+    "rl": (
+        ["rl", *SOAK, "name=new", "seed=1", *ENDLESS],
+        r"perception: +\d+%.*loss|action_error",
+    ),
     "stage": (["stage", "imitation", *SOAK, "name=new", *ENDLESS], r"perception: +\d+%.*loss|action_error"),
     "evaluate": (
         ["evaluate", "policy=imitation", *SOAK, "name=known", "evaluate.episodes=4000"],
         r"physics: +\d",
     ),
+    "controls": (["controls", *SOAK, "name=known"], r"=== \S+ ->"),
     "finetune": (
         ["finetune", "simulator=unet_small", "task=lerobot", "name=new", "track=disabled", *ENDLESS],
         r"simulator: +\d+%.*loss",
@@ -54,26 +62,47 @@ COMMANDS = {
     "serve": (["serve", *SOAK, "name=known", "serve.port=0"], r"http://127\.0\.0\.1:\d+"),
     "bench": (["bench", "learning", "track=disabled"], r"\w"),
     "chaos": (["chaos", "chaos.events=0", "chaos.seconds=500"], r"0 iterations"),
+    "chaos soak": (["chaos", "chaos.events=500", "seed=770019"], r"life 1 begins"),
+    "convert": (["convert"], r"convert: +\d"),
+    "inspect": (["inspect"], r"\w"),
+    "verify": (["verify"], r"verify: +\d"),
 }
+SHORT = ("convert", "inspect", "verify")  # may have ended before they are asked to
+# answer from what is there, or hand over to a cluster
+AT_ONCE = {"stages", "compare", "submit", "tasks", "config", "doctor", "completion"}
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_ctrl_c_ends_a_command_and_all_that_it_began(name: str, run: Path) -> None:
-    words, pattern = COMMANDS[name]
-    words = [*words, f"runs={run.parent}"]
+def test_every_command_is_tried() -> None:
+    assert {name.split()[0] for name in LASTS} | AT_ONCE == COMMANDS.keys()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("name", LASTS)
+def test_a_signal_ends_a_command_and_all_that_it_began(name: str, number: signal.Signals, run: Path) -> None:
+    words, pattern = LASTS[name]
+    mark, data = f"{name}-{number}", next(run.glob("stages/collect-*/dataset"))
     if name == "finetune":
-        data = next(run.glob("stages/collect-*/dataset"))
-        words += [f"task.data=[{data}]", f"finetune.data=[{data}]"]
-    log = run.parent / f"{name}.log"
-    process = life.begin(words, name, log, run.parent)
+        words = [*words, f"task.data=[{data}]", f"finetune.data=[{data}]"]
+    if name in ("convert", "inspect"):
+        words = [*words, str(data), str(run.parent / mark)]
+    elif name == "verify":
+        words = [*words, str(run)]
+    else:
+        words = [*words, f"runs={run.parent}"]
+    log = run.parent / f"{mark}.log"
+    process = life.begin(words, mark, log, cores=1)
     assert process.pid is not None
     try:
         wait_for(pattern, log, process)
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: everything in the foreground
+        if number == signal.SIGINT:
+            os.killpg(process.pid, number)  # as a terminal does: everything in the foreground
+        else:
+            os.kill(process.pid, number)
         process.join(60)
         said = log.read_text(errors="replace")
-        assert process.exitcode in ((0, 130) if name == "serve" else (130,)), said
+        assert process.exitcode in ((0,) if name in (*SHORT, "serve") else ()) + (128 + number,), said
         assert "Traceback" not in said, said
-        nothing_left(name, process.pid, AssertionError)
+        nothing_left(mark, process.pid, AssertionError)
+        nothing_left("770019-1", process.pid, AssertionError)  # what a soak began
     finally:
         process.kill()

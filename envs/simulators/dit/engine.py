@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -74,17 +74,11 @@ class Denoising:
         augment: chance that a clip's memory is augmented in training.
     """
 
-    prediction: str
+    prediction: Literal["velocity", "clean"]
     steps: Count
     shift: Positive
     foreground: NonNegative
     augment: Share
-
-    def __post_init__(self) -> None:
-        if self.prediction not in PREDICTIONS:
-            raise ValueError(
-                f"simulator.denoising.prediction={self.prediction!r} must be one of {list(PREDICTIONS)}"
-            )
 
     def diffusion(self) -> Diffusion:
         """The same for LatentWorld."""
