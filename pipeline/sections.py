@@ -147,6 +147,7 @@ class MeasureSection:
     """Section measure."""
 
     videos: Natural
+    worst: Natural
     starts: Count
     speed_chunks: Count
 
