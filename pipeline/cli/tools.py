@@ -88,7 +88,7 @@ def inspect(words: Words) -> None:
 
 def bench(words: Words) -> None:
     """measure performance: worldloop bench
-    conditioning|physics|world|actors|learning|serving|gesim|overfit|pretrained
+    conditioning|collection|world|actors|learning|serving|gesim|overfit|pretrained
     """
     from pipeline.benches.bench import run_bench
 
