@@ -26,6 +26,8 @@ class Offscreen:
 
     def __init__(self, model: mujoco.MjModel, size: tuple[int, int]):
         height, width = size
+        room = model.vis.global_  # or pictures larger than the model asks for would hold what nobody drew
+        room.offheight, room.offwidth = max(room.offheight, height), max(room.offwidth, width)
         # Mesa's software driver hands pictures this small to threads of its own at a loss; every core has a
         # worker already.
         os.environ.setdefault("LP_NUM_THREADS", "0")
