@@ -69,7 +69,7 @@ class Controls:
         if rest:
             self._group(len(self.arms), sorted(rest))
             self.arms.append("other" if self.arms else robot.robot)
-        self._held = {arm.gripper for arm in robot.arms}
+        self._grippers = {arm.gripper for arm in robot.arms}
 
     def _group(self, arm: int, numbers: Any) -> None:
         for place, number in enumerate(numbers):
@@ -108,7 +108,7 @@ class Controls:
         for channel in self.channels:
             push = float(np.clip(held.get(channel.number, 0.0), -1.0, 1.0)) * speed
             at = channel.number
-            if self.robot.delta and at not in self._held:
+            if self.robot.delta and at not in self._grippers:
                 out[at] = push * channel.rate
             else:
                 out[at] += push * channel.rate / self.robot.fps

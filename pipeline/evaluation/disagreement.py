@@ -12,8 +12,7 @@ from torch import Tensor
 from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge
 from envs.simulators.replay import Replay
-from pipeline.evaluation.by_scene import scenes_of_episodes
-from pipeline.evaluation.by_task import tasks_of_episodes
+from pipeline.evaluation.by_task import scenes_of_episodes, tasks_of_episodes
 from pipeline.evaluation.judging import Views
 
 _DIGITS = 3  # of what is written down

@@ -10,8 +10,7 @@ import torch
 
 from envs.manifest import read_manifest
 from envs.physics.suite import task_names
-from pipeline.evaluation.by_scene import by_scene, scenes_of_seeds
-from pipeline.evaluation.by_task import by_task, tasks_of_seeds
+from pipeline.evaluation.by_task import by_scene, by_task, scenes_of_seeds, tasks_of_seeds
 from pipeline.evaluation.statistics import mcnemar, rate, rate_entry
 from pipeline.graph.stage import Inputs
 

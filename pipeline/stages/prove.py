@@ -22,8 +22,13 @@ from actors.rollouts.evaluate import evaluate
 from envs.files import write_text
 from envs.simulators.replay import replay
 from pipeline.evaluation import measurement
-from pipeline.evaluation.by_scene import by_scene, scenes_of_episodes
-from pipeline.evaluation.by_task import by_task, tasks_of_episodes, tasks_of_seeds
+from pipeline.evaluation.by_task import (
+    by_scene,
+    by_task,
+    scenes_of_episodes,
+    tasks_of_episodes,
+    tasks_of_seeds,
+)
 from pipeline.evaluation.disagreement import compared
 from pipeline.evaluation.judging import episode_success, judge_both, judge_frames, judge_table
 from pipeline.evaluation.statistics import rate_entry

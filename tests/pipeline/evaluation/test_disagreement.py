@@ -14,7 +14,7 @@ from envs.episodes.video import read_video
 from envs.judges.base import Judge, Verdict
 from envs.physics.suite import scene_of
 from envs.simulators.replay import Replay
-from pipeline.evaluation.by_scene import by_scene, scenes_of_seeds
+from pipeline.evaluation.by_task import by_scene, scenes_of_seeds
 from pipeline.evaluation.disagreement import compared, curves, worst
 from pipeline.evaluation.judging import judge_both
 from pipeline.evaluation.media import film
