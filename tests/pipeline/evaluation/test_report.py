@@ -151,8 +151,9 @@ def test_the_page_shows_tasks(inputs: Inputs) -> None:
         "close": {"physics_before": None, "physics_after": None, "paired": None, "imagined_after": entry(88)},
     }
     page = build_report({}, inputs, {**result(tasks=tasks), "verdict": "gain"})
-    assert "Before and after, task by task" in page and "+25.0" in page and "77.0%" in page and "88.0%" in page
-    assert "Before and after, task by task" not in build_report({}, inputs, {**result(), "verdict": "gain"})
+    title = "Before and after, task by task"
+    assert title in page and "+25.0" in page and "77.0%" in page and "88.0%" in page
+    assert title not in build_report({}, inputs, {**result(), "verdict": "gain"})
 
 
 def test_the_page_shows_controls_and_runs_without_physics(inputs: Inputs) -> None:
