@@ -51,6 +51,8 @@ def play(words: Words) -> None:
     words = [word for word in words if not word.startswith("actions=")]
     cfg, root = prepared(words)
     world = learned_world(cfg, root)
+    if not world and (root / "stages").is_dir():
+        print(f"{root} holds no world of these options and this code yet (`worldloop stages` says why)")
     if not world and cfg["task"]["suite"]:  # nothing asks for small pictures
         cfg, root = prepared([*words, *without_given([_LARGE], words)])
     config = options(ServeConfig, cfg["serve"], "serve")
