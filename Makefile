@@ -7,8 +7,9 @@ PIP_ARGS ?=
 SEED ?= 0
 METAWORLD := metaworld==3.1.1
 ALOHA := dm_control==1.0.41 gym-aloha==0.1.5
+OGBENCH := dm_control==1.0.41 ogbench==1.2.2
 
-.PHONY: setup metaworld aloha gl test lint quickstart smoke controls clean
+.PHONY: setup metaworld aloha ogbench gl test lint quickstart smoke controls clean
 
 setup: gl $(VENV)/.ready
 
@@ -22,7 +23,7 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps openpi-client==0.1.2 $(METAWORLD) $(ALOHA)
 	touch $@
 
-# One suite alone, for an environment that was set up without it.
+# One suite alone, for an environment that was set up without it; ogbench is not part of the set-up.
 metaworld:
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[metaworld]"
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps $(METAWORLD)
@@ -30,6 +31,10 @@ metaworld:
 aloha:
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[aloha]"
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps $(ALOHA)
+
+ogbench:
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[ogbench]"
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps $(OGBENCH)
 
 # OpenGL in software, for rendering without a screen. Installed where we may, else the line to type is printed.
 gl:

@@ -158,10 +158,11 @@ def _conclude(
     inputs, policies = {"data": data, **made.roles()}, {"before": first, "after": last}
     imagined = graph.add("evaluate-imagined", prove.evaluate_imagined, {**inputs, **policies})
     measured = graph.add("measure", prove.measure, inputs)
+    shown = {"data": data, "simulator": made.simulator, "judge": made.judge, "measured": measured}
     if proofs:
-        videos = graph.add("videos", show.videos, {"simulator": made.simulator, **policies})
+        videos = graph.add("videos", show.videos, {**shown, **policies})
     else:
-        videos = graph.add("videos", show.replays, {"data": data, "simulator": made.simulator})
+        videos = graph.add("videos", show.replays, shown)
     everything = list(graph.nodes)
     graph.add(
         "report",

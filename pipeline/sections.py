@@ -148,6 +148,7 @@ class MeasureSection:
     """Section measure."""
 
     videos: Natural
+    worst: Natural
     starts: Count
     speed_chunks: Count
 

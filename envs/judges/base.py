@@ -79,6 +79,14 @@ class Judge(nn.Module):
             done.append(run >= self.hold)
         return torch.stack(done, 1), run
 
+    def confidence(self, success: Tensor) -> Tensor:
+        """The highest threshold [B] at which episodes of frame probabilities [B, T], 0 where they are over,
+        count as successes: the least probability of the best run of `hold` frames.
+        """
+        short = self.hold - success.shape[1]
+        padded = nn.functional.pad(success, (0, max(0, short)))
+        return padded.unfold(1, self.hold, 1).amin(-1).amax(1)
+
     def episode(self, success: Tensor, valid: Tensor) -> Tensor:
         """Episode success bool [B] from frame probabilities [B, T]; frames exist where valid [B, T]."""
         masked = torch.where(valid, success, 0.0)

@@ -93,9 +93,21 @@ class _Remote:
                 log.warning("physics worker %d died (exit code %s); its episodes run again", self.index, code)
                 self._start()
         raise PoolError(
-            f"physics worker {self.index} died {1 + RETRIES} times in a row (exit code {code});"
-            " out of memory or a broken GL driver"
+            f"physics worker {self.index} died {1 + RETRIES} times in a row (exit code {code})"
+            f"{self._where()}; out of memory, a broken GL driver, or a suite that crashes in this episode"
         )
+
+    def _where(self) -> str:
+        """The episodes that were asked for, in words; "" if none were."""
+        name, arguments = self._request or ("", ())
+        seeds: list[int] = []
+        if name == "script":
+            seeds = [seed for seed, _ in arguments[0]]
+        elif name == "reset":
+            seeds = list(arguments[0].values())
+        elif name == "step":
+            seeds = [self._episodes[slot].seed for slot in arguments[0]]
+        return f" in the episodes of the seeds {seeds[:4]}" if seeds else ""
 
     def close(self, patience: float) -> int | None:
         """End the process, by force after `patience` seconds; returns its exit code."""

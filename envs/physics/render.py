@@ -31,6 +31,8 @@ class Offscreen:
         buffer = model.vis.global_
         self._fine = 2 if 2 * size[0] <= buffer.offheight and 2 * size[1] <= buffer.offwidth else 1
         height, width = self._fine * size[0], self._fine * size[1]
+        # or pictures larger than the model asks for would hold what nobody drew
+        buffer.offheight, buffer.offwidth = max(buffer.offheight, height), max(buffer.offwidth, width)
         # Mesa's software driver hands pictures this small to threads of its own at a loss; every core has a
         # worker already.
         os.environ.setdefault("LP_NUM_THREADS", "0")

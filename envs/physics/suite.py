@@ -63,9 +63,12 @@ class TaskSuite(ABC):
         tasks: names that `reset` takes.
         embodiment: the robot; camera sizes are those that `render` returns.
         offers: what else its options choose from, such as scenes or cameras, by the option's name.
+        scenes: names of the scenes that episodes are laid out in, with its options as they are; see scene_of.
+            () where all are laid out in one. A suite that has them takes names of scenes as option `scenes`.
     """
 
     tasks: tuple[str, ...]
+    scenes: tuple[str, ...] = ()
     offers: Mapping[str, Sequence[str]] = {}
     embodiment: Embodiment
 
@@ -141,6 +144,12 @@ def task_names(name: str | Sequence[str]) -> tuple[str, ...]:
 def task_of(tasks: Sequence[str], seed: int) -> str:
     """The task of an episode, where several are played by turns: consecutive seeds take consecutive tasks."""
     return tasks[seed % len(tasks)]
+
+
+def scene_of(scenes: Sequence[str], seed: int) -> str:
+    """The scene of an episode, drawn by its seed whatever its task; "" if there are none to draw from."""
+    draw = np.random.default_rng([seed, 3])
+    return scenes[int(draw.integers(len(scenes)))] if scenes else ""
 
 
 def check_task(task: str, tasks: Iterable[str]) -> None:

@@ -204,9 +204,7 @@ def calibrate(judge: Judge, success: Tensor, succeeded: Tensor) -> bool:
     hits = float(succeeded.sum())
     if hits in (0.0, float(len(succeeded))) or not torch.isfinite(success).all():
         return False
-    # An episode succeeds if its best run of `hold` frames lies above the threshold throughout.
-    best = success.double().unfold(1, judge.hold, 1).amin(-1).amax(1)
-    score = torch.logit(best.clamp(0.01, 0.99)).numpy()
+    score = torch.logit(judge.confidence(success.double()).clamp(0.01, 0.99)).numpy()
     targets = (
         torch.where(succeeded, (hits + 1) / (hits + 2), 1 / (len(succeeded) - hits + 2)).double().numpy()
     )

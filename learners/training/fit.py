@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from envs.precision import mixed_precision
 from envs.ranges import Count, Decay, Natural, NonNegative, Positive
-from envs.rng import step_generator
+from learners.training.ahead import Batch, BatchesAhead
 from learners.training.checkpoint import Checkpoints, buffers_of, truncate_log
 from learners.training.interrupt import deferred_signals, leave
 from learners.training.optimisers import OPTIMISERS, optimiser_state
@@ -36,8 +36,6 @@ from learners.training.parallel import (
     my_share,
     twin,
 )
-
-Batch = Callable[[int, torch.Generator], Any]
 
 
 class TrainingDiverged(RuntimeError):
@@ -112,13 +110,15 @@ def fit(
     Args:
         name: shown in the progress bar and used as the metrics' prefix.
         module: what is trained; parameters without gradient are left alone.
-        batch: (step, generator) -> config.part samples of anything `loss` understands.
+        batch: (step, generator) -> config.part samples of anything `loss` understands; made ahead in another
+            thread, see ahead.py.
         loss: (batch, generator) -> scalar loss and figures to log.
         folder: receives checkpoints and metrics.jsonl; a checkpoint found there is resumed.
         watch: the figure shown while it runs.
 
     Returns:
-        Seconds spent: total, data, compute; and the last smoothed loss.
+        data_seconds, spent waiting for batches; compute_seconds, spent on all else; samples_per_second over
+        both, of all workers together; and the last smoothed loss.
 
     Raises:
         TrainingDiverged: on a loss or gradient that is not finite.
@@ -159,19 +159,22 @@ def fit(
         dynamic_ncols=True,
         disable=not leads(),
     )
-    with (log if leads() else Path(os.devnull)).open("a") as stream, deferred_signals() as asked_to_leave:
-        for step in range(first, config.steps):
+    steps = range(first, config.steps)
+    with (
+        (log if leads() else Path(os.devnull)).open("a") as stream,
+        deferred_signals() as asked_to_leave,
+        BatchesAhead(batch, config.seed, steps, mine, device) as batches,
+    ):
+        for step in steps:
             began, waited = time.perf_counter(), 0.0
             for optimiser in optimisers:
                 for group in optimiser.param_groups:
                     group["lr"] = _rate(config, step)
                 optimiser.zero_grad(set_to_none=True)
             rows = []
-            for part in mine:
-                generator, asked = step_generator(config.seed, step, part), time.perf_counter()
-                data = batch(step, generator)
-                if hasattr(data, "to"):
-                    data = data.to(device)
+            for _ in mine:
+                asked = time.perf_counter()
+                data, generator = batches.take()
                 waited += time.perf_counter() - asked
                 with mixed_precision(device, config.bf16):
                     value, more = trainee(loss, data, generator)
@@ -224,6 +227,7 @@ def fit(
     module.eval()
     return {
         **{f"{key}_seconds": value for key, value in spent.items()},
+        "samples_per_second": config.steps * config.batch / max(1e-9, sum(spent.values())),
         "loss": smooth if smooth is not None else math.nan,
     }
 

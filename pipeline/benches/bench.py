@@ -11,7 +11,7 @@ from pipeline.config import load_config
 # Where each benchmark is, and what it takes for granted unless the command line says otherwise.
 BENCHES: dict[str, tuple[str, tuple[str, ...]]] = {
     "conditioning": ("pipeline.benches.conditioning", ()),
-    "physics": ("pipeline.benches.worlds", ()),
+    "collection": ("pipeline.benches.worlds", ()),
     "world": ("pipeline.benches.worlds", ()),
     "actors": ("pipeline.benches.actors", ("launch=ray",)),
     "learning": ("pipeline.benches.learning", ()),

@@ -11,6 +11,8 @@ from typing import Any
 from envs.targets import ConfigError
 from pipeline.cli.words import Words, prepared, without_given
 
+_LARGE = "task.size=[256,256]"  # pictures of a game without a learned world
+
 
 def serve(words: Words) -> None:
     """serve a simulator to many sessions by GE-Sim's protocol: worldloop serve simulator=gesim
@@ -33,6 +35,32 @@ def serve(words: Words) -> None:
             flush=True,
         )
         run_server(host, name, server)
+
+
+def play(words: Words) -> None:
+    """open a task for a person in a browser, and beside it the world that a run of the same options learned:
+    worldloop play task=push [actions=<LeRobot data set>]
+    """
+    from actors.playing.app import play as run_game
+    from actors.serving.app import listening
+    from actors.serving.sessions import ServeConfig
+    from envs.targets import options
+    from pipeline.commands.play import build_game, learned_world
+
+    chosen = [word.removeprefix("actions=") for word in words if word.startswith("actions=")]
+    words = [word for word in words if not word.startswith("actions=")]
+    cfg, root = prepared(words)
+    world = learned_world(cfg, root)
+    if not world and (root / "stages").is_dir():
+        print(f"{root} holds no world of these options and this code yet (`worldloop stages` says why)")
+    if not world and cfg["task"]["suite"]:  # nothing asks for small pictures
+        cfg, root = prepared([*words, *without_given([_LARGE], words)])
+    config = options(ServeConfig, cfg["serve"], "serve")
+    with listening(config) as server:
+        sides = " and ".join([*["physics"] * bool(cfg["task"]["suite"]), *["imagination"] * bool(world)])
+        where = f"http://{config.host}:{server.getsockname()[1]}"
+        said = f"{sides} of {cfg['task']['name']}: open {where} in a browser, end with Ctrl-C"
+        run_game(lambda: build_game(cfg, world, Path(chosen[-1]) if chosen else None), server, said)
 
 
 def convert(words: Words) -> None:
@@ -62,7 +90,7 @@ def inspect(words: Words) -> None:
 
 def bench(words: Words) -> None:
     """measure performance: worldloop bench
-    conditioning|physics|world|actors|learning|serving|gesim|overfit|pretrained
+    conditioning|collection|world|actors|learning|serving|gesim|overfit|pretrained
     """
     from pipeline.benches.bench import run_bench
 

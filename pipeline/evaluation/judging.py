@@ -1,15 +1,23 @@
-"""A judge asked about whole episodes, and its verdicts against recorded success."""
+"""A judge asked about whole episodes: its verdicts against recorded success, and its view frame by frame."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge
+from envs.simulators.replay import Replay
 from pipeline.evaluation.statistics import confusion
+
+
+class Scores(NamedTuple):
+    """Probabilities of success and progress, float32 [N, T] each in 0..1."""
+
+    success: Tensor
+    progress: Tensor
 
 
 def labelled(store: ClipStore, episodes: Tensor) -> Tensor:
@@ -24,30 +32,48 @@ def episode_success(store: ClipStore, episodes: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def judge_frames(judge: Judge, frames: Tensor, store: ClipStore, episodes: Tensor, batch: int = 16) -> Tensor:
-    """Success probabilities [N, T] of frames uint8 [N, T, V, 3, H, W] of these episodes."""
+def judge_frames(judge: Judge, frames: Tensor, store: ClipStore, episodes: Tensor, batch: int = 16) -> Scores:
+    """What the judge says of frames uint8 [N, T, V, 3, H, W] of these episodes."""
     device = judge.threshold.device
     scores = []
     for begin in range(0, len(episodes), batch):
         some = slice(begin, begin + batch)
         first = store.frames(store.start[episodes[some]])
         texts = [store.instructions[n] for n in episodes[some].tolist()]
-        scores.append(judge.score(frames[some].to(device), first.to(device), texts).success.cpu())
-    return torch.cat(scores)
+        verdict = judge.score(frames[some].to(device), first.to(device), texts)
+        scores.append((verdict.success.cpu(), verdict.progress.cpu()))
+    return Scores(*(torch.cat(parts) for parts in zip(*scores, strict=True)))
 
 
 def judge_table(
-    judge: Judge, frames: Tensor, valid: Tensor, store: ClipStore, episodes: Tensor
+    judge: Judge, scores: Scores, valid: Tensor, store: ClipStore, episodes: Tensor
 ) -> dict[str, Any]:
     """Confusion of the judge's episode verdicts with recorded success; {} if no episode is labelled.
 
     Args:
-        frames: uint8 [N, T, V, 3, H, W], recorded or generated, of the N episodes.
+        scores: of frames, recorded or generated, of the N episodes.
         valid: bool [N, T], frames that exist.
     """
     known = torch.isin(episodes, labelled(store, episodes))
     if not known.any():
         return {}
-    score = judge_frames(judge, frames[known], store, episodes[known])
-    verdicts = judge.episode(score.to(judge.threshold.device), valid[known].to(judge.threshold.device))
+    device = judge.threshold.device
+    verdicts = judge.episode(scores.success[known].to(device), valid[known].to(device))
     return confusion(verdicts.cpu(), episode_success(store, episodes[known]))
+
+
+class Views(NamedTuple):
+    """A judge's view of episodes as they were recorded and as a simulator generated them under the same
+    actions.
+    """
+
+    recorded: Scores
+    generated: Scores
+
+
+def judge_both(judge: Judge, store: ClipStore, episodes: Tensor, made: Replay) -> Views:
+    """What the judge says of replayed episodes int64 [N] and of their recordings."""
+    return Views(
+        judge_frames(judge, store.frames(made.rows), store, episodes),
+        judge_frames(judge, made.frames, store, episodes),
+    )

@@ -1,9 +1,8 @@
-"""Videos and pictures for people: imagined above true, curves, pictures of the bench."""
+"""Videos and pictures for people: imagined above true."""
 
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,15 +19,12 @@ from envs.simulators.replay import Replay
 _HEIGHT = 192  # pixels of a view in videos, about
 
 
-def paired_frames(
-    store: ClipStore, episodes: Tensor, made: Replay, number: int, title: str
-) -> list[NDArray[np.uint8]]:
+def paired_frames(store: ClipStore, episodes: Tensor, made: Replay, number: int) -> list[NDArray[np.uint8]]:
     """Frames RGB of one episode: what was imagined above, what was recorded below, all views side by side.
 
     Args:
         episodes: int64 [N], those that `made` replays.
         number: which of them.
-        title: stands beside "imagined".
     """
     valid = made.valid[number]
     imagined, true = made.frames[number][valid].numpy(), store.frames(made.rows[number][valid]).numpy()
@@ -39,18 +35,32 @@ def paired_frames(
         rows = [np.concatenate(list(views.transpose(0, 2, 3, 1)), 1) for views in (above, below)]
         big = [cv2.resize(row, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST) for row in rows]
         bars = [np.full((22, big[0].shape[1], 3), 24, np.uint8) for _ in range(2)]
-        for bar, text in zip(bars, (f"imagined   {title}", "recorded"), strict=True):
+        for bar, text in zip(bars, ("imagined", "recorded"), strict=True):
             cv2.putText(bar, text, (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (230, 230, 230), 1, cv2.LINE_AA)
         out.append(np.concatenate([bars[0], big[0], bars[1], big[1]]))
-    return [
-        np.ascontiguousarray(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]) for frame in out
-    ]
+    return [_even(frame) for frame in out]
+
+
+def film(path: Path, frames: NDArray[np.uint8], fps: float) -> None:
+    """Write frames uint8 [T, V, 3, H, W] as an mp4 that browsers play, all views side by side."""
+    scale = max(1, round(_HEIGHT / frames.shape[-2]))
+    rows = frames.transpose(0, 3, 1, 4, 2).reshape(len(frames), frames.shape[-2], -1, 3)
+    _video(path, [_even(row.repeat(scale, 0).repeat(scale, 1)) for row in rows], fps)
 
 
 def paired_video(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> None:
-    """Write `paired_frames` as an mp4 that browsers play."""
+    """Write `paired_frames` as an mp4 that browsers play; it ends with a moment's rest."""
+    _video(path, [*frames, *[frames[-1]] * 5], fps)
+
+
+def _video(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_video(path, [*frames, *[frames[-1]] * 5], fps, crf=20, browser=True)
+    write_video(path, frames, fps, crf=20, browser=True)
+
+
+def _even(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A frame [H, W, 3] less a row or column, so that both sides are even, as H.264 asks."""
+    return np.ascontiguousarray(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2])
 
 
 def write_gif(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> None:
@@ -67,34 +77,6 @@ def write_gif(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> No
 def inline(data: bytes, kind: str) -> str:
     """A data URL, so that a report is one file."""
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"
-
-
-def plot(
-    curves: Sequence[tuple[str, Sequence[float], Sequence[float]]],
-    title: str,
-    xlabel: str,
-    ylabel: str,
-    size: tuple[float, float] = (5.2, 2.8),
-) -> str:
-    """Line plot of (label, x, y) as a data URL of an SVG."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=size)
-    for label, x, y in curves:
-        axes.plot(x, y, label=label, linewidth=1.6)
-    axes.set(title=title, xlabel=xlabel, ylabel=ylabel)
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
-    if len(curves) > 1:
-        axes.legend(frameon=False, fontsize=8)
-    figure.tight_layout()
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg")
-    plt.close(figure)
-    return inline(buffer.getvalue(), "image/svg+xml")
 
 
 def smooth(values: Sequence[float], width: int) -> list[float]:

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup
 from omegaconf import OmegaConf
 
-from pipeline.evaluation.media import inline, plot, smooth
+from pipeline.evaluation.charts import Curve, line_chart, progress_chart
+from pipeline.evaluation.heat import heat_maps
+from pipeline.evaluation.media import inline, smooth
 from pipeline.evaluation.result import manifests
 from pipeline.evaluation.statistics import rate
 from pipeline.graph.stage import Inputs
 from pipeline.track import read_metrics
 
-_TEMPLATE = "report.html.j2"
+VIDEOS = "videos.json"  # what the stage that made the videos says of each, see pipeline/stages/show.py
 # Curves beside those of RL: stages, the figure that they log, and the plot's title.
 _CURVES = (
     ("simulator", "simulator/loss", "Simulator loss"),
@@ -48,17 +52,25 @@ def build_report(
         result: see result.py.
         controls: rows of controls.json, None before `worldloop controls` has run.
     """
-    loader = PackageLoader("pipeline", "evaluation")
-    page = Environment(loader=loader, autoescape=select_autoescape(["j2"]), undefined=StrictUndefined)
-    page.globals["rate"] = rate
-    config = {key: cfg[key] for key in cfg}
-    return page.get_template(_TEMPLATE).render(
+    loader = PackageLoader("pipeline", "evaluation/page")
+    page = Environment(
+        loader=loader,
+        autoescape=select_autoescape(["j2"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page.globals |= {"rate": rate, "progress_chart": progress_chart}
+    worst, tasks = _videos(inputs)
+    return page.get_template("report.html.j2").render(
         result=result,
+        heat=heat_maps(result["scenes"]),
         controls=controls,
-        videos=_videos(inputs),
+        worst=worst,
+        tasks=tasks,
         curves=_curves(inputs),
         hosts=_hosts(inputs),
-        config=OmegaConf.to_yaml(OmegaConf.create(config)),
+        config=OmegaConf.to_yaml(OmegaConf.create({key: cfg[key] for key in cfg})),
     )
 
 
@@ -67,18 +79,30 @@ def stage_folders(inputs: Inputs) -> dict[str, Path]:
     return dict(zip(manifests(inputs), inputs.folders("stages"), strict=True))
 
 
-def _videos(inputs: Inputs) -> list[dict[str, str]]:
-    """Videos in pairs, as data URLs: before and after where there are both."""
-    files = sorted((inputs.folder("videos") / "media").glob("*.mp4"))
-    kinds = sorted({file.stem.split("-")[0] for file in files}, reverse=True)  # before stands left of after
-    ordered = [[file for file in files if file.stem.split("-")[0] == kind] for kind in kinds]
-    most = max((len(some) for some in ordered), default=0)
-    picked = [some[k] for k in range(most) for some in ordered if k < len(some)]
-    return [{"name": file.stem, "url": inline(file.read_bytes(), "video/mp4")} for file in picked]
+def _videos(inputs: Inputs) -> tuple[list[dict[str, Any]], dict[str, list[dict[str, Any]]]]:
+    """Videos of the worst disagreements, and those of each task, each with its data URL and the worst first;
+    of equal ones before stands left of after.
+    """
+    folder = inputs.folder("videos")
+    worst: list[dict[str, Any]] = []
+    tasks: dict[str, list[dict[str, Any]]] = {}
+    for row in json.loads((folder / VIDEOS).read_text()):
+        video = {**row, "url": inline((folder / "media" / row["file"]).read_bytes(), "video/mp4")}
+        if row["label"] == "worst":
+            worst.append(video)
+        else:
+            tasks.setdefault(row["task"], []).append(video)
+    for videos in tasks.values():
+        hardest = {row["seed"]: 0.0 for row in videos}
+        for row in videos:
+            hardest[row["seed"]] = max(hardest[row["seed"]], row["disagreement"])
+        videos.sort(key=lambda row: row["label"], reverse=True)
+        videos.sort(key=lambda row: (-hardest[row["seed"]], row["seed"]))
+    return worst, dict(sorted(tasks.items()))
 
 
-def _curves(inputs: Inputs) -> list[str]:
-    """Plots as data URLs: imagined success over all rounds, and the losses of what learned."""
+def _curves(inputs: Inputs) -> list[Markup]:
+    """Charts of imagined success over all rounds, and of the losses of what learned."""
     folders = stage_folders(inputs)
     success, offset = [], 0
     for name, folder in folders.items():
@@ -86,9 +110,9 @@ def _curves(inputs: Inputs) -> list[str]:
             continue
         rows = read_metrics(folder / "metrics.jsonl")
         steps = [offset + row["step"] for row in rows]
-        success.append((name.replace("rl-", "round "), steps, [row["rl/success"] for row in rows]))
+        success.append(Curve(name.replace("rl-", "round "), steps, [row["rl/success"] for row in rows]))
         offset += len(rows)
-    urls = [plot(success, "Imagined success while learning (stochastic)", "iteration", "success")]
+    charts = [line_chart(success, "Imagined success while learning (stochastic)", "iteration", "success")]
     for stage, figure, title in _CURVES:
         curves = []
         for name, folder in folders.items():
@@ -96,10 +120,9 @@ def _curves(inputs: Inputs) -> list[str]:
             values = [row[figure] for row in rows if figure in row]
             if values and name.split("-")[0] == stage:
                 shown = smooth(values, 25)
-                curves.append((name, list(range(len(shown))), shown))
-        if curves:
-            urls.append(plot(curves, title, "step", figure.split("/")[1].replace("_", " ")))
-    return urls
+                curves.append(Curve(name, list(range(len(shown))), shown))
+        charts.append(line_chart(curves, title, "step", figure.split("/")[1].replace("_", " ")))
+    return [chart for chart in charts if chart]
 
 
 def _hosts(inputs: Inputs) -> list[list[str]]:

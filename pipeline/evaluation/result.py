@@ -10,7 +10,7 @@ import torch
 
 from envs.manifest import read_manifest
 from envs.physics.suite import task_names
-from pipeline.evaluation.by_task import by_task, tasks_of_seeds
+from pipeline.evaluation.by_task import by_scene, by_task, scenes_of_seeds, tasks_of_seeds
 from pipeline.evaluation.statistics import mcnemar, rate, rate_entry
 from pipeline.graph.stage import Inputs
 
@@ -27,8 +27,9 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
     Returns:
         name, seed, simulator, algorithm, verdict; physics_before and physics_after (rate entries) with paired
         (McNemar), None without physics; imagined_before, imagined_after; judge, rollout, frames_per_second
-        (see the measure stage); tasks (the same rates by task, {} if there is one); rounds (gaps); episodes
-        used and held out; seconds per stage; alarms.
+        (see the measure stage); tasks (the same rates by task, {} if there is one); scenes (the same rates of
+        each task in each scene that occurs, [] if there is one); rounds (gaps); episodes used and held out;
+        seconds per stage; training (see `_training`); alarms.
     """
     finished = manifests(inputs)
     imagined, measured = (result_of(inputs.folder(role)) for role in ("imagined", "measured"))
@@ -52,11 +53,13 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         "rollout": measured["rollout"],
         "frames_per_second": measured["frames_per_second"],
         "tasks": _tasks(cfg, inputs, imagined),
+        "scenes": _scenes(cfg, inputs, imagined),
         "rounds": [entry["result"] for name, entry in finished.items() if name.startswith("gap-")],
         "episodes_used": sum(entry["episodes"] - entry.get("held_out", 0) for entry in gathered),
         "episodes_held_out": sum(entry.get("held_out", 0) for entry in gathered),
         "imagined_episodes_used": [entry["result"]["ledger"]["learned"] for entry in learned],
         "stage_seconds": {name: entry["seconds"] for name, entry in finished.items()},
+        "training": _training(finished),
         "alarms": [text for entry in learned for text in entry["result"]["alarms"]],
     }
     result["verdict"] = verdict(result)
@@ -154,6 +157,43 @@ def _tasks(cfg: Mapping[str, Any], inputs: Inputs, imagined: Mapping[str, Any]) 
         }
         for name in names
     }
+
+
+def _scenes(cfg: Mapping[str, Any], inputs: Inputs, imagined: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """For each task in each scene task, scene, and those of physics_before, physics_after, paired,
+    imagined_before and imagined_after of which there are episodes.
+    """
+    parts = [
+        {"task": cell["task"], "scene": cell["scene"], f"imagined_{when}": cell}
+        for when in ("before", "after")
+        for cell in imagined[when]["scenes"]
+    ]
+    if "physics_before" in inputs.found:
+        before, after = (inputs.folder(f"physics_{when}") for when in ("before", "after"))
+        seeds = outcomes(before, "seeds").tolist()
+        tasks, scenes = tasks_of_seeds(cfg, seeds), scenes_of_seeds(cfg, seeds)
+        parts += by_scene(tasks, scenes, _pair, outcomes(before), outcomes(after))
+    found: dict[tuple[str, str], dict[str, Any]] = {}
+    for part in parts:
+        found.setdefault((part["task"], part["scene"]), {}).update(part)
+    return [found[where] for where in sorted(found)]
+
+
+def _training(finished: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, float]]:
+    """By the name of what was trained: samples_per_second, and data_share, the share of the time in which it
+    waited for data.
+    """
+    out = {}
+    for stage, manifest in finished.items():
+        made = manifest["result"]
+        for key in made:
+            if not key.endswith("samples_per_second"):
+                continue
+            part = key.removesuffix("samples_per_second")
+            waited, worked = made[f"{part}data_seconds"], made[f"{part}compute_seconds"]
+            name = f"{stage}, {part.rstrip('_')}" if part else stage
+            out[name] = {"samples_per_second": made[key], "data_share": waited / ((waited + worked) or 1.0)}
+    return out
 
 
 def _pair(before: torch.Tensor, after: torch.Tensor) -> dict[str, Any]:

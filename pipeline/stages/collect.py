@@ -14,6 +14,7 @@ from tqdm import tqdm
 from actors.factory import build_physics, build_policy, build_pool, open_clips
 from actors.rollouts.evaluate import evaluate
 from actors.world_config import world_spec
+from envs.episodes.clips import ClipStore
 from envs.episodes.episode import Episode
 from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.episodes.formats.lerobot_writer import LeRobotWriter
@@ -23,7 +24,8 @@ from envs.files import write_text
 from envs.physics.suite import task_names
 from envs.physics.worker import Track
 from envs.targets import ConfigError
-from pipeline.evaluation.by_task import by_task, tasks_of_seeds
+from pipeline.evaluation.by_task import by_task, tasks_of_episodes, tasks_of_seeds
+from pipeline.evaluation.media import film
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.graph.code_version import digest
 from pipeline.graph.stage import Inputs, stage
@@ -31,6 +33,7 @@ from pipeline.stages.given import DATASETS, PHYSICS, ROBOT, Cfg
 from pipeline.stages.seeds import Purpose, episode_seeds
 
 _SIDE_BY_SIDE = 64  # deployed episodes
+_FILMED = 5  # failures of the expert, at most
 SPLITS = ("train", "held_out", "calibration")  # in the order of their episodes
 
 
@@ -66,7 +69,25 @@ def collect(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         "held_out": len(store.split("held_out")),
         "frames": int(store.length.sum()),
         "successes": sum(bool(row["success"]) for row in store.episodes),
+        "expert_failures": _failures(cfg, store, folder),
     }
+
+
+def _failures(cfg: Cfg, store: ClipStore, folder: Path) -> list[str]:
+    """Task and seed of every episode in which the expert itself failed; says so, leaves videos of some."""
+    tried, failed = store.select(["expert"]), store.select(["expert"], succeeded=False)
+    tasks = tasks_of_episodes(cfg, store, failed)
+    names = [f"{task}-{store.episodes[n]['seed']}" for task, n in zip(tasks, failed.tolist(), strict=True)]
+    for name, number in list(zip(names, failed.tolist(), strict=True))[:_FILMED]:
+        frames = store.frames(store.rows(torch.tensor([number]))).numpy()
+        film(folder / "media" / f"expert-{name}.mp4", frames, store.fps)
+    if names:
+        tqdm.write(
+            f"collect: the expert failed in {len(names)} of {len(tried)} episodes, by task and seed"
+            f" {', '.join(names[:_FILMED])}{' ...' if len(names) > _FILMED else ''}; videos of them are in"
+            f" {folder / 'media'}"
+        )
+    return names
 
 
 def scripted_jobs(cfg: Cfg) -> list[tuple[int, float, str]]:

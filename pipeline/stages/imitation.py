@@ -40,9 +40,9 @@ def imitation(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     seen = train_perception(policy, store, everything, mode, eyes, folder / "perception", section["discount"])
     fit = fit_options(cfg, section["fit"], "imitation.fit")
     # Perception has taken its units from all frames; demonstrations must not change them again.
-    stats = seen | train_imitation(Cloning(policy, store, demos, mode), fit, folder, fresh=not seen)
+    stats = train_imitation(Cloning(policy, store, demos, mode), fit, folder, fresh=not seen)
     save_weights(policy, folder)
-    return {**stats, "demos": len(demos)}
+    return {**_both(stats, seen), "demos": len(demos)}
 
 
 @stage(reads=(*WORLD, "policy", "imitation", "clone", "microbatches"), place=Place.LEARNERS)
@@ -67,6 +67,11 @@ def clone(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         policy, store, everything, mode, eyes, folder / "perception", discount, fresh=False
     )
     fit = fit_options(cfg, section["fit"], "clone.fit")
-    stats = seen | train_imitation(Cloning(policy, store, episodes, mode, made), fit, folder, fresh=False)
+    stats = train_imitation(Cloning(policy, store, episodes, mode, made), fit, folder, fresh=False)
     save_weights(policy, folder)
-    return {**stats, "episodes": len(episodes), "generated_frames": len(made)}
+    return {**_both(stats, seen), "episodes": len(episodes), "generated_frames": len(made)}
+
+
+def _both(stats: dict[str, float], seen: dict[str, float]) -> dict[str, float]:
+    """What imitation says of itself, and what perception before it said, if it was trained."""
+    return {**stats, **{f"perception_{key}": value for key, value in seen.items()}}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from pathlib import Path
 from typing import Any
@@ -12,15 +13,24 @@ from torch import Tensor
 from actors.factory import build_judge, build_physics, build_policy, build_simulator, build_state_decoder
 from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
+from envs.files import write_text
 from envs.simulators.replay import replay
 from pipeline.evaluation import measurement
-from pipeline.evaluation.by_task import by_task, tasks_of_episodes, tasks_of_seeds
-from pipeline.evaluation.judging import episode_success, judge_table
+from pipeline.evaluation.by_task import (
+    by_scene,
+    by_task,
+    scenes_of_episodes,
+    tasks_of_episodes,
+    tasks_of_seeds,
+)
+from pipeline.evaluation.disagreement import compared
+from pipeline.evaluation.judging import episode_success, judge_both, judge_frames, judge_table
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import PHYSICS, WORLD, Cfg, load_world, open_store
 from pipeline.stages.seeds import Purpose, episode_seeds
 
+EPISODES = "episodes.json"  # of the stage measure
 _SIDE_BY_SIDE = 64  # imagined episodes
 
 
@@ -51,7 +61,8 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     if len(held):
         made = replay(world.base_env.simulator, store, held, bf16=cfg["simulator"]["bf16"])
         judge = build_judge(cfg, inputs.weights("judge"))
-        result["replayed"] = judge_table(judge, made.frames, made.valid, store, held)
+        scores = judge_frames(judge, made.frames, store, held)
+        result["replayed"] = judge_table(judge, scores, made.valid, store, held)
     return result
 
 
@@ -88,7 +99,7 @@ def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     others = torch.arange(len(store))
     starts = torch.cat((held, others[~torch.isin(others, held)]))[: cfg["evaluate"]["imagined"]]
     world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(starts)), starts)
-    tasks = tasks_of_episodes(cfg, store, starts)
+    tasks, scenes = (of(cfg, store, starts) for of in (tasks_of_episodes, scenes_of_episodes))
     out: dict[str, Any] = {}
     for label in ("before", "after"):
         policy = build_policy(cfg, inputs.weights(label))
@@ -96,6 +107,7 @@ def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         out[label] = {
             **_imagined(outcome.success, outcome.judged),
             "tasks": by_task(tasks, _imagined, outcome.success, outcome.judged),
+            "scenes": by_scene(tasks, scenes, _imagined, outcome.success, outcome.judged),
         }
     return out
 
@@ -117,23 +129,28 @@ def _gap(truth: Tensor, success: Tensor, judged: Tensor) -> dict[str, Any]:
 
 @stage(reads=(*WORLD, "measure"), place=Place.EVALUATOR)
 def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """Rollout error, state error, speed and the judge's tables on held-out episodes of every source."""
+    """Rollout error, state error, speed and the judge's tables on held-out episodes of every source; and
+    episodes.json, how far imagination and truth disagree in each of them (see disagreement.py).
+    """
     prepare_process(cfg["seed"])
     simulator = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
     judge = build_judge(cfg, inputs.weights("judge"))
     store = open_store(cfg, inputs)
     result: dict[str, Any] = {"rollout": {}, "judge": {}}
+    rows: list[dict[str, Any]] = []
     for name, episodes in measurement.groups(store, store.split("held_out")).items():
         made = replay(simulator, store, episodes, decoder, bf16=cfg["simulator"]["bf16"])
         result["rollout"][name] = measurement.rollout_error(store, episodes, made)
-        real = store.frames(made.rows)
+        views = judge_both(judge, store, episodes, made)
         tables = {
-            "recorded": judge_table(judge, real, made.valid, store, episodes),
-            "generated": judge_table(judge, made.frames, made.valid, store, episodes),
+            video: judge_table(judge, scores, made.valid, store, episodes)
+            for video, scores in views._asdict().items()
         }
         if all(tables.values()):
             result["judge"][name] = tables
+        rows += compared(cfg, judge, store, episodes, made, views)
+    write_text(folder / EPISODES, json.dumps(rows))
     result["frames_per_second"] = {
         f"batch {n}": measurement.speed(simulator, store, n, cfg["measure"]["speed_chunks"]) for n in (1, 32)
     }

@@ -53,6 +53,12 @@ def test_a_store_shows_what_the_robot_allows(
     assert torch.equal(later["state"][1], store.arrays["states"][store.start[5] + store.length[5] - 1])
 
 
+def test_pictures_stay_on_disk(store: ClipStore) -> None:
+    for part in store.parts:
+        for pictures in (part.frames, part.pose_maps):
+            assert isinstance(pictures, np.memmap) and not pictures.flags.writeable
+
+
 def test_clips_line_up(store: ClipStore) -> None:
     clip = store.clips(torch.tensor([0, 3]), torch.tensor([0, 3]), ClipSpec(4, 4, 2))
     rows = store.start[3] + 3 + torch.arange(1, 9)

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+pytest.importorskip("metaworld", reason="make metaworld installs it")
+
 from envs.physics.metaworld import MetaWorld, instruction_of
 from envs.physics.suite import build_suite
 from envs.targets import ConfigError

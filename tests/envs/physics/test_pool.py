@@ -67,6 +67,13 @@ def test_a_worker_that_keeps_dying_is_reported() -> None:
         pool_of(2, 2, at_start="exit")
 
 
+def test_an_episode_in_which_physics_keeps_crashing_is_named() -> None:
+    pool = pool_of(2, 2, fault="exit")
+    with pytest.raises(PoolError, match=r"died 4 times.*in the episodes of the seeds \[7\]"):
+        pool.script([(7, 1.0), (8, 0.0)], 1)
+    pool.close()
+
+
 def test_an_exception_in_a_worker_arrives_with_its_traceback() -> None:
     pool = pool_of(2, 2, fault="raise")
     pool.reset({0: 0, 1: 1}, False)

@@ -28,7 +28,13 @@ def task(request: pytest.FixtureRequest) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def suite(task: dict[str, Any]) -> TaskSuite:
-    return build_suite(task["suite"])
+    """The suite; make setup installs the packages of all but ogbench."""
+    try:
+        return build_suite(task["suite"])
+    except ConfigError as error:
+        if "needs more packages" not in str(error):
+            raise
+        pytest.skip(str(error))
 
 
 def env_of(task: dict[str, Any], suite: TaskSuite, batch: int, horizon: int) -> PhysicsEnv:
@@ -100,7 +106,7 @@ def test_the_expert_succeeds_and_chance_does_not(task: dict[str, Any], suite: Ta
     assert sum(seen.success for seen in random) <= 3
 
 
-def test_the_number_of_workers_changes_nothing(task: dict[str, Any]) -> None:
+def test_the_number_of_workers_changes_nothing(task: dict[str, Any], suite: TaskSuite) -> None:
     jobs = [(seed, 0.5) for seed in SEEDS]
     tracks, steps = [], []
     for slots, workers in ((1, 1), (3, 2)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from pathlib import Path
 from typing import Any
 
@@ -162,3 +163,23 @@ def test_muon_takes_matrices_and_adamw_the_rest() -> None:
 def test_unknown_optimisers_are_refused() -> None:
     with pytest.raises(ValueError, match=r"optimiser=sgd must be one of \['adamw', 'muon'\]"):
         FitConfig(1, optimiser="sgd")
+
+
+def test_batches_are_made_while_others_are_learned_from(tmp_path: Path) -> None:
+    made: list[int] = []
+
+    def batch(step: int, generator: torch.Generator) -> Tensor:
+        made.append(step)
+        return torch.randn(8, 1, 6, generator=generator)
+
+    def loss(data: Tensor, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
+        learned.append(len(made))
+        while len(made) < min(6, len(learned) + 1):  # hangs, if nobody makes the next one meanwhile
+            time.sleep(0.001)
+        return net.loss(data, generator)
+
+    net, learned = Net(), list[int]()
+    stats = fit("toy", net, batch, loss, FitConfig(6, 8, bf16=False), tmp_path)
+    assert made == [0, 1, 2, 3, 4, 5] and len(learned) == 6
+    total = stats["data_seconds"] + stats["compute_seconds"]
+    assert stats["samples_per_second"] == pytest.approx(48 / total)

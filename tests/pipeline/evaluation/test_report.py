@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import math
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from pipeline.evaluation.charts import Curve, line_chart
+from pipeline.evaluation.heat import heat_maps
 from pipeline.evaluation.report import build_report
 from pipeline.evaluation.result import verdict
 from pipeline.graph.stage import Inputs
@@ -51,14 +56,38 @@ def result(**changes: Any) -> dict[str, Any]:
         "rollout": rows,
         "frames_per_second": {"batch 1": 30.0, "batch 32": 300.0},
         "tasks": {},
+        "scenes": [],
         "rounds": [{"round": 1, "true": entry(40), "imagined": entry(44), "gap": 0.04, "replayed": table}],
         "episodes_used": 60,
         "episodes_held_out": 10,
         "imagined_episodes_used": [256],
         "stage_seconds": {"collect": 3.0, "rl-1": 9.0},
+        "training": {"rl-1": {"samples_per_second": 812.0, "data_share": 0.031}},
         "alarms": [],
     }
     return {**base, **changes}
+
+
+def video(label: str, seed: int, disagreement: float = 0.1) -> dict[str, Any]:
+    """An entry of videos.json."""
+    return {
+        "file": f"{label}-{seed}.mp4",
+        "label": label,
+        "fps": 5.0,
+        "episode": 0,
+        "seed": seed,
+        "source": "noisy",
+        "instruction": "push <it>",
+        "success": True,
+        "task": "push",
+        "scene": "oak table",
+        "recorded": 0.9,
+        "generated": 1 - disagreement,
+        "claims": disagreement < 0.5,
+        "disagreement": disagreement,
+        "done": 2,
+        "curves": {"recorded": [0.1, 0.5, 0.9, 1.0], "generated": [0.1, 0.2, 0.2, 0.3]},
+    }
 
 
 def test_the_verdict_can_say_no_and_why() -> None:
@@ -79,8 +108,16 @@ def inputs(tmp_path: Path) -> Inputs:
     rl, videos = tmp_path / "rl-1-abc", tmp_path / "videos-abc"
     (videos / "media").mkdir(parents=True)
     rl.mkdir()
-    for name in ("before-1-0", "after-1-0"):
-        (videos / "media" / f"{name}.mp4").write_bytes(b"video")
+    shown = [
+        video("worst", 8, 0.9),
+        video("before", 1),
+        video("before", 2),
+        video("after", 1),
+        video("after", 2, 0.8),
+    ]
+    for one in shown:
+        (videos / "media" / one["file"]).write_bytes(one["file"].encode())
+    (videos / "videos.json").write_text(json.dumps(shown))
     ledger = {"asked": 256, "learned": 256, "dropped": {"judge": 2}}
     for folder, stage, made in ((rl, "rl-1", {"ledger": ledger, "alarms": []}), (videos, "videos", {})):
         manifest = {"stage": stage, "seconds": 1.0, "result": made}
@@ -92,10 +129,19 @@ def inputs(tmp_path: Path) -> Inputs:
 
 def test_the_page_is_one_file_with_everything(inputs: Inputs) -> None:
     page = build_report({"name": "tiny", "rl": {"lr": 0.1}}, inputs, {**result(), "verdict": "gain: yes"})
-    assert page.count("data:video/mp4") == 2 and page.index("before-1-0") < page.index("after-1-0")
     assert "tiny &lt;run&gt;" in page and "worldloop controls" in page and "lr: 0.1" in page
-    assert "http" not in page.replace("http://www.w3.org", "").split("<h2>Config")[0]
-    assert "2 judge" in page and "25.0%" in page
+    assert not re.findall(r'(?:src|href)=(?!"data:|"#)', page) and "url(" not in page
+    assert "http" not in page.split("<h2 id=config>")[0]
+    assert "2 judge" in page and "25.0%" in page and "3.1%" in page and "812" in page
+
+
+def test_the_worst_disagreements_come_first_and_pairs_stay_together(inputs: Inputs) -> None:
+    page = build_report({}, inputs, {**result(), "verdict": "gain: yes"})
+    order = [base64.b64decode(data).decode() for data in re.findall(r"data:video/mp4;base64,([^\"]+)", page)]
+    assert order == ["worst-8.mp4", "before-2.mp4", "after-2.mp4", "before-1.mp4", "after-1.mp4"]
+    assert page.count("svg class=progress") == 5 and page.count("badge apart") == 2
+    assert "push, oak table · seed 8" in page and "“push &lt;it&gt;”" in page
+    assert "Success by task" not in page  # one task in one scene: the figures above say it
 
 
 def test_the_page_shows_tasks(inputs: Inputs) -> None:
@@ -105,8 +151,9 @@ def test_the_page_shows_tasks(inputs: Inputs) -> None:
         "close": {"physics_before": None, "physics_after": None, "paired": None, "imagined_after": entry(88)},
     }
     page = build_report({}, inputs, {**result(tasks=tasks), "verdict": "gain"})
-    assert "Task by task" in page and "+25.0" in page and "77.0%" in page and "88.0%" in page
-    assert "Task by task" not in build_report({}, inputs, {**result(), "verdict": "gain"})
+    title = "Before and after, task by task"
+    assert title in page and "+25.0" in page and "77.0%" in page and "88.0%" in page
+    assert title not in build_report({}, inputs, {**result(), "verdict": "gain"})
 
 
 def test_the_page_shows_controls_and_runs_without_physics(inputs: Inputs) -> None:
@@ -116,3 +163,47 @@ def test_the_page_shows_controls_and_runs_without_physics(inputs: Inputs) -> Non
     assert "filtered BC" in page and "+10.0" in page and "have not been run" not in page
     alone = result(physics_before=None, physics_after=None, paired=None, rounds=[], verdict="imagined")
     assert "no physics to try" in build_report({}, inputs, alone)
+
+
+def test_success_by_task_and_scene_is_a_heat_map(inputs: Inputs) -> None:
+    cells = [
+        {"task": task, "scene": scene, "physics_before": entry(20), "physics_after": entry(40), **more}
+        for task, scene, more in (
+            ("pull", "oak", {"imagined_after": entry(85)}),
+            ("pull", "pine", {"imagined_after": entry(10)}),
+            ("push", "oak", {}),
+        )
+    ]
+    heat = heat_maps(cells)
+    assert heat is not None and heat.scenes == ["oak", "pine"] and heat.wide
+    assert [one.title for one in heat.maps] == [
+        "true before",
+        "true after",
+        "imagined after",
+        "imagined − true",
+    ]
+    gap = heat.maps[-1].rows
+    assert [cell and cell.text for cell in gap["pull"]] == ["+45", "-30"] and gap["push"] == [None, None]
+    assert gap["pull"][0] is not None and "--bad" in gap["pull"][0].colour
+    page = build_report({}, inputs, {**result(scenes=cells), "verdict": "gain"})
+    assert "Success by task and scene" in page and page.count("<td class=none>") == 1 + 1 + 2 + 2
+    alone = [{**cell, "scene": ""} for cell in cells[:1]] + [{**cells[2], "scene": ""}]
+    assert heat_maps(alone).scenes == [""]  # type: ignore[union-attr]
+    assert "Success by task and scene" not in build_report(
+        {}, inputs, {**result(scenes=alone), "verdict": "-"}
+    )
+    assert heat_maps([]) is None
+
+
+def test_charts_are_drawn_within_their_frame() -> None:
+    chart = line_chart(
+        [Curve("a", [0, 1, 2], [1.0, math.nan, 3.0]), Curve("b <", [0, 5], [2.0, 2.5])], "T", "x", "y"
+    )
+    numbers = [
+        float(n)
+        for part in re.findall(r'class="line c\d" d="([^"]+)"', chart)
+        for n in re.findall(r"[\d.]+", part)
+    ]
+    assert len(numbers) == 8 and min(numbers) >= 0 and max(numbers) <= 520
+    assert "b &lt;" in chart and "nan" not in chart
+    assert line_chart([Curve("a", [0], [math.nan])], "T", "x", "y") == ""

@@ -1,0 +1,1 @@
+"""A person in the policy's place: keys or recorded actions move a robot, in physics or imagined."""

@@ -1,0 +1,302 @@
+"""OGBench's manipulation as a task suite: a UR5e with cubes, a drawer, a window, buttons (Park et al., 2025).
+
+Scenes and targets are drawn as the package does to collect data; of its targets those are taken that belong
+to the task. It is installed without its dependencies, of which only dm_control's model files are needed.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.embodiment import ActionKind, Arm, Camera, Embodiment
+from envs.physics.render import calibration, offscreen_for
+from envs.physics.suite import (
+    Array,
+    Expert,
+    HeldCondition,
+    Observation,
+    SuiteError,
+    TaskSuite,
+    check_cameras,
+    check_noise_level,
+    check_task,
+)
+from envs.ranges import NonNegative, Positive
+
+SIM_HZ = 20.0  # at which OGBench's own step takes actions
+CAMERAS = ("front", "front_pixels")
+COLOURS = ("red", "blue")
+# Scene of each task, and the kind of its target there.
+TASKS = {
+    "cube-single": ("single", "cube"),
+    "cube-double": ("double", "cube"),
+    "scene-cube": ("scene", "cube"),
+    "scene-drawer": ("scene", "drawer"),
+    "scene-window": ("scene", "window"),
+    "scene-button": ("scene", "button"),
+}
+_MARK = 0.4  # opacity of the mark where a cube shall go
+_OVER = 0.05  # m by which a cube's target must lie higher to be on top of another
+INSTALL = (
+    "python -m pip install gymnasium==1.4.0 dm-env==1.6 dm-tree==0.1.10 lxml==6.1.3 && "
+    "python -m pip install --no-deps dm_control==1.0.41 ogbench==1.2.2"
+)
+
+
+class OGBench(TaskSuite):
+    """Tasks of OGBench's cube and scene environments whose start and target are drawn from the seed.
+
+    Actions are [dx, dy, dz, dyaw, gripper] in -1..1: 1 moves the target of the hand 5 cm or 0.3 rad from
+    where it is, or closes the gripper, in each of the SIM_HZ steps; an action is held for a whole frame. The
+    state is the hand's position in metres, cosine and sine of its yaw, and how far the gripper is closed,
+    0..1.
+
+    Args:
+        control_hz: actions and frames per second, a divisor of SIM_HZ.
+        hold: seconds that OGBench's own success condition must hold.
+        size: (height, width) of every picture.
+        cameras: names out of CAMERAS, in the views' order.
+        calibrated: whether intrinsics and camera poses are told.
+
+    Raises:
+        SuiteError: if ogbench is not installed, or an option does not fit.
+    """
+
+    tasks = tuple(TASKS)
+
+    def __init__(
+        self,
+        control_hz: Positive,
+        hold: NonNegative,
+        size: tuple[int, int],
+        cameras: tuple[str, ...],
+        calibrated: bool,
+    ):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # dm_control looks for a screen, which nothing here needs
+                self._open, self._oracles = _package()
+        except ImportError as error:
+            raise SuiteError(f"task=ogbench needs more packages ({error}): {INSTALL}") from error
+        if SIM_HZ % control_hz:
+            raise SuiteError(f"task.suite.control_hz={control_hz} must divide {SIM_HZ}: 5, 10 or 20")
+        check_cameras(cameras, CAMERAS)
+        self.size, self._views, self.substeps = size, cameras, round(SIM_HZ / control_hz)
+        self.condition = HeldCondition(hold, control_hz)
+        self._envs: dict[str, Any] = {}
+        self.embodiment = Embodiment(
+            robot="ur5e",
+            action_names=("delta_x", "delta_y", "delta_z", "delta_yaw", "gripper"),
+            action_kind=ActionKind.END_EFFECTOR,
+            delta=True,
+            arms=(Arm("arm", (0, 1, 2, 3), 4, (-1.0, 1.0)),),
+            state_names=("x", "y", "z", "cos_yaw", "sin_yaw", "closed"),
+            cameras=tuple(Camera(name, size, None, calibrated) for name in cameras),
+            fps=control_hz,
+        )
+
+    def reset(self, task: str, seed: int) -> None:
+        """Draw things and target of `task` from `seed`; a drawer or window that is meant is unlocked."""
+        check_task(task, self.tasks)
+        self._scene, self._kind = TASKS[task]
+        if self._scene not in self._envs:
+            self._envs[self._scene] = self._open[self._scene]()
+        self._env = env = self._envs[self._scene]
+        env.reset(seed=seed)
+        env._model.vis.quality.offsamples = 0
+        if self._kind in ("drawer", "window"):
+            env._cur_button_states[:] = 1
+            env._apply_button_states()
+        while getattr(env, "_target_task", "cube") != self._kind or self._met():
+            env.set_new_target(return_info=False)
+        self.command = np.zeros(5)
+        self._see()
+        self._start = self._distance()
+        self.condition.reset()
+
+    def step(self, action: Array) -> None:
+        """Hold one action [5] for a frame; what exceeds -1..1 is cut.
+
+        Raises:
+            ValueError: if it is not finite or has another shape.
+        """
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (5,) or not np.isfinite(action).all():
+            raise ValueError(f"an action of OGBench is 5 finite numbers, got {action}")
+        self.command = np.clip(action, -1.0, 1.0)
+        for _ in range(self.substeps):
+            self._env.step(self.command)
+        self._see()
+        self.condition.update(bool(self._env._success))
+
+    def render(self) -> NDArray[np.uint8]:
+        """Pictures uint8 [V, 3, H, W] without shadows and reflections."""
+        return self._render(self.size, False)
+
+    def picture(self, size: tuple[int, int]) -> NDArray[np.uint8]:
+        """Pictures with shadows, of any size."""
+        return self._render(size, True)
+
+    def observe(self) -> Observation:
+        """Hand, gripper, and how the task stands; progress is the share of the target's distance made up."""
+        intrinsic, c2w = None, None
+        if self.embodiment.calibrated:
+            intrinsic, c2w = calibration(self._env._model, self._env._data, self._views, self.size)
+        seen = self._seen
+        yaw, met = float(seen["proprio/effector_yaw"][0]), bool(self._env._success)
+        state = (*seen["proprio/effector_pos"], np.cos(yaw), np.sin(yaw), *seen["proprio/gripper_opening"])
+        left = self._distance() / self._start
+        return Observation(
+            state=np.array(state),
+            command=self.command.copy(),
+            instruction=self._instruction(),
+            success=self.condition.success,
+            progress=1.0 if met else float(np.clip(1.0 - left, 0.0, 0.99)),
+            intrinsic=intrinsic,
+            c2w=c2w,
+        )
+
+    def privileged(self) -> dict[str, Array]:
+        """object_poses [14]: metres and quaternion of up to two cubes, zeros where there is no second; goal
+        [3] in metres, of the cube, handle or button that is meant.
+        """
+        seen, poses = self._seen, np.zeros(14)
+        for k in range(self._env._num_cubes):
+            block = (seen[f"privileged/block_{k}_pos"], seen[f"privileged/block_{k}_quat"])
+            poses[7 * k : 7 * k + 7] = np.concatenate(block)
+        return {"object_poses": poses, "goal": np.array(self._places()[1])}
+
+    def expert(self, noise_level: float, rng: np.random.Generator) -> Expert:
+        """OGBench's closed-loop oracle of the target's kind, bent by noise; see NoisyOracle."""
+        oracle = self._oracles[self._kind](env=self._env)
+        oracle.reset(None, self._seen)
+        low, high = self._env._arm_sampling_bounds
+        oracle._final_pos, oracle._final_yaw = rng.uniform(low, high), rng.uniform(-np.pi, np.pi)
+        return NoisyOracle(
+            lambda: oracle.select_action(None, self._seen),
+            lambda: rng.uniform(low, high) - self._seen["proprio/effector_pos"],
+            noise_level,
+            rng,
+            1 / self.embodiment.fps,
+        )
+
+    def _met(self) -> bool:
+        """Whether the target is met as things stand."""
+        self._env.pre_step()
+        self._env.post_step()
+        return bool(self._env._success)
+
+    def _see(self) -> None:
+        """Take down how things stand, and show where the cube that is meant shall go."""
+        env = self._env
+        mujoco.mj_kinematics(env._model, env._data)
+        self._seen: dict[str, Any] = env.compute_ob_info()
+        for k, geoms in enumerate(env._cube_target_geom_ids_list):
+            shown = self._kind == "cube" and k == env._target_block
+            env._model.geom_rgba[geoms, 3] = _MARK * shown
+
+    def _places(self) -> tuple[Array, Array]:
+        """Where the thing that is meant is, and where it shall be, in metres."""
+        seen, kind = self._seen, self._kind
+        if kind == "cube":
+            return seen[f"privileged/block_{self._env._target_block}_pos"], seen[
+                "privileged/target_block_pos"
+            ]
+        if kind == "button":  # the hand must come to it
+            return seen["proprio/effector_pos"], seen["privileged/target_button_top_pos"]
+        return seen[f"privileged/{kind}_handle_pos"], seen[f"privileged/target_{kind}_handle_pos"]
+
+    def _distance(self) -> float:
+        here, there = self._places()
+        return max(1e-6, float(np.linalg.norm(np.subtract(here, there))))
+
+    def _instruction(self) -> str:
+        env = self._env
+        if self._kind == "cube":
+            colour = COLOURS[env._target_block]
+            if self._places()[1][2] > _OVER:
+                return f"put the {colour} cube on the {COLOURS[1 - env._target_block]} cube"
+            return f"move the {colour} cube to its mark"
+        if self._kind == "button":
+            return f"press the {('left', 'right')[env._target_button]} button"
+        opened = {"drawer": env._target_drawer_pos < -0.08, "window": env._target_window_pos > 0.1}
+        return f"{'open' if opened[self._kind] else 'close'} the {self._kind}"
+
+    def _render(self, size: tuple[int, int], shadows: bool) -> NDArray[np.uint8]:
+        offscreen = offscreen_for(f"ogbench/{self._scene}", self._env._model, size)
+        return offscreen.render(self._env._model, self._env._data, self._views, shadows)
+
+
+class NoisyOracle:
+    """An oracle that is bent towards chance: a slowly varying offset is added to its motion, and random
+    way-points interrupt it; at noise level 1 nothing else is left.
+
+    Args:
+        oracle: () -> action [5].
+        waypoint: () -> the way [3] in metres to a random place.
+        noise_level: 0 is the oracle itself, 1 pays no heed to the task.
+        rng: of the noise.
+        period: seconds between two calls.
+
+    Raises:
+        ValueError: if the noise level lies outside [0, 1].
+    """
+
+    def __init__(
+        self,
+        oracle: Callable[[], Array],
+        waypoint: Callable[[], Array],
+        noise_level: float,
+        rng: np.random.Generator,
+        period: float,
+    ):
+        check_noise_level(noise_level)
+        self.oracle, self.waypoint, self.noise_level, self.rng = oracle, waypoint, noise_level, rng
+        self.keep = 0.8 ** (period / 0.1)
+        self.start = 0.1 * noise_level**2 * period / 0.1  # chance that a way-point interrupts, per action
+        self.frames = max(1, round(0.6 / period))  # of one way-point
+        self.drift, self.left, self.away = np.zeros(4), 0, np.zeros(5)
+
+    def __call__(self) -> Array:
+        """The next action [5] in -1..1."""
+        if self.left == 0 and (self.noise_level >= 1.0 or self.rng.random() < self.start):
+            self.left = self.frames
+            turn, grip = self.rng.uniform(-1, 1), self.rng.choice((-1.0, 1.0))
+            self.away = np.clip(np.array([*5.0 * self.waypoint(), turn, grip]), -1.0, 1.0)
+        action = np.array(self.away if self.left else self.oracle(), dtype=np.float64)
+        self.left = max(0, self.left - 1)
+        scale = 0.4 * self.noise_level * np.sqrt(1 - self.keep**2)
+        self.drift = self.keep * self.drift + self.rng.normal(0.0, scale, 4)
+        action[:4] += self.drift
+        return np.clip(action, -1.0, 1.0)
+
+
+def _package() -> tuple[dict[str, Callable[[], Any]], dict[str, Any]]:
+    """What opens each scene, and the oracle of each kind of target."""
+    from ogbench.manipspace.envs.cube_env import CubeEnv
+    from ogbench.manipspace.envs.scene_env import SceneEnv
+    from ogbench.manipspace.oracles.markov.button_markov import ButtonMarkovOracle
+    from ogbench.manipspace.oracles.markov.cube_markov import CubeMarkovOracle
+    from ogbench.manipspace.oracles.markov.drawer_markov import DrawerMarkovOracle
+    from ogbench.manipspace.oracles.markov.window_markov import WindowMarkovOracle
+
+    # Without `visualize_info` cubes do not change their colour when they arrive, which would be telling.
+    how = {"mode": "data_collection", "terminate_at_goal": False, "visualize_info": False}
+    scenes = {
+        "single": lambda: CubeEnv("single", **how),
+        "double": lambda: CubeEnv("double", **how),
+        "scene": lambda: SceneEnv("scene", **how),
+    }
+    oracles = {
+        "cube": CubeMarkovOracle,
+        "drawer": DrawerMarkovOracle,
+        "window": WindowMarkovOracle,
+        "button": ButtonMarkovOracle,
+    }
+    return scenes, oracles

@@ -1,0 +1,64 @@
+"""Batches made ahead: while one is learned from, a thread gathers the next from disk and moves it over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import torch
+
+from envs.rng import step_generator
+
+Batch = Callable[[int, torch.Generator], Any]
+Drawn = tuple[Any, torch.Generator]
+
+
+class BatchesAhead:
+    """The microbatches of training steps in their order, each made while its predecessor is learned from.
+
+    A batch depends on seed, step and microbatch alone, so it is the same whenever and by whom it is made.
+
+    Args:
+        batch: (step, generator) -> anything; runs in another thread, so it must not read what training
+            changes.
+        seed: of the generators, see envs/rng.py.
+        steps: numbers of the steps.
+        parts: the microbatches of this process, of every step.
+        device: to which whatever has a `to` is moved.
+    """
+
+    def __init__(
+        self, batch: Batch, seed: int, steps: range, parts: Sequence[int], device: torch.device | str
+    ):
+        self.batch, self.seed, self.device = batch, seed, device
+        self._order: Iterator[tuple[int, int]] = ((step, part) for step in steps for part in parts)
+        self._thread = ThreadPoolExecutor(1, "batches")
+        self._next: Future[Drawn] | None = None
+
+    def __enter__(self) -> BatchesAhead:
+        self._ask()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._thread.shutdown(cancel_futures=True)
+
+    def take(self) -> Drawn:
+        """The next batch, and its generator for whatever else is drawn in its step.
+
+        Raises:
+            Exception: whatever making it raised.
+        """
+        assert self._next is not None, "there are no more batches"
+        drawn = self._next.result()
+        self._ask()
+        return drawn
+
+    def _ask(self) -> None:
+        following = next(self._order, None)
+        self._next = None if following is None else self._thread.submit(self._make, *following)
+
+    def _make(self, step: int, part: int) -> Drawn:
+        generator = step_generator(self.seed, step, part)
+        data = self.batch(step, generator)
+        return data.to(self.device) if hasattr(data, "to") else data, generator

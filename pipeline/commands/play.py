@@ -1,0 +1,98 @@
+"""What `worldloop play` opens: the task's physics, and beside it the world that a run of it has learned."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.factory import (
+    build_judge,
+    build_kinematics,
+    build_simulator,
+    build_state_decoder,
+    build_world,
+    embodiment_of,
+    open_clips,
+    pose_style,
+    world_spec,
+)
+from actors.playing.game import Game, Recorded
+from actors.playing.imagination import ImaginedSide, start_of
+from envs.embodiment import Embodiment
+from envs.episodes.formats.lerobot import LeRobotDataset
+from envs.initial_states import InitialStates
+from envs.physics.suite import Observation, build_suite, task_names
+from envs.targets import ConfigError
+from pipeline.loop import build_loop, has_physics, last_round
+
+Cfg = Mapping[str, Any]
+_PARTS = ("simulator", "state", "judge")
+
+
+def learned_world(cfg: Cfg, root: Path) -> dict[str, Path]:
+    """Weights of the last imagined world of a run by part: simulator, state and judge; {} if it has none."""
+    graph, last = build_loop(cfg, root), last_round(cfg)
+    weights = {part: graph.folder(f"{part}-{last}") / "weights.safetensors" for part in _PARTS}
+    return weights if all(path.exists() for path in weights.values()) else {}
+
+
+def build_game(cfg: Cfg, world: Mapping[str, Path], actions: Path | None = None) -> Game:
+    """The game of a config.
+
+    Args:
+        cfg: the resolved config.
+        world: see `learned_world`.
+        actions: a LeRobot data set of this robot whose actions can be played, None for none.
+
+    Raises:
+        ConfigError: if there is neither physics nor a learned world, or the actions are another robot's.
+    """
+    if not has_physics(cfg) and not world:
+        raise ConfigError(
+            "this task has no physics (task.suite is empty), and no run of this config has learned a world"
+            " yet: first `worldloop run` with the same options, or choose a task with a suite"
+        )
+    names, robot = task_names(cfg["task"]["name"]), embodiment_of(cfg)
+    recorded = _recorded(actions, robot) if actions is not None else []
+    if not has_physics(cfg):
+        starts = InitialStates.of(open_clips(cfg, cfg["task"]["data"]))
+        return Game(robot, names, None, _imagination(cfg, world, starts), None, recorded)
+    suite = build_suite(cfg["task"]["suite"])
+    tasks = tuple(dict.fromkeys((*names, *suite.tasks)))
+    if not world:
+        return Game(robot, tasks, suite, None, None, recorded)
+    begin = partial(_start, cfg)
+    suite.reset(tasks[0], 0)
+    imagination = _imagination(cfg, world, begin(suite.observe(), suite.render()))
+    return Game(robot, tasks, suite, imagination, begin, recorded)
+
+
+def _start(cfg: Cfg, observed: Observation, pictures: NDArray[np.uint8]) -> InitialStates:
+    return start_of(world_spec(cfg), observed, pictures, pose_style(cfg), build_kinematics(cfg))
+
+
+def _imagination(cfg: Cfg, world: Mapping[str, Path], starts: InitialStates) -> ImaginedSide:
+    simulator = build_simulator(cfg, world["simulator"])
+    decoder = build_state_decoder(cfg, simulator, world["state"])
+    return ImaginedSide(build_world(cfg, simulator, decoder, build_judge(cfg, world["judge"]), starts, 1))
+
+
+def _recorded(folder: Path, robot: Embodiment) -> list[Recorded]:
+    """The recorded actions of a data set, by episode."""
+    data = LeRobotDataset(folder)
+    wanted, found = (
+        (one.robot, one.action_names, one.action_kind, one.delta, one.fps) for one in (robot, data.embodiment)
+    )
+    if wanted != found:
+        raise ConfigError(f"actions={folder} are of {found}, but this task's robot is {wanted}")
+    out = []
+    for number, episode in enumerate(data):
+        outcome = {True: "success", False: "failure", None: ""}[episode.succeeded]
+        title = f"{number}: seed {episode.seed} {episode.source} {outcome}".strip()
+        out.append(Recorded(title, episode.seed, episode.commands[1:]))
+    return out

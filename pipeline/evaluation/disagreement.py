@@ -1,0 +1,69 @@
+"""Where imagination and truth disagree: episode by episode, how sure the judge of generated video is of
+another outcome than the recorded one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from torch import Tensor
+
+from envs.episodes.clips import ClipStore
+from envs.judges.base import Judge
+from envs.simulators.replay import Replay
+from pipeline.evaluation.by_task import scenes_of_episodes, tasks_of_episodes
+from pipeline.evaluation.judging import Views
+
+_DIGITS = 3  # of what is written down
+
+
+def compared(
+    cfg: Mapping[str, Any], judge: Judge, store: ClipStore, episodes: Tensor, made: Replay, views: Views
+) -> list[dict[str, Any]]:
+    """A row for each replayed episode int64 [N]:
+
+    episode, its number in the store; seed, source, task, scene and instruction; success as recorded, None if
+    nobody labelled it; recorded and generated, the judge's confidence that the episode succeeded on either
+    video; claims, its verdict on the generated one; disagreement in 0..1, how far its confidence on the
+    generated video lies from the recorded success, or where that is unknown from its confidence on the
+    recorded video.
+    """
+    over = ~made.valid
+    recorded, generated = (
+        judge.confidence(scores.success.masked_fill(over, 0.0)).tolist() for scores in views
+    )
+    device = judge.threshold.device
+    claims = judge.episode(views.generated.success.to(device), made.valid.to(device)).tolist()
+    tasks, scenes = (of(cfg, store, episodes) for of in (tasks_of_episodes, scenes_of_episodes))
+    rows = []
+    for n, number in enumerate(episodes.tolist()):
+        about = store.episodes[number]
+        truth = recorded[n] if about["success"] is None else float(about["success"])
+        rows.append(
+            {
+                "episode": number,
+                **{key: about[key] for key in ("seed", "source", "instruction", "success")},
+                "task": tasks[n],
+                "scene": scenes[n],
+                "recorded": round(recorded[n], _DIGITS),
+                "generated": round(generated[n], _DIGITS),
+                "claims": bool(claims[n]),
+                "disagreement": round(abs(generated[n] - truth), _DIGITS),
+            }
+        )
+    return rows
+
+
+def worst(rows: Sequence[Mapping[str, Any]], count: int) -> list[Mapping[str, Any]]:
+    """The `count` rows of the greatest disagreement, the greatest first."""
+    return sorted(rows, key=lambda row: -row["disagreement"])[:count]
+
+
+def curves(views: Views, made: Replay, n: int) -> dict[str, list[float]]:
+    """The judge's progress in each frame of the n-th replayed episode: recorded and generated."""
+    valid = made.valid[n]
+    return {
+        name: [round(value, _DIGITS) for value in scores.progress[n][valid].tolist()]
+        for name, scores in views._asdict().items()
+    }

@@ -1,0 +1,101 @@
+"""Success by task and scene as heat maps: in truth, in imagination, and how far they lie apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.evaluation.statistics import rate
+
+Entry = Mapping[str, Any]
+_FEW = 10  # scenes whose cells are wide enough for numbers
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One field.
+
+    Args:
+        colour: in CSS.
+        text: in the field.
+        title: what it says when it is pointed at.
+    """
+
+    colour: str
+    text: str
+    title: str
+
+
+@dataclass(frozen=True)
+class HeatMap:
+    """Fields of every task (rows) in every scene (columns); None where no episode was tried."""
+
+    title: str
+    rows: Mapping[str, Sequence[Cell | None]]
+
+
+@dataclass(frozen=True)
+class HeatMaps:
+    """Heat maps over the same scenes."""
+
+    scenes: Sequence[str]
+    maps: Sequence[HeatMap]
+
+    @property
+    def wide(self) -> bool:
+        """Whether fields have room for their text."""
+        return len(self.scenes) <= _FEW
+
+
+def heat_maps(cells: Sequence[Entry]) -> HeatMaps | None:
+    """Heat maps of result.json's `scenes`; None if there is one task in one scene, of which the whole says
+    everything.
+    """
+    if not cells:
+        return None
+    found = {(cell["task"], cell["scene"]): cell for cell in cells}
+    tasks, scenes = (sorted({where[n] for where in found}) for n in (0, 1))
+
+    def heat_map(title: str, field: Callable[[Entry], Cell | None]) -> HeatMap:
+        rows = {
+            task: [field(found[task, scene]) if (task, scene) in found else None for scene in scenes]
+            for task in tasks
+        }
+        return HeatMap(title, rows)
+
+    maps = [
+        heat_map("true before", lambda cell: _rate(cell, "physics_before")),
+        heat_map("true after", lambda cell: _rate(cell, "physics_after")),
+        heat_map("imagined after", lambda cell: _rate(cell, "imagined_after")),
+        heat_map("imagined − true", _gap),
+    ]
+    return HeatMaps(scenes, [one for one in maps if any(cell for row in one.rows.values() for cell in row)])
+
+
+def _where(cell: Entry) -> str:
+    return f"{cell['task']}, {cell['scene']}" if cell["scene"] else str(cell["task"])
+
+
+def _rate(cell: Entry, key: str) -> Cell | None:
+    entry = cell.get(key)
+    if not entry or not entry["episodes"]:
+        return None
+    share = 100 * rate(entry)
+    interval = f"95% [{100 * entry['low']:.0f}, {100 * entry['high']:.0f}]"
+    title = f"{_where(cell)}: {entry['successes']} of {entry['episodes']}, {interval}"
+    return Cell(_mixed("--blue", 8 + 0.72 * share), f"{share:.0f}", title)
+
+
+def _gap(cell: Entry) -> Cell | None:
+    true, imagined = cell.get("physics_after"), cell.get("imagined_after")
+    if not true or not imagined or not true["episodes"] or not imagined["episodes"]:
+        return None
+    points = 100 * (rate(imagined) - rate(true))
+    kind = "--bad" if points > 0 else "--cold"
+    title = f"{_where(cell)}: imagined {points:+.0f} points from {true['episodes']} true episodes"
+    return Cell(_mixed(kind, min(80.0, abs(points))), f"{points:+.0f}", title)
+
+
+def _mixed(colour: str, percent: float) -> str:
+    return f"color-mix(in srgb, var({colour}) {percent:.0f}%, var(--card))"

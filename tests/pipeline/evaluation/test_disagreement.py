@@ -1,0 +1,131 @@
+"""Imagination against truth, episode by episode: confidence, verdicts, the worst first; scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from envs.episodes.clips import ClipStore
+from envs.episodes.video import read_video
+from envs.judges.base import Judge, Verdict
+from envs.physics.suite import scene_of
+from envs.simulators.replay import Replay
+from pipeline.evaluation.by_task import by_scene, scenes_of_seeds
+from pipeline.evaluation.disagreement import compared, curves, worst
+from pipeline.evaluation.judging import judge_both
+from pipeline.evaluation.media import film
+from pipeline.evaluation.statistics import rate_entry
+from tests.envs.physics.sections import Counting
+
+FRAMES = 6
+
+
+class Brightness(Judge):
+    """Takes a frame's brightness for the probability of success."""
+
+    def __init__(self) -> None:
+        super().__init__(hold=2)
+
+    def score(self, frames: torch.Tensor, first: torch.Tensor, instruction: list[str]) -> Verdict:
+        bright = frames.float().mean((-4, -3, -2, -1)) / 255
+        return Verdict(bright, bright / 2, torch.zeros(len(frames), dtype=torch.int64))
+
+
+class Store:
+    """Three episodes of FRAMES frames, two with bright ones; of the last nobody knows success."""
+
+    def __init__(self) -> None:
+        bright = torch.tensor(
+            [[0, 0, 0, 0, 255, 255], [0] * FRAMES, [0, 0, 255, 255, 0, 0]], dtype=torch.uint8
+        )
+        self.pictures = bright.flatten()[:, None, None, None, None].expand(-1, 1, 3, 2, 2)
+        self.start = torch.arange(3) * FRAMES
+        self.instructions = ["do a", "do b", "do a"]
+        self.episodes: list[dict[str, Any]] = [
+            {"seed": 10 + n, "source": "noisy", "instruction": text, "success": success}
+            for n, (text, success) in enumerate(zip(self.instructions, (True, False, None), strict=True))
+        ]
+
+    def frames(self, rows: torch.Tensor) -> torch.Tensor:
+        return self.pictures[rows]
+
+
+def replayed(generated: list[list[int]], valid: int = FRAMES - 1) -> Replay:
+    count = len(generated)
+    frames = torch.tensor(generated, dtype=torch.uint8)[:, :, None, None, None, None].expand(
+        -1, -1, 1, 3, 2, 2
+    )
+    rows = torch.arange(count)[:, None] * FRAMES + torch.arange(1, FRAMES)
+    exists = (torch.arange(FRAMES - 1) < valid).expand(count, -1)
+    return Replay(frames, rows, exists, torch.zeros(count, FRAMES - 1, 1))
+
+
+def test_the_surer_and_the_more_wrong_the_worse() -> None:
+    store: ClipStore = Store()  # type: ignore[assignment]
+    judge, episodes = Brightness(), torch.arange(3)
+    made = replayed([[0, 0, 0, 51, 51], [0, 204, 204, 204, 0], [255, 255, 0, 0, 0]])
+    views = judge_both(judge, store, episodes, made)
+    rows = compared({"task": {"name": "any"}}, judge, store, episodes, made, views)
+    assert [row["generated"] for row in rows] == [0.2, 0.8, 1.0]
+    assert [row["recorded"] for row in rows] == [1.0, 0.0, 1.0]
+    assert [row["claims"] for row in rows] == [False, True, True]
+    assert [row["disagreement"] for row in rows] == [0.8, 0.8, 0.0]
+    assert [row["task"] for row in rows] == ["do a", "do b", "do a"] and rows[2]["success"] is None
+    assert [row["episode"] for row in worst(rows[::-1], 2)] == [1, 0]
+    assert curves(views, made, 1)["generated"] == pytest.approx([0, 0.4, 0.4, 0.4, 0])
+
+
+def test_frames_that_do_not_exist_count_for_nothing() -> None:
+    store: ClipStore = Store()  # type: ignore[assignment]
+    judge, made = Brightness(), replayed([[0, 0, 255, 255, 255]], valid=3)
+    views = judge_both(judge, store, torch.tensor([0]), made)
+    (row,) = compared({"task": {"name": "any"}}, judge, store, torch.tensor([0]), made, views)
+    assert row["generated"] == 0.0 and not row["claims"] and len(curves(views, made, 0)["recorded"]) == 3
+
+
+def test_confidence_is_the_highest_threshold_that_still_says_success() -> None:
+    judge, success = Brightness(), torch.tensor([[0.9, 0.1, 0.6, 0.7], [0.2, 0.3, 0.1, 0.1]])
+    confidence = judge.confidence(success)
+    assert confidence.tolist() == pytest.approx([0.6, 0.2])
+    for shift, wanted in ((-1e-4, True), (1e-4, False)):
+        for row in range(2):
+            judge.threshold.fill_(float(confidence[row]) + shift)
+            assert bool(judge.episode(success, torch.ones(2, 4, dtype=torch.bool))[row]) is wanted
+    assert judge.confidence(success[:, :1]).tolist() == [0.0, 0.0]  # too short to hold
+
+
+class Rooms(Counting):
+    """A suite with scenes."""
+
+    scenes = ("oak", "pine")
+
+
+def test_scenes_are_what_the_suite_says_they_are() -> None:
+    section = {"_target_": f"{Rooms.__module__}.Rooms", "fault": ""}
+    scenes = scenes_of_seeds({"task": {"suite": section}}, range(20))
+    assert scenes == [scene_of(Rooms.scenes, seed) for seed in range(20)] and set(scenes) == {"oak", "pine"}
+    plain = {"_target_": f"{Counting.__module__}.Counting", "fault": ""}
+    assert scenes_of_seeds({"task": {"suite": plain}}, range(2)) == ["", ""]
+    won = torch.tensor([True, False, True, True])
+    cells = by_scene(["a", "b", "a", "b"], ["x", "x", "y", "x"], rate_entry, won)
+    found = [(cell["task"], cell["scene"], cell["successes"], cell["episodes"]) for cell in cells]
+    assert found == [("a", "x", 1, 1), ("a", "y", 1, 1), ("b", "x", 1, 2)]
+    assert by_scene(["a"] * 4, [""] * 4, rate_entry, won) == []
+
+
+def test_a_film_shows_all_views_side_by_side(tmp_path: Path) -> None:
+    frames = np.zeros((5, 2, 3, 33, 31), np.uint8)
+    frames[:, 1] = 200
+    film(tmp_path / "media" / "one.mp4", frames, 10.0)
+    seen = read_video(tmp_path / "media" / "one.mp4")
+    assert len(seen) == 5 and seen.shape[2] % 2 == 0 and seen.shape[3] % 2 == 0
+    assert (
+        seen[0, :, :, : seen.shape[3] // 2 - 4].mean()
+        < 30
+        < 170
+        < seen[0, :, :, seen.shape[3] // 2 + 4 :].mean()
+    )
