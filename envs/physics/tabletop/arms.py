@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from envs.physics.tabletop.scene import ARMS, HOME, JOINTS
+from envs.physics.tabletop.scene import FLANGES, HOME, JOINTS, ROBOT_FILE
 
 Array = NDArray[np.float64]
 _DAMPING = 1e-4
@@ -29,16 +29,15 @@ def matrix_to_rpy(matrix: Array, near: Array) -> Array:
 
 
 class ArmKinematics:
-    """Forward and inverse kinematics on a private copy of the state.
+    """Forward and inverse kinematics of the robot alone, on a state of its own.
 
-    Args:
-        model: a model that holds the robot.
+    Joints have the same addresses in any model that adds things to the robot's file; sites need not.
     """
 
-    def __init__(self, model: mujoco.MjModel):
-        self.model = model
+    def __init__(self) -> None:
+        self.model = model = mujoco.MjModel.from_xml_path(str(ROBOT_FILE))
         self.data = mujoco.MjData(model)
-        self.sites = [model.site(f"{side}_flange").id for side in ARMS]
+        self.sites = [model.site(name).id for name in FLANGES]
         joints = [[model.joint(name) for name in arm] for arm in JOINTS]
         self.qpos = np.array([[j.qposadr[0] for j in arm] for arm in joints])  # [2, 7]
         self.dofs = np.array([[j.dofadr[0] for j in arm] for arm in joints])  # [2, 7]
@@ -52,15 +51,12 @@ class ArmKinematics:
         mujoco.mj_kinematics(self.model, self.data)
         return self.read(self.data)
 
-    def read(self, data: mujoco.MjData) -> Array:
+    @staticmethod
+    def read(data: mujoco.MjData) -> Array:
         """Flange poses [2, 6] that a simulation's arms have."""
+        sites = [data.site(name) for name in FLANGES]
         return np.stack(
-            [
-                np.concatenate(
-                    [data.site_xpos[site], matrix_to_rpy(data.site_xmat[site].reshape(3, 3), DOWN)]
-                )
-                for site in self.sites
-            ]
+            [np.concatenate([site.xpos, matrix_to_rpy(site.xmat.reshape(3, 3), DOWN)]) for site in sites]
         )
 
     def solve(self, poses: Array, start: Array, iterations: int = 20, tolerance: float = 2e-4) -> Array:
