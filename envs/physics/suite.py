@@ -63,9 +63,12 @@ class TaskSuite(ABC):
         tasks: names that `reset` takes.
         embodiment: the robot; camera sizes are those that `render` returns.
         offers: what else its options choose from, such as scenes or cameras, by the option's name.
+        scenes: names of the scenes that episodes are laid out in, with its options as they are; see scene_of.
+            () where all are laid out in one.
     """
 
     tasks: tuple[str, ...]
+    scenes: tuple[str, ...] = ()
     offers: Mapping[str, Sequence[str]] = {}
     embodiment: Embodiment
 
@@ -141,6 +144,27 @@ def task_names(name: str | Sequence[str]) -> tuple[str, ...]:
 def task_of(tasks: Sequence[str], seed: int) -> str:
     """The task of an episode, where several are played by turns: consecutive seeds take consecutive tasks."""
     return tasks[seed % len(tasks)]
+
+
+def scene_of(scenes: Sequence[str], seed: int) -> str:
+    """The scene of an episode, drawn by its seed whatever its task; "" if there are none to draw from."""
+    draw = np.random.default_rng([seed, 3])
+    return scenes[int(draw.integers(len(scenes)))] if scenes else ""
+
+
+def check_names(key: str, given: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse an option that holds no names, or unknown ones.
+
+    Raises:
+        SuiteError: naming the key and the nearest names that exist.
+    """
+    names, given = list(known), list(given)
+    if not given:
+        raise SuiteError(f"{key} is empty; there are {names[:5]} and {max(0, len(names) - 5)} more")
+    for name in given:
+        if name not in names:
+            near = difflib.get_close_matches(name, names, 5, 0.3) or names[:5]
+            raise SuiteError(f"{key} holds {name!r}, which is unknown; the nearest of {len(names)} are {near}")
 
 
 def check_task(task: str, tasks: Iterable[str]) -> None:

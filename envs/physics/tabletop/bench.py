@@ -1,4 +1,4 @@
-"""The two arms in one MuJoCo world at a time: carry out actions, render, say how the episode's goal stands."""
+"""The two arms in one MuJoCo world at a time: carry out actions, render, say how the goal stands."""
 
 from __future__ import annotations
 
