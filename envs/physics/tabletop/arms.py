@@ -23,7 +23,9 @@ def rpy_to_matrix(rpy: Array) -> Array:
 
 
 def matrix_to_rpy(matrix: Array, near: Array) -> Array:
-    """Roll, pitch, yaw [3] of a rotation matrix [3, 3], shifted by whole turns to lie closest to `near`."""
+    """Roll, pitch, yaw [..., 3] of rotation matrices [..., 3, 3], shifted by whole turns to lie closest to
+    `near` [3].
+    """
     rpy = Rotation.from_matrix(matrix).as_euler("xyz")
     return rpy + 2 * np.pi * np.round((near - rpy) / (2 * np.pi))
 
@@ -55,9 +57,8 @@ class ArmKinematics:
     def read(data: mujoco.MjData) -> Array:
         """Flange poses [2, 6] that a simulation's arms have."""
         sites = [data.site(name) for name in FLANGES]
-        return np.stack(
-            [np.concatenate([site.xpos, matrix_to_rpy(site.xmat.reshape(3, 3), DOWN)]) for site in sites]
-        )
+        rpy = matrix_to_rpy(np.stack([site.xmat.reshape(3, 3) for site in sites]), DOWN)
+        return np.concatenate((np.stack([site.xpos for site in sites]), rpy), 1)
 
     def solve(self, poses: Array, start: Array, iterations: int = 20, tolerance: float = 2e-4) -> Array:
         """Joint angles [2, 7] in rad whose flanges reach `poses`.

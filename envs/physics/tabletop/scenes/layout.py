@@ -27,7 +27,7 @@ from envs.physics.tabletop.scenes.catalogue import (
 )
 
 Array = NDArray[np.float64]
-COLUMNS = (-0.15, 0.0, 0.15)  # m, their places across the table
+COLUMNS = (-0.165, 0.0, 0.165)  # m, their places across the table
 CONTAINERS_AT = (0.055, 0.225)  # m, along the table
 EYE, FOVY = (0.41, 0.0, 0.90), 31.0  # of the head camera: nearer than in the robot's file, to see shapes
 OBJECTS = ("thing", "companion")  # names of bodies in the model, as are the colours of containers and mats

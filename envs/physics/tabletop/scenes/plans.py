@@ -18,7 +18,8 @@ CARRIED = 0.10  # m that two hands lift
 LOW = 0.012  # m above the table of fingertips that push, pull or press
 DEEP = 0.032  # m that fingers reach down along an object
 ROOM = 0.012  # m between an open finger and the object
-CLEAR = 0.030  # m that a hand comes down away from what it will push or press
+CLEAR = 0.030  # m that a hand comes down away from what it will push or pull
+CLOSE_BY = 0.011  # m, of what two hands will press, beside which there is less room
 STROKE = 0.105  # m that things are pushed or pulled
 SQUEEZE = 0.008  # m that each of two hands is sent into what they press
 THICK, WIDE = 0.010, 0.025  # m, half of a closed hand along its flange's x and y
@@ -148,8 +149,8 @@ def _carry(sketch: Sketch, thing: Thing, pose: Array, request: Request) -> None:
         }
 
     here, place = pose[:2], request.place
-    sketch.go(hands(here, CLEAR, ABOVE))
-    sketch.go(hands(here, CLEAR * 0.7, LOW), "press", SLOW)
+    sketch.go(hands(here, CLOSE_BY, ABOVE))
+    sketch.go(hands(here, CLOSE_BY, LOW), "press", SLOW)
     sketch.go(hands(here, -SQUEEZE, LOW), "press", SLOW, SETTLE)
     sketch.go(hands(here, -SQUEEZE, LOW + CARRIED), speed=SLOW)
     sketch.go(hands(place, -SQUEEZE, LOW + CARRIED), "place", SLOW)
