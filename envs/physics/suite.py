@@ -64,7 +64,7 @@ class TaskSuite(ABC):
         embodiment: the robot; camera sizes are those that `render` returns.
         offers: what else its options choose from, such as scenes or cameras, by the option's name.
         scenes: names of the scenes that episodes are laid out in, with its options as they are; see scene_of.
-            () where all are laid out in one.
+            () where all are laid out in one. A suite that has them takes names of scenes as option `scenes`.
     """
 
     tasks: tuple[str, ...]
@@ -164,7 +164,9 @@ def check_names(key: str, given: Iterable[str], known: Iterable[str]) -> None:
     for name in given:
         if name not in names:
             near = difflib.get_close_matches(name, names, 5, 0.3) or names[:5]
-            raise SuiteError(f"{key} holds {name!r}, which is unknown; the nearest of {len(names)} are {near}")
+            raise SuiteError(
+                f"{key} holds {name!r}, which is unknown; the nearest of {len(names)} are {near}"
+            )
 
 
 def check_task(task: str, tasks: Iterable[str]) -> None:

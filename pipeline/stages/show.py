@@ -21,7 +21,7 @@ from pipeline.evaluation.report import build_report
 from pipeline.evaluation.result import build_result
 from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.collect import run_recorded
-from pipeline.stages.given import EVERYTHING, WORLD, Cfg, open_store
+from pipeline.stages.given import EVERYTHING, TASK, WORLD, Cfg, open_store
 from pipeline.stages.seeds import Purpose, episode_seeds
 
 
@@ -45,7 +45,7 @@ def videos(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return {"videos": names}
 
 
-@stage(reads=("seed", "task", "simulator", "measure.videos"))
+@stage(reads=("seed", *TASK, "simulator", "measure.videos"))
 def replays(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Paired videos without physics: recordings, held-out ones if there are any, and their actions in the
     simulator.

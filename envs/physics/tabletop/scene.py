@@ -30,6 +30,4 @@ TIP_HEIGHT = 0.020  # m above the table at which fingertips travel
 
 def kinematic_description() -> Robot:
     """The robot's file and names, for forward kinematics of joint commands."""
-    return Robot(
-        model=str(ROBOT_FILE), joints=JOINTS, flanges=FLANGES, held={}
-    )
+    return Robot(model=str(ROBOT_FILE), joints=JOINTS, flanges=FLANGES, held={})

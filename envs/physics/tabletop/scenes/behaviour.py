@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 TURN = 2.5  # rad/s of a hand
 MANNERS = ("detours", "stops", "disturbances")  # in which behaviour is suboptimal; see `bend`
 _DETOUR, _DETOUR_TURN = 0.12, 0.5  # m and rad, spread of unrelated way-points at noise 1
-_ASIDE = 0.015  # m, spread of stops around the straight line at noise 1
-_SHIFT, _SHIFT_TURN = 0.03, 0.3  # m and rad, spread of disturbances at noise 1
+_ASIDE = 0.02  # m, spread of stops around the straight line at noise 1
+_SHIFT, _SHIFT_TURN = 0.05, 0.4  # m and rad, spread of disturbances at noise 1
 _WANDER = 0.09  # m, spread of random way-points around things
 
 
@@ -55,9 +55,9 @@ def _detours(
             moving = np.abs(point.hands - last).max(1) > 1e-6
             middle = (last + point.hands) / 2
             middle[:, 6] = last[:, 6]
-            noise = np.zeros((2, 7))
-            noise[:, :3] = rng.normal(0.0, 0.03 + _DETOUR * noise_level, (2, 3))
-            noise[:, 3:6] = rng.normal(0.0, 0.1 + _DETOUR_TURN * noise_level, (2, 3))
+            noise = np.zeros(7)  # the same for both hands, which may hold a thing between them
+            noise[:3] = rng.normal(0.0, 0.03 + _DETOUR * noise_level, 3)
+            noise[3:6] = rng.normal(0.0, 0.1 + _DETOUR_TURN * noise_level, 3)
             middle += noise * moving[:, None]
             middle[:, 2] = np.maximum(middle[:, 2], np.where(moving, 0.09, 0.0))
             out.append(Waypoint(middle))

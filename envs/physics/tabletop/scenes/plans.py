@@ -191,9 +191,7 @@ def _turned(vector: Array, angle: float) -> Array:
     return np.array([cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1]])
 
 
-def _hand(
-    arm: int, place: Array, height: float, yaw: float, grip: float, lean: tuple[float, float]
-) -> Array:
+def _hand(arm: int, place: Array, height: float, yaw: float, grip: float, lean: tuple[float, float]) -> Array:
     """A hand [7] over a place, which leans outward the further it must reach.
 
     Args:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import numpy as np
 
 from envs.physics.suite import Array, Expert, SuiteError, check_names, check_noise_level, check_task, scene_of
@@ -25,11 +27,11 @@ IN_DOMAIN, OUT_OF_DOMAIN = "in_domain", "out_of_domain"
 
 
 class TabletopScenes(TwoArmSuite):
-    """Push, pull, pick and place, move onto a mat, and carry with both hands, among two objects, two containers
-    and two mats.
+    """Push, pull, pick and place, move onto a mat, and carry with both hands, among two objects, two
+    containers and two mats.
 
-    Where things lie depends on scene and seed alone, so each task can be asked for at the same first frame. An
-    object of `in_domain` lies beside a scene's own, one whose scene with the same container and table is in
+    Where things lie depends on scene and seed alone, so each task can be asked for at the same first frame.
+    Beside a scene's own object lies one of `in_domain`, whose scene with the same container and table is in
     that list, too: what is out of domain is seen there alone.
 
     Args:
@@ -45,7 +47,7 @@ class TabletopScenes(TwoArmSuite):
     """
 
     tasks = tuple(TASKS)
-    offers = {"scenes": (IN_DOMAIN, OUT_OF_DOMAIN, *SCENES), "phrasings": STYLES}
+    offers = MappingProxyType({"scenes": (IN_DOMAIN, OUT_OF_DOMAIN, *SCENES), "phrasings": STYLES})
 
     def __init__(
         self,
@@ -77,8 +79,8 @@ class TabletopScenes(TwoArmSuite):
         for name in self.scenes:
             if not self._companions(SCENES[name]):
                 raise SuiteError(
-                    f"task.suite.in_domain holds no other scene with container and table of {name}, so nothing"
-                    " can lie beside its object; add one"
+                    f"task.suite.in_domain holds no other scene with container and table of {name}, so"
+                    " nothing can lie beside its object; add one"
                 )
 
     def reset(self, task: str, seed: int) -> None:
@@ -100,8 +102,9 @@ class TabletopScenes(TwoArmSuite):
         self._bench.begin(model, data, self._goal, flanges(layout.hands))
 
     def privileged(self) -> dict[str, Array]:
-        """True poses, see TwoArmSuite, of what the words name first; the scene's place in catalogue.SCENES; and
-        of scripted episodes noise_level and the place of their manner in behaviour.MANNERS, -1 for neither.
+        """True poses, see TwoArmSuite, of what the words name first; the scene's place in catalogue.SCENES;
+        and of scripted episodes noise_level and the place of their manner in behaviour.MANNERS, -1 for
+        neither.
         """
         scene = list(SCENES).index(self.request.layout.scene.name)
         return super().privileged() | {
