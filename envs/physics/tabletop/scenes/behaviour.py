@@ -94,12 +94,11 @@ def _disturbances(
         shift[:, 2] = np.abs(rng.normal(0.0, _SHIFT / 3 * noise_level, 2))
         shift[:, 3:6] = rng.normal(0.0, _SHIFT_TURN * noise_level, (2, 3))
         shifts[phase] = shift
-    out, last = [], hands
+    out = []
     for point in points:
         used = np.abs(point.hands - hands).max(1) > 1e-6  # the other hand rests
         shift = shifts.get(point.phase, np.zeros((2, 7))) * used[:, None]
         out.append(replace(point, hands=point.hands + shift))
-        last = point.hands
     return out
 
 
