@@ -38,6 +38,8 @@ from pipeline.loop import build_loop
         (["algorithm=grpo", "rl.envs=40"], r"algorithm\.group"),
         (["imitation.fit.batch=7", "microbatches=2"], r"imitation\.fit: batch=7 must be a multiple of micro"),
         (["collect.noise_level=[0.6,0.1]"], r"collect\.noise_level"),
+        (["task=tabletop", "task.suite.scenes=3"], r"task\.suite\.scenes=3"),
+        (["task=tabletop", "+task.variants.x={scene: a}"], r"task\.variants\.x\.scene is not an option"),
     ],
 )
 def test_mistakes_name_the_key(words: list[str], match: str) -> None:
@@ -68,6 +70,7 @@ FREE = ("simulator.scratch", "policy.policy", "finetune.weights")  # other packa
     [
         ["experiment=quickstart"],
         ["experiment=smoke", "algorithm=grpo", "launch=ray", "policy=chunk_tokens", "simulator=dit_small"],
+        ["experiment=smoke", "task=tabletop", "judge=learned"],
         ["simulator=gesim_tiny", "task=metaworld", "algorithm=filtered_bc", "policy=tiny_vla"],
     ],
 )
@@ -122,6 +125,8 @@ def test_keys_change_with_what_matters_only(tmp_path: Path) -> None:
     assert {"simulator-1", "rl-1"} <= same and "simulator-2" not in same
     assert build("simulator.ray_map=false")["imitation"] != base["imitation"]
     assert base == build("launch=ray", "track=disabled")
+    same = {name for name, key in build("+task.variants={harder: {hold: 1.0}}").items() if base[name] == key}
+    assert {"collect", "rl-2", "evaluate-after"} <= same
 
 
 def test_the_loop_without_rl_shares_what_comes_before(tmp_path: Path) -> None:
