@@ -17,35 +17,23 @@ from envs.physics.tabletop.scenes.plans import FAST, SLOW, Waypoint
 
 Array = NDArray[np.float64]
 TURN = 2.5  # rad/s of a hand
-MANNERS = ("detours", "stops", "disturbances")  # in which behaviour is suboptimal; see `bend`
 _DETOUR, _DETOUR_TURN = 0.12, 0.5  # m and rad, spread of unrelated way-points at noise 1
 _ASIDE = 0.02  # m, spread of stops around the straight line at noise 1
 _SHIFT, _SHIFT_TURN = 0.05, 0.4  # m and rad, spread of disturbances at noise 1
 _WANDER = 0.09  # m, spread of random way-points around things
 
 
-def bend(
-    points: list[Waypoint], hands: Array, manner: str, noise_level: float, rng: np.random.Generator
+def detours(
+    points: list[Waypoint], hands: Array, noise_level: float, rng: np.random.Generator
 ) -> list[Waypoint]:
-    """A suboptimal variant of a plan.
+    """A plan with unrelated way-points in it, whose position and rotation are noise.
 
     Args:
         points: the plan.
         hands: [2, 7] fingertip poses and grippers that it starts at.
-        manner: "detours" inserts unrelated way-points with noise on position and rotation, "stops" points on
-            the way to the next way-point, "disturbances" shifts and turns the hands where they grasp, place,
-            push or press.
-        noise_level: 0..1, how many and how far.
+        noise_level: 0..1, how many, and how far off they are.
         rng: of the noise.
     """
-    return {"detours": _detours, "stops": _stops, "disturbances": _disturbances}[manner](
-        points, hands, noise_level, rng
-    )
-
-
-def _detours(
-    points: list[Waypoint], hands: Array, noise_level: float, rng: np.random.Generator
-) -> list[Waypoint]:
     # Between grasping and placing fingers stay as they are, and detours are flown over things.
     free = [k for k, point in enumerate(points) if not point.phase]
     chosen = rng.choice(free, min(len(free), 1 + round(2 * noise_level)), replace=False)
@@ -66,9 +54,12 @@ def _detours(
     return out
 
 
-def _stops(
+def stops(
     points: list[Waypoint], hands: Array, noise_level: float, rng: np.random.Generator
 ) -> list[Waypoint]:
+    """A plan with further points between its way-points, more and farther aside the higher the noise; for
+    arguments see `detours`.
+    """
     out, last = [], hands
     for point in points:
         far = np.abs(point.hands - last)[:, :3].max() > 0.02
@@ -84,9 +75,12 @@ def _stops(
     return out
 
 
-def _disturbances(
+def disturbances(
     points: list[Waypoint], hands: Array, noise_level: float, rng: np.random.Generator
 ) -> list[Waypoint]:
+    """A plan whose hands are shifted and turned where they grasp, place, push or press; for arguments see
+    `detours`.
+    """
     shifts = {}
     for phase in ("grasp", "place", "push", "press"):
         shift = np.zeros((2, 7))
@@ -100,6 +94,10 @@ def _disturbances(
         shift = shifts.get(point.phase, np.zeros((2, 7))) * used[:, None]
         out.append(replace(point, hands=point.hands + shift))
     return out
+
+
+# In which behaviour is suboptimal; recordings name them by their places here.
+MANNERS = (detours, stops, disturbances)
 
 
 class Wander:

@@ -180,18 +180,24 @@ class Thing:
         """Put it into a model as a free body of some name."""
         body = spec.worldbody.add_body(name=name)
         body.add_freejoint(name=name)
-        volumes = [np.prod(part.half) for part in self.shape.parts]
+        volumes = [float(np.prod(part.half)) for part in self.shape.parts]
         for part, volume in zip(self.shape.parts, volumes, strict=True):
             _add_geom(body, part, COLOURS[self.colour], mass=self.mass * volume / sum(volumes))
 
 
 def _scaled(shape: Shape, size: float) -> Shape:
-    def times(numbers: tuple[float, ...]) -> tuple[float, ...]:
-        return tuple(size * number for number in numbers)
+    def triple(numbers: tuple[float, float, float]) -> tuple[float, float, float]:
+        return size * numbers[0], size * numbers[1], size * numbers[2]
 
-    parts = tuple(Part(times(part.half), times(part.at), part.round) for part in shape.parts)  # type: ignore[arg-type]
+    parts = tuple(Part(triple(part.half), triple(part.at), part.round) for part in shape.parts)
     pinches = tuple(
-        Pinch(pinch.angle, *times((pinch.width, pinch.low, pinch.high)), times(pinch.at))  # type: ignore[arg-type]
+        Pinch(
+            pinch.angle,
+            size * pinch.width,
+            size * pinch.low,
+            size * pinch.high,
+            (size * pinch.at[0], size * pinch.at[1]),
+        )
         for pinch in shape.pinches
     )
     return Shape(parts, pinches, size * shape.press)
@@ -245,8 +251,7 @@ def add_container(spec: mujoco.MjSpec, name: str, kind: str, rgb: Rgb) -> None:
         floor = Part((OUTER, OUTER, BOTTOM / 2), (0.0, 0.0, BOTTOM / 2), True)
     else:
         floor = Part((OUTER, OUTER, BOTTOM / 2), (0.0, 0.0, BOTTOM / 2))
-    inside = tuple(0.72 * part for part in rgb)
-    _add_geom(body, floor, inside)  # type: ignore[arg-type]
+    _add_geom(body, floor, (0.72 * rgb[0], 0.72 * rgb[1], 0.72 * rgb[2]))
     for k in range(walls):
         angle = 2 * np.pi * k / walls
         wall = Part(

@@ -11,7 +11,6 @@ from envs.physics.tabletop.scenes.behaviour import (
     MANNERS,
     Follower,
     Wander,
-    bend,
     fingertips,
     flanges,
 )
@@ -127,7 +126,7 @@ class TabletopScenes(TwoArmSuite):
             more = Wander(lambda: goal.object_poses(bench.data)[:, :2], rng).next
         if 0.0 < noise_level < 1.0:
             self.manner = int(rng.integers(len(MANNERS)))
-            points = bend(points, hands, MANNERS[self.manner], noise_level, rng)
+            points = MANNERS[self.manner](points, hands, noise_level, rng)
         follower = Follower(points, hands, 1 / self.embodiment.fps, more)
         return lambda: bench.actions.encode(flanges(follower()), bench.target)
 
