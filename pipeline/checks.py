@@ -94,6 +94,11 @@ def _alone(cfg: Cfg) -> Iterator[str]:
         section = _at(cfg, key)
         if isinstance(section, Mapping):
             yield from section_faults(section, key, around)
+    suite, variants = cfg["task"].get("suite"), cfg["task"].get("variants", {})
+    if isinstance(suite, Mapping) and isinstance(variants, Mapping):
+        for name, changes in variants.items():
+            if isinstance(changes, Mapping):
+                yield from section_faults({**suite, **changes}, f"task.variants.{name}")
     world = {name: value for name, value in cfg["simulator"].items() if name in WORLD_OPTIONS}
     yield from _of(sections.WorldSection, world, "simulator")
 

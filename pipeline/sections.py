@@ -7,7 +7,7 @@ that become a dataclass elsewhere, against that.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, MinLen, MultipleOf
@@ -22,7 +22,11 @@ Choice = Mapping[str, Any]  # `_target_` and its options; checked by itself
 
 @dataclass(frozen=True)
 class TaskSection:
-    """Section task: a suite (physics), or recordings (data)."""
+    """Section task: a suite (physics), or recordings (data).
+
+    `variants` are options of the suite, by a name of their own, under which policies and experts are tried as
+    well: other scenes, other words.
+    """
 
     suite: Choice | None
     name: Name | Annotated[Sequence[Name], MinLen(1)]
@@ -31,6 +35,7 @@ class TaskSection:
     horizon: Count
     mode: Literal["relative", "absolute"]
     data: Sequence[str] | str = ()
+    variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

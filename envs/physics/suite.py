@@ -152,6 +152,23 @@ def scene_of(scenes: Sequence[str], seed: int) -> str:
     return scenes[int(draw.integers(len(scenes)))] if scenes else ""
 
 
+def check_names(key: str, given: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse an option that holds no names, or unknown ones.
+
+    Raises:
+        SuiteError: naming the key and the nearest names that exist.
+    """
+    names, given = list(known), list(given)
+    if not given:
+        raise SuiteError(f"{key} is empty; there are {names[:5]} and {max(0, len(names) - 5)} more")
+    for name in given:
+        if name not in names:
+            near = difflib.get_close_matches(name, names, 5, 0.3) or names[:5]
+            raise SuiteError(
+                f"{key} holds {name!r}, which is unknown; the nearest of {len(names)} are {near}"
+            )
+
+
 def check_task(task: str, tasks: Iterable[str]) -> None:
     """Refuse unknown task names.
 

@@ -12,6 +12,7 @@ from pipeline.config import load_config
 BENCHES: dict[str, tuple[str, tuple[str, ...]]] = {
     "conditioning": ("pipeline.benches.conditioning", ()),
     "collection": ("pipeline.benches.worlds", ()),
+    "experts": ("pipeline.benches.experts", ("evaluate.episodes=100",)),
     "world": ("pipeline.benches.worlds", ()),
     "actors": ("pipeline.benches.actors", ("launch=ray",)),
     "learning": ("pipeline.benches.learning", ()),

@@ -90,7 +90,7 @@ def inspect(words: Words) -> None:
 
 def bench(words: Words) -> None:
     """measure performance: worldloop bench
-    conditioning|collection|world|actors|learning|serving|gesim|overfit|pretrained
+    conditioning|collection|experts|world|actors|learning|serving|gesim|overfit|pretrained
     """
     from pipeline.benches.bench import run_bench
 
@@ -158,14 +158,19 @@ def chaos(words: Words) -> None:
 
 
 def tasks(words: Words) -> None:
-    """list what can be tried in physics: suites, robots, tasks, scenes; of one all: worldloop tasks
-    task=metaworld
+    """list what can be tried in physics: suites, robots, tasks, scenes; of one all, and its pictures into a
+    folder: worldloop tasks task=metaworld [pictures=FOLDER]
     """
+    from pipeline.commands.task_pictures import draw
     from pipeline.commands.tasks import table
 
-    if len(words) > 1 or (words and not words[0].startswith("task=")):
-        raise ConfigError("say worldloop tasks, or worldloop tasks task=metaworld")
-    print(table(words[0].removeprefix("task=") if words else ""))
+    own = {key: value for key, _, value in (word.partition("=") for word in words)}
+    if set(own) - {"task", "pictures"} or ("pictures" in own and not own.get("task")):
+        raise ConfigError("say worldloop tasks, or worldloop tasks task=metaworld [pictures=FOLDER]")
+    print(table(own.get("task", "")))
+    if own.get("pictures"):
+        for path in draw(own["task"], Path(own["pictures"])):
+            print(path)
 
 
 def config(words: Words) -> None:

@@ -37,10 +37,13 @@ def _paragraph(name: str, task: Mapping[str, Any], whole: bool) -> str:
     cameras = ", ".join(camera.name for camera in robot.cameras)
     known = f"{'calibrated' if robot.calibrated else 'uncalibrated'} cameras {cameras}"
     lists = {"task.name": suite.tasks, **{f"task.suite.{key}": given for key, given in suite.offers.items()}}
+    if task.get("variants"):
+        lists["task.variants"] = list(task["variants"])
     lines = [
         f"task={name}",
         f"  robot {robot.robot}: {len(robot.action_names)} numbers per action ({robot.action_kind.value}),"
         f" {robot.fps:g} actions a second, {known}",
+        *([f"  scenes: {len(suite.scenes)}, drawn by the seed"] if suite.scenes else []),
         *(line for key, given in lists.items() for line in _wrapped(key, list(given), whole)),
     ]
     return "\n".join(lines)

@@ -14,9 +14,9 @@ from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
-from pipeline.stages.given import Cfg, fit_options
+from pipeline.stages.given import TASK, Cfg, fit_options
 
-_READS = ("seed", "task", "simulator", "microbatches")
+_READS = ("seed", *TASK, "simulator", "microbatches")
 
 
 @stage(reads=(*_READS, "finetune.simulator", "finetune.weights"), place=Place.LEARNERS)

@@ -21,13 +21,15 @@ from pipeline.graph.stage import Inputs
 
 Cfg = Mapping[str, Any]
 
-# Config sections behind the shapes of a robot's world, a policy for it, the imagined world, and physics.
+# Config sections behind the task, the shapes of a robot's world, a policy for it, the imagined world, and
+# physics. Variants of a task are for evaluation alone: one more makes nothing else out of date.
+TASK = tuple(f"task.{key}" for key in ("suite", "name", "size", "chunk", "horizon", "mode", "data"))
 ROBOT = (
-    *("seed", "task", "simulator.kinematics"),
+    *("seed", *TASK, "simulator.kinematics"),
     *("simulator.pose_map", "simulator.pose_map_style", "simulator.ray_map"),
 )
 POLICY = (*ROBOT, "policy")
-WORLD = ("seed", "task", "simulator", "judge")
+WORLD = ("seed", *TASK, "simulator", "judge")
 PHYSICS = (*POLICY, "judge.rewards")
 
 # What a report shows.

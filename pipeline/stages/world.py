@@ -24,6 +24,7 @@ from pipeline.evaluation.judging import episode_success, labelled
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import (
+    TASK,
     WORLD,
     Cfg,
     fit_options,
@@ -33,7 +34,7 @@ from pipeline.stages.given import (
     open_store,
 )
 
-SIMULATOR = ("seed", "task", "simulator", "microbatches")
+SIMULATOR = ("seed", *TASK, "simulator", "microbatches")
 
 
 @stage(reads=(*SIMULATOR, "tokenizer_fit"), place=Place.LEARNERS)

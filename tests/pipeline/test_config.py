@@ -48,6 +48,8 @@ from pipeline.loop import build_loop
         (["launch.device=gpu"], r"launch\.device='gpu' should be auto, cpu, cuda or"),
         (["policy.head.mode=sideways"], r"policy\.head\.mode='sideways' should be 'relative' or"),
         (["simulator=dit", "simulator.denoising.prediction=noise"], r"denoising\.prediction='noise' should"),
+        (["task=tabletop", "task.suite.scenes=3"], r"task\.suite\.scenes=3"),
+        (["task=tabletop", "+task.variants.x={scene: a}"], r"task\.variants\.x\.scene is not an option"),
     ],
 )
 def test_mistakes_name_the_key(words: list[str], match: str) -> None:
@@ -170,6 +172,8 @@ def test_keys_change_with_what_matters_only(tmp_path: Path) -> None:
     assert {"simulator-1", "rl-1"} <= same and "simulator-2" not in same
     assert build("simulator.ray_map=false")["imitation"] != base["imitation"]
     assert base == build("launch=ray", "track=disabled")
+    same = {name for name, key in build("+task.variants={harder: {hold: 1.0}}").items() if base[name] == key}
+    assert {"collect", "rl-2", "evaluate-after"} <= same
 
 
 def test_the_loop_without_rl_shares_what_comes_before(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from envs.physics.tabletop.scene import ARMS, HOME, JOINTS
+from envs.physics.tabletop.scene import FLANGES, HOME, JOINTS, ROBOT_FILE
 
 Array = NDArray[np.float64]
 _DAMPING = 1e-4
@@ -23,22 +23,23 @@ def rpy_to_matrix(rpy: Array) -> Array:
 
 
 def matrix_to_rpy(matrix: Array, near: Array) -> Array:
-    """Roll, pitch, yaw [3] of a rotation matrix [3, 3], shifted by whole turns to lie closest to `near`."""
+    """Roll, pitch, yaw [..., 3] of rotation matrices [..., 3, 3], shifted by whole turns to lie closest to
+    `near` [3].
+    """
     rpy = Rotation.from_matrix(matrix).as_euler("xyz")
     return rpy + 2 * np.pi * np.round((near - rpy) / (2 * np.pi))
 
 
 class ArmKinematics:
-    """Forward and inverse kinematics on a private copy of the state.
+    """Forward and inverse kinematics of the robot alone, on a state of its own.
 
-    Args:
-        model: a model that holds the robot.
+    Joints have the same addresses in any model that adds things to the robot's file; sites need not.
     """
 
-    def __init__(self, model: mujoco.MjModel):
-        self.model = model
+    def __init__(self) -> None:
+        self.model = model = mujoco.MjModel.from_xml_path(str(ROBOT_FILE))
         self.data = mujoco.MjData(model)
-        self.sites = [model.site(f"{side}_flange").id for side in ARMS]
+        self.sites = [model.site(name).id for name in FLANGES]
         joints = [[model.joint(name) for name in arm] for arm in JOINTS]
         self.qpos = np.array([[j.qposadr[0] for j in arm] for arm in joints])  # [2, 7]
         self.dofs = np.array([[j.dofadr[0] for j in arm] for arm in joints])  # [2, 7]
@@ -52,16 +53,12 @@ class ArmKinematics:
         mujoco.mj_kinematics(self.model, self.data)
         return self.read(self.data)
 
-    def read(self, data: mujoco.MjData) -> Array:
+    @staticmethod
+    def read(data: mujoco.MjData) -> Array:
         """Flange poses [2, 6] that a simulation's arms have."""
-        return np.stack(
-            [
-                np.concatenate(
-                    [data.site_xpos[site], matrix_to_rpy(data.site_xmat[site].reshape(3, 3), DOWN)]
-                )
-                for site in self.sites
-            ]
-        )
+        sites = [data.site(name) for name in FLANGES]
+        rpy = matrix_to_rpy(np.stack([site.xmat.reshape(3, 3) for site in sites]), DOWN)
+        return np.concatenate((np.stack([site.xpos for site in sites]), rpy), 1)
 
     def solve(self, poses: Array, start: Array, iterations: int = 20, tolerance: float = 2e-4) -> Array:
         """Joint angles [2, 7] in rad whose flanges reach `poses`.

@@ -1,6 +1,8 @@
-"""One MuJoCo bench with one task: lay out an episode, carry out actions, render, say how the task stands."""
+"""The two arms in one MuJoCo world at a time: carry out actions, render, say how the goal stands."""
 
 from __future__ import annotations
+
+from abc import ABC, abstractmethod
 
 import mujoco
 import numpy as np
@@ -9,60 +11,79 @@ from numpy.typing import NDArray
 from envs.physics.render import offscreen_for
 from envs.physics.suite import HeldCondition
 from envs.physics.tabletop.actions import ActionInterface, Target
-from envs.physics.tabletop.arms import DOWN, ArmKinematics
-from envs.physics.tabletop.scene import ARMS, FINGER_TRAVEL, HOME, ROBOT_FILE, TIP_HEIGHT, TOOL_OFFSET
-from envs.physics.tabletop.tasks import Start, TabletopTask
+from envs.physics.tabletop.arms import ArmKinematics
+from envs.physics.tabletop.scene import ARMS, FINGER_TRAVEL, HOME
 
 Array = NDArray[np.float64]
 GLIDE = 0.025  # s between joint targets: arms glide instead of jerking at the control rate
+
+
+class Goal(ABC):
+    """What an episode asks for."""
+
+    @abstractmethod
+    def satisfied(self, data: mujoco.MjData) -> bool:
+        """Whether the task's condition is met at this moment."""
+
+    @abstractmethod
+    def progress(self, data: mujoco.MjData) -> float:
+        """True progress in 0..1."""
+
+    @abstractmethod
+    def object_poses(self, data: mujoco.MjData) -> Array:
+        """True poses [objects, 4] = [x, y, z, heading] of what the task is about, in metres and radians."""
 
 
 class Bench:
     """The true world for one episode at a time; states and commands are float64.
 
     Args:
-        task: of all its episodes.
         actions: class of its commands.
         control_hz: actions and frames per second.
-        hold: seconds the task's condition must hold.
+        hold: seconds an episode's condition must hold.
         cameras: to render, in order.
+        assets: a name that all its models share, whose textures and meshes are the same.
     """
+
+    goal: Goal
+    target: Target
+    model: mujoco.MjModel
+    data: mujoco.MjData
 
     def __init__(
         self,
-        task: TabletopTask,
         actions: type[ActionInterface],
         control_hz: float,
         hold: float,
         cameras: tuple[str, ...],
+        assets: str,
     ):
-        spec = mujoco.MjSpec.from_file(str(ROBOT_FILE))
-        task.add_objects(spec)
-        self.task, self.control_hz, self.cameras = task, control_hz, cameras
-        self.model = spec.compile()
-        self.data = mujoco.MjData(self.model)
-        self.arms = ArmKinematics(self.model)
+        self.control_hz, self.cameras, self.assets = control_hz, cameras, assets
+        self.arms = ArmKinematics()
         self.actions = actions(self.arms, control_hz)
         self.condition = HeldCondition(hold, control_hz)
+        robot = self.arms.model
         self.glides = max(1, round(1.0 / (control_hz * GLIDE)))
-        self.substeps = max(1, round(1.0 / (control_hz * self.glides * self.model.opt.timestep)))
-        self._slides = np.array([[self.model.joint(f"{s}_slide_{t}").qposadr[0] for t in "ab"] for s in ARMS])
-        self.start: Start
-        self.target: Target
+        self.substeps = max(1, round(1.0 / (control_hz * self.glides * robot.opt.timestep)))
+        self._slides = np.array([[robot.joint(f"{s}_slide_{t}").qposadr[0] for t in "ab"] for s in ARMS])
 
     # -- episode ---------------------------------------------------------------------------------------------
-    def reset(self, seed: int) -> None:
-        """Lay out the task drawn from `seed`; the same seed gives the same episode, bit for bit."""
-        mujoco.mj_resetData(self.model, self.data)
-        self.start = self.task.begin(self.model, self.data, np.random.default_rng(seed))
-        self.model.geom("table").rgba[:3] = self.start.table_rgb
-        poses = np.array([[*tip, TIP_HEIGHT + TOOL_OFFSET, *DOWN, 1.0] for tip in self.start.fingertips])
+    def begin(self, model: mujoco.MjModel, data: mujoco.MjData, goal: Goal, poses: Array) -> None:
+        """Take over a world whose things lie where they should.
+
+        Args:
+            model: made from the robot's file by adding things to it.
+            data: of the model.
+            goal: of the episode.
+            poses: [2, 7] flange poses and grippers that the arms start at.
+        """
+        self.model, self.data, self.goal = model, data, goal
         joints = self.arms.solve(poses[:, :6], np.stack([HOME, HOME]), iterations=100)
         self.target = Target(joints, poses[:, 6])
         self.actions.begin(self.target, poses)
-        self.data.qpos[self.arms.qpos] = joints
+        data.qpos[self.arms.qpos] = joints
         self._set_targets(joints, self.target.grippers)
-        mujoco.mj_forward(self.model, self.data)
+        mujoco.mj_forward(model, data)
         self.condition.reset()
 
     def step(self, action: Array) -> None:
@@ -84,7 +105,7 @@ class Bench:
             self._set_targets(joints, after.grippers)
             mujoco.mj_step(self.model, self.data, nstep=self.substeps)
         mujoco.mj_forward(self.model, self.data)
-        self.condition.update(self.task.satisfied(self.data))
+        self.condition.update(self.goal.satisfied(self.data))
 
     def _set_targets(self, joints: Array, grippers: Array) -> None:
         for k in range(len(ARMS)):
@@ -103,5 +124,5 @@ class Bench:
 
     def render(self, size: tuple[int, int], shadows: bool) -> NDArray[np.uint8]:
         """Pictures uint8 [V, 3, H, W]."""
-        offscreen = offscreen_for(type(self.task).__name__, self.model, size)
+        offscreen = offscreen_for(self.assets, self.model, size)
         return offscreen.render(self.model, self.data, self.cameras, shadows)

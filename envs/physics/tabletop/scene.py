@@ -15,6 +15,7 @@ from envs.embodiment import Robot
 ROBOT_FILE = Path(__file__).with_name("robot.xml")
 ARMS = ("left", "right")
 JOINTS = tuple(tuple(f"{arm}_joint{k}" for k in range(1, 8)) for arm in ARMS)
+FLANGES = tuple(f"{arm}_flange" for arm in ARMS)
 CAMERAS = {"head": None, "hand_left": "left", "hand_right": "right"}  # and the arm each is mounted on
 TOOL_OFFSET = 0.15  # m from the flange to the fingertips, along the flange's z
 FINGER_TRAVEL = 0.035  # m each finger moves from closed (gripper = 1) to open (gripper = 0)
@@ -29,6 +30,4 @@ TIP_HEIGHT = 0.020  # m above the table at which fingertips travel
 
 def kinematic_description() -> Robot:
     """The robot's file and names, for forward kinematics of joint commands."""
-    return Robot(
-        model=str(ROBOT_FILE), joints=JOINTS, flanges=tuple(f"{arm}_flange" for arm in ARMS), held={}
-    )
+    return Robot(model=str(ROBOT_FILE), joints=JOINTS, flanges=FLANGES, held={})

@@ -1,4 +1,7 @@
-"""The tabletop as a task suite: two arms at a table, commanded by end-effector poses or by joints."""
+"""The tabletop as a task suite: two arms at a table, commanded by end-effector poses or by joints.
+
+What all its suites share stands in `TwoArmSuite`; `Tabletop` is the smallest of them.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +20,15 @@ from envs.physics.suite import (
     check_task,
 )
 from envs.physics.tabletop.actions import ACTIONS, JointActions
+from envs.physics.tabletop.arms import DOWN
 from envs.physics.tabletop.bench import Bench
-from envs.physics.tabletop.scene import CAMERAS
-from envs.physics.tabletop.tasks import TASKS
+from envs.physics.tabletop.scene import CAMERAS, TIP_HEIGHT, TOOL_OFFSET
+from envs.physics.tabletop.tasks import TASKS, TabletopTask
 from envs.ranges import NonNegative, Positive
 
 
-class Tabletop(TaskSuite):
-    """Two 7-DoF arms with parallel grippers, calibrated cameras, and the tasks of tasks.TASKS.
+class TwoArmSuite(TaskSuite):
+    """Two 7-DoF arms with parallel grippers and calibrated cameras; subclasses lay out episodes.
 
     Args:
         actions: "end_effector" for 14 absolute numbers [x, y, z, roll, pitch, yaw, gripper] of the left and
@@ -38,7 +42,7 @@ class Tabletop(TaskSuite):
         SuiteError: if there is no such kind of action or camera.
     """
 
-    tasks = tuple(TASKS)
+    instruction: str
 
     def __init__(
         self,
@@ -51,10 +55,9 @@ class Tabletop(TaskSuite):
         if actions not in ACTIONS:
             raise SuiteError(f"task.suite.actions={actions!r} is unknown; choose one of {sorted(ACTIONS)}")
         check_cameras(cameras, CAMERAS)
-        self.size, self._hold = size, hold
-        self._actions = kind = ACTIONS[actions]
-        self._benches: dict[str, Bench] = {}
-        self._bench: Bench
+        kind = ACTIONS[actions]
+        self.size = size
+        self._bench = Bench(kind, control_hz, hold, cameras, type(self).__name__)
         self.embodiment = Embodiment(
             robot="worldloop_tabletop",
             action_names=kind.names,
@@ -66,16 +69,6 @@ class Tabletop(TaskSuite):
             fps=control_hz,
             kinematics=kind.kinematics(),
         )
-
-    def reset(self, task: str, seed: int) -> None:
-        """Lay out the start of `task` that `seed` draws."""
-        if task not in self._benches:
-            check_task(task, self.tasks)
-            self._benches[task] = Bench(
-                TASKS[task](), self._actions, self.embodiment.fps, self._hold, self.embodiment.views
-            )
-        self._bench = self._benches[task]
-        self._bench.reset(seed)
 
     def step(self, action: Array) -> None:
         """Carry out one absolute action [A]; too fast or too far is carried out as far as limits allow."""
@@ -96,9 +89,9 @@ class Tabletop(TaskSuite):
         return Observation(
             state=bench.state(),
             command=bench.actions.command.copy(),
-            instruction=bench.start.instruction,
+            instruction=self.instruction,
             success=bench.condition.success,
-            progress=bench.task.progress(bench.data),
+            progress=bench.goal.progress(bench.data),
             intrinsic=intrinsic,
             c2w=c2w,
             poses=None if self.embodiment.kinematics is None else bench.actions.poses,
@@ -107,12 +100,41 @@ class Tabletop(TaskSuite):
     def privileged(self) -> dict[str, Array]:
         """True object poses [objects, 4] = [x, y, z, heading] and true flange poses [2, 6]."""
         bench = self._bench
-        return {"object_poses": bench.task.object_poses(bench.data), "flange_poses": bench.flanges()}
+        return {"object_poses": bench.goal.object_poses(bench.data), "flange_poses": bench.flanges()}
+
+
+class Tabletop(TwoArmSuite):
+    """The tasks of tasks.TASKS, each in a model of its own; options are those of TwoArmSuite."""
+
+    tasks = tuple(TASKS)
+    _task: TabletopTask
+
+    def __init__(
+        self,
+        actions: str,
+        control_hz: Positive,
+        hold: NonNegative,
+        size: tuple[int, int],
+        cameras: tuple[str, ...],
+    ):
+        super().__init__(actions, control_hz, hold, size, cameras)
+        self._made: dict[str, TabletopTask] = {}
+
+    def reset(self, task: str, seed: int) -> None:
+        """Lay out the start of `task` that `seed` draws."""
+        check_task(task, self.tasks)
+        if task not in self._made:
+            self._made[task] = TASKS[task]()
+        self._task = self._made[task]
+        start = self._task.reset(seed)
+        self.instruction = start.instruction
+        poses = np.array([[*tip, TIP_HEIGHT + TOOL_OFFSET, *DOWN, 1.0] for tip in start.fingertips])
+        self._bench.begin(self._task.model, self._task.data, self._task, poses)
 
     def expert(self, noise_level: float, rng: np.random.Generator) -> Expert:
         """The task's expert moves one arm's fingertips; the other arm, heights and angles stay."""
         bench = self._bench
-        behaviour = bench.task.expert(bench.data, noise_level, rng, 1 / self.embodiment.fps)
+        behaviour = self._task.expert(bench.data, noise_level, rng, 1 / self.embodiment.fps)
         start = bench.actions.poses.copy()
 
         def act() -> Array:

@@ -6,7 +6,7 @@ bench knows them.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.physics.suite import check_noise_level
+from envs.physics.tabletop.bench import Goal
 from envs.physics.tabletop.experts import Drifting, FingertipExpert, PushExpert, WaypointWalk
+from envs.physics.tabletop.scene import ROBOT_FILE
 
 Array = NDArray[np.float64]
 BLOCK_COLOURS = {
@@ -42,8 +44,21 @@ class Start:
     table_rgb: Array
 
 
-class TabletopTask(ABC):
-    """One task: objects in the model, the start of an episode, its condition and its expert."""
+class TabletopTask(Goal):
+    """One task: objects in a model of its own, the start of an episode, its condition and its expert."""
+
+    def __init__(self) -> None:
+        spec = mujoco.MjSpec.from_file(str(ROBOT_FILE))
+        self.add_objects(spec)
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, seed: int) -> Start:
+        """Lay out the start that a seed draws; the same seed gives the same, bit for bit."""
+        mujoco.mj_resetData(self.model, self.data)
+        start = self.begin(self.model, self.data, np.random.default_rng(seed))
+        self.model.geom("table").rgba[:3] = start.table_rgb
+        return start
 
     @abstractmethod
     def add_objects(self, spec: mujoco.MjSpec) -> None:
@@ -52,18 +67,6 @@ class TabletopTask(ABC):
     @abstractmethod
     def begin(self, model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Generator) -> Start:
         """Draw a start, and lay out the task's objects accordingly in model and data."""
-
-    @abstractmethod
-    def satisfied(self, data: mujoco.MjData) -> bool:
-        """Whether the task's condition is met at this moment."""
-
-    @abstractmethod
-    def progress(self, data: mujoco.MjData) -> float:
-        """True progress in 0..1."""
-
-    @abstractmethod
-    def object_poses(self, data: mujoco.MjData) -> Array:
-        """True poses [objects, 4] = [x, y, z, heading] of what the task is about, in metres and radians."""
 
     @abstractmethod
     def expert(

@@ -9,7 +9,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from envs.embodiment import ActionKind, Camera, Embodiment
-from envs.physics.suite import Array, Expert, Observation, TaskSuite
+from envs.physics.suite import Array, Expert, Observation, TaskSuite, task_names
 from tests.sections import CONFIGS, offered
 
 
@@ -22,10 +22,16 @@ def task_section(choice: str, **changes: Any) -> dict[str, Any]:
 
 
 def physical_tasks() -> dict[str, dict[str, Any]]:
-    """Every task of configs/task that has a suite, and our bench commanded by joints, by name."""
+    """Every task that choices of configs/task with a suite play, and push commanded by joints, by name."""
     known = [name for name in offered("task") if _load(name).suite is not None]
-    out = {name: task_section(name) for name in known}
-    return {**out, "push-joints": task_section("push", actions="joints")}
+    out = {"push-joints": task_section("push", actions="joints")}
+    for choice in known:
+        section = task_section(choice)
+        names = task_names(section["name"])
+        for name in names:
+            key = choice if len(names) == 1 else f"{choice}-{name}"
+            out[key] = {**section, "name": name}
+    return out
 
 
 def _load(choice: str) -> DictConfig:

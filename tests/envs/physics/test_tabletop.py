@@ -40,8 +40,8 @@ def test_expert_succeeds_on_unseen_seeds(actions: str, control_hz: float) -> Non
 
 def test_success_must_be_held() -> None:
     suite = tabletop(1)
-    bench = suite._bench
-    bench.data.qpos[bench.task.joint : bench.task.joint + 2] = bench.task.target
+    bench, task = suite._bench, suite._task
+    bench.data.qpos[task.joint : task.joint + 2] = task.target
     still = suite.observe().command
     for step in range(4):  # 0.4 s at 10 Hz
         assert suite.observe().success is False, step
