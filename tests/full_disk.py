@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from actors.factory import load
+from actors.weights import load
 from envs.episodes import LeRobotDataset, LeRobotWriter
 from envs.episodes.clips import ClipStore
 from learners.training.checkpoint import Checkpoints

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from actors.factory import embodiment_of
+from actors.world_config import embodiment_of
 from envs.episodes.video import write_video
 from envs.physics.pool import TaskPool, available_cores
 from envs.physics.suite import task_names

@@ -10,19 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.factory import (
-    build_judge,
-    build_kinematics,
-    build_simulator,
-    build_state_decoder,
-    build_world,
-    embodiment_of,
-    open_clips,
-    pose_style,
-    world_spec,
-)
+from actors.factory import build_judge, build_simulator, build_state_decoder, build_world, open_clips
 from actors.playing.game import Game, Recorded
 from actors.playing.imagination import ImaginedSide, start_of
+from actors.world_config import build_kinematics, embodiment_of, pose_style, world_spec
 from envs.embodiment import Embodiment
 from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.initial_states import InitialStates
