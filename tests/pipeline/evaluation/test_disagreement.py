@@ -11,7 +11,7 @@ import torch
 
 from envs.episodes.clips import ClipStore
 from envs.episodes.video import read_video
-from envs.judges.base import Judge, Verdict
+from envs.judges.base import Judge, Judgement
 from envs.physics.suite import scene_of
 from envs.simulators.replay import Replay
 from pipeline.evaluation.by_task import by_scene, scenes_of_seeds
@@ -30,9 +30,9 @@ class Brightness(Judge):
     def __init__(self) -> None:
         super().__init__(hold=2)
 
-    def score(self, frames: torch.Tensor, first: torch.Tensor, instruction: list[str]) -> Verdict:
+    def score(self, frames: torch.Tensor, first: torch.Tensor, instruction: list[str]) -> Judgement:
         bright = frames.float().mean((-4, -3, -2, -1)) / 255
-        return Verdict(bright, bright / 2, torch.zeros(len(frames), dtype=torch.int64))
+        return Judgement(bright, bright / 2, torch.zeros(len(frames), dtype=torch.int64))
 
 
 class Store:
