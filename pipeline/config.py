@@ -13,7 +13,6 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from envs.targets import ConfigError, nearest
-from pipeline.checks import faults
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 
@@ -36,6 +35,8 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
             hint
             or f"{text}\nGroups are {', '.join(groups())}; `worldloop config` prints every key and its value."
         ) from error
+    from pipeline.checks import faults  # needs torch, which an unknown key should not wait for
+
     if wrong := faults(cfg):
         raise ConfigError("\n".join(wrong))
     return cfg

@@ -22,10 +22,11 @@ def root_of(cfg: dict[str, Any]) -> Path:
 
 def prepared(words: Words) -> tuple[dict[str, Any], Path]:
     """The config and the run's folder, with this process made ready for work."""
-    from actors.factory import device_of, prepare_process
     from pipeline.config import load_config
 
     cfg = load_config(words)
+    from actors.factory import device_of, prepare_process  # a mistake in the words is told before it loads
+
     device_of(cfg)  # one that is not there is told before any work
     prepare_process(cfg["seed"])
     return cfg, root_of(cfg)
