@@ -11,7 +11,6 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from envs.targets import ConfigError, nearest
-from pipeline.checks import faults
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 
@@ -29,6 +28,8 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
         cfg = composed(overrides)
     except Exception as error:  # for simulator=null and the like Hydra raises a bare ValueError
         raise ConfigError(_unknown_key(overrides) or _unreadable(overrides, error)) from error
+    from pipeline.checks import faults  # needs torch, which an unknown key should not wait for
+
     if wrong := faults(cfg):
         raise ConfigError("\n".join(wrong))
     return cfg

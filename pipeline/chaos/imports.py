@@ -6,6 +6,8 @@ from pathlib import Path
 
 import matplotlib.pyplot  # noqa: F401
 
+import pipeline.checks
+import pipeline.stages.collect
 import pipeline.track  # noqa: F401
 from pipeline.config import load_config
 from pipeline.loop import build_loop

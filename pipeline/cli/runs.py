@@ -1,4 +1,8 @@
-"""Commands that learn, and that say what has been learned."""
+"""Commands that learn, and that say what has been learned.
+
+A command reads its words before it imports what works on them, so that a mistake is told without waiting for
+torch.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +15,11 @@ from pipeline.cli.words import Words, prepared, root_of
 
 def run(words: Words) -> None:
     """run the whole loop of an experiment; finished stages are reused, interrupted ones resume"""
+    cfg, root = prepared(words)
     from pipeline.graph.owner import owning
     from pipeline.loop import build_loop
     from pipeline.track import tracking
 
-    cfg, root = prepared(words)
     graph = build_loop(cfg, root)
     print(f"{len(graph.nodes)} stages in {root}; each says how long it will take after its first steps")
     with owning(root, "run"), tracking(cfg, root) as tracker:
@@ -31,9 +35,11 @@ def rl(words: Words) -> None:
     experiment=quickstart
     """
     from pipeline.config import load_config
+
+    cfg = load_config(words)
     from pipeline.loop import last_round
 
-    last = f"rl-{last_round(load_config(words))}"
+    last = f"rl-{last_round(cfg)}"
     folder = _run_until(last, words)
     print(f"\nthe policy lies in {folder}; worldloop evaluate policy={last} {' '.join(words)}")
 
@@ -50,9 +56,10 @@ def stage(words: Words) -> None:
 def stages(words: Words) -> None:
     """list the stages of an experiment, their folders, which are finished, and why others will run again"""
     from pipeline.config import load_config
-    from pipeline.loop import build_loop
 
     cfg = load_config(words)
+    from pipeline.loop import build_loop
+
     graph = build_loop(cfg, root_of(cfg))
     for name in graph.nodes:
         folder = graph.folder(name)
@@ -67,7 +74,6 @@ def evaluate(words: Words) -> None:
     """success of a policy: worldloop evaluate policy=<stage|folder> world=physics|imagined experiment=...;
     one that needs no weights is a choice of configs/policy: policy=openpi policy.url=ws://...
     """
-    from pipeline.commands.evaluate import evaluate_policy
     from pipeline.config import choices
 
     own, rest = {"weights": "", "world": "physics"}, []
@@ -80,6 +86,8 @@ def evaluate(words: Words) -> None:
         else:
             rest.append(word)
     cfg, root = prepared(rest)
+    from pipeline.commands.evaluate import evaluate_policy
+
     print(evaluate_policy(cfg, root, **own))
 
 
@@ -105,11 +113,11 @@ def trust(words: Words) -> None:
 
 def controls(words: Words) -> None:
     """whose gain is it: beside a finished run the loop without RL iterations, RL in physics, filtered BC"""
+    cfg, root = prepared(words)
     from pipeline.commands.controls import run_controls, table_text
     from pipeline.graph.owner import owning
     from pipeline.track import tracking
 
-    cfg, root = prepared(words)
     with owning(root, "controls"), tracking(cfg, root) as tracker:
         table = run_controls(cfg, root, tracker)
     print(f"{table_text(table)}\n{root}/controls.json, {root}/report.html")
@@ -128,11 +136,11 @@ def finetune(words: Words) -> None:
     """train a simulator on any LeRobot data: worldloop finetune simulator=gesim simulator.checkpoint=<folder>
     finetune.data=[<folder>]
     """
+    cfg, root = prepared(words)
     from pipeline.commands.finetune import build_finetune
     from pipeline.graph.owner import owning
     from pipeline.track import tracking
 
-    cfg, root = prepared(words)
     graph = build_finetune(cfg, root)
     with owning(root, "finetune"), tracking(cfg, root / "finetune") as tracker:
         graph.run(tracker=tracker)
@@ -141,11 +149,11 @@ def finetune(words: Words) -> None:
 
 def _run_until(name: str, words: Words) -> Path:
     """Run a stage and what it needs; returns its folder."""
+    cfg, root = prepared(words)
     from pipeline.graph.owner import owning
     from pipeline.loop import build_loop
     from pipeline.track import tracking
 
-    cfg, root = prepared(words)
     graph = build_loop(cfg, root)
     if name not in graph.nodes:
         raise ConfigError(f"no stage {name}{nearest(name, graph.nodes)}")

@@ -22,11 +22,13 @@ def root_of(cfg: dict[str, Any]) -> Path:
 
 def prepared(words: Words) -> tuple[dict[str, Any], Path]:
     """The config and the run's folder, with this process made ready for work."""
-    from actors.process import device_of, prepare_process
-    from actors.world_config import check_world
     from pipeline.config import load_config
 
     cfg = load_config(words)
+    # a mistake in the words is told before these load torch
+    from actors.process import device_of, prepare_process
+    from actors.world_config import check_world
+
     device_of(cfg)  # what is not there is told before any work
     check_world(cfg)
     prepare_process(cfg["seed"])

@@ -30,9 +30,10 @@ from envs.simulators.dit.engine import DiTSimulator
 from envs.simulators.remote.engine import GivenStates, RemoteError, RemoteSimulator
 from envs.simulators.remote.protocol import decode_frame, encode_frame
 from envs.simulators.state_experts.base import StateDecoder
+from envs.specs import WorldSpec
 from tests.actors.serving import Running, serve_config, tiny_expert, tiny_world
 from tests.embodiments import ARM_DELTAS, BIMANUAL_JOINTS, world_spec
-from tests.envs.clips_of import first_of, future_of
+from tests.envs.simulators.clips import blocks, clip, first_of, future_of
 
 CONNECTION: dict[str, Any] = {"connect_s": 10.0, "deadline_s": 60.0, "retries": 1, "user": "test"}
 ROOT = Path(__file__).parents[2]
@@ -54,6 +55,18 @@ def remote(*urls: str, of: Simulator, **options: Any) -> RemoteSimulator:
     return RemoteSimulator(of.spec, of.memory_frames, urls, CONNECTION | options)
 
 
+def begin(spec: WorldSpec, rows: int) -> TensorDict:
+    """What sessions begin with, [rows]; JPEG keeps its pictures, so that both sides see the same."""
+    first = first_of(spec, clip(spec, rows, 3))
+    first["frames"] = blocks(first["frames"].shape, torch.Generator().manual_seed(0))
+    return first
+
+
+def following(spec: WorldSpec, rows: int, number: int = 0) -> TensorDict:
+    """What chunk `number` of these sessions is asked for, [rows]."""
+    return future_of(spec, clip(spec, rows, 3, chunks=2), number)
+
+
 def through_jpeg(values: Tensor) -> Tensor:
     """Pictures [..., V, 3, H, W] as the other side sees them."""
     views, _, height, width = values.shape[-4:]
@@ -65,10 +78,10 @@ def run(
     world: Simulator, decoder: StateDecoder, batch: int, steps: int = 2
 ) -> tuple[list[Tensor], list[Tensor]]:
     most = 3  # the first rows of which are the same for any batch
-    state = world.reset(first_of(world.spec, most)[:batch], torch.arange(batch) + 3)
+    state = world.reset(begin(world.spec, most)[:batch], torch.arange(batch) + 3)
     frames, states = [], []
     for step in range(steps):
-        made, features, state = world.step(state, future_of(world.spec, most, step)[:batch])
+        made, features, state = world.step(state, following(world.spec, most, step)[:batch])
         frames.append(made)
         states.append(decoder.follow(state, world.spec.chunk, features))
     return frames, states
@@ -85,9 +98,9 @@ def test_a_served_world_is_the_world_but_for_jpegs(robot: str) -> None:
         frames, states = run(far, GivenStates(far), 2)
         assert server.host.steps == 4 and server.host.passes <= 4
         # The same session by hand, from the pictures that the server was sent.
-        spec, first = world.spec, first_of(world.spec, 3)[:2]
+        spec, first = world.spec, begin(world.spec, 3)[:2]
         first["frames"] = through_jpeg(first["frames"])
-        maps = [future_of(spec, 3, step)[:2] for step in range(2)]
+        maps = [following(spec, 3, step)[:2] for step in range(2)]
         for future in maps:
             if spec.pose_map:
                 future["pose_map"] = through_jpeg(future["pose_map"])
@@ -118,25 +131,25 @@ def test_the_same_client_gets_the_same_bits_alone_and_in_company(server: Running
 
 def test_partial_resets_end_the_sessions_they_replace(server: Running, near: DiTSimulator) -> None:
     far = remote(server.url, of=near)
-    state = far.reset(first_of(far.spec, 2), torch.tensor([1, 2]))
+    state = far.reset(begin(far.spec, 2), torch.tensor([1, 2]))
     kept = set(server.host.sessions)
     assert len(kept) == 2
     mask = torch.tensor([True, False])
     far.release(state, mask)
-    state = memory.replace(state, mask, far.reset(first_of(far.spec, 1), torch.tensor([3])))
+    state = memory.replace(state, mask, far.reset(begin(far.spec, 1), torch.tensor([3])))
     assert len(server.host.sessions) == 2 and len(kept & set(server.host.sessions)) == 1
-    assert far.step(state, future_of(far.spec, 2))[0].shape[0] == 2
+    assert far.step(state, following(far.spec, 2))[0].shape[0] == 2
 
 
 def test_more_rows_than_places_and_many_urls(server: Running, near: DiTSimulator) -> None:
-    first, seeds = first_of(near.spec, 4), torch.arange(4)
+    first, seeds = begin(near.spec, 4), torch.arange(4)
     with pytest.raises(RemoteError, match=r"4 sessions are wanted, the servers at simulator\.urls hold 3"):
         remote(server.url, of=near).reset(first, seeds)
     second = Running(SessionHost(near, None, serve_config(sessions=1), bf16=False))
     try:
         far = remote(server.url, second.url, of=near)
         state = far.reset(first, seeds)
-        frames, features, _ = far.step(state, future_of(far.spec, 4))
+        frames, features, _ = far.step(state, following(far.spec, 4))
         assert frames.shape[0] == 4 and len(second.host.sessions) == 1
         assert torch.isfinite(features[:3]).all() and features[3].isnan().all()  # the second has no decoder
     finally:
@@ -150,15 +163,15 @@ def test_a_reset_that_fails_leaves_nothing_behind(server: Running, near: DiTSimu
     try:
         far = remote(server.url, url, of=near)
         with pytest.raises(RemoteError, match="/init answered 503: all places are taken"):
-            far.reset(first_of(far.spec, 4), torch.arange(4))
+            far.reset(begin(far.spec, 4), torch.arange(4))
         assert server.host.sessions == {}
-        state = far.reset(first_of(far.spec, 3), torch.arange(3))  # the three places that do work
-        assert far.step(state, future_of(far.spec, 3))[0].shape[0] == 3
+        state = far.reset(begin(far.spec, 3), torch.arange(3))  # the three places that do work
+        assert far.step(state, following(far.spec, 3))[0].shape[0] == 3
         # A server that is not there yet when it is first asked is there later.
         late = remote("http://127.0.0.1:9", server.url, of=near)
         for _ in range(2):
             with pytest.raises(RemoteError, match="no connection"):
-                late.reset(first_of(far.spec, 1), torch.arange(1))
+                late.reset(begin(far.spec, 1), torch.arange(1))
         assert late._places == []
     finally:
         httpd.shutdown()
@@ -166,17 +179,17 @@ def test_a_reset_that_fails_leaves_nothing_behind(server: Running, near: DiTSimu
 
 def test_sessions_end_with_their_simulator_and_its_process(server: Running, near: DiTSimulator) -> None:
     far = remote(server.url, of=near)
-    far.reset(first_of(far.spec, 1), torch.arange(1))
+    far.reset(begin(far.spec, 1), torch.arange(1))
     far.close()
     assert server.host.sessions == {}
-    far.reset(first_of(far.spec, 1), torch.arange(1))
+    far.reset(begin(far.spec, 1), torch.arange(1))
     del far
     gc.collect()
     assert server.host.sessions == {}
     code = (
         "import torch; from tests.actors.test_remote import *; spec = world_spec(BIMANUAL_POSES);"
         f"far = RemoteSimulator(spec, 3, ('{server.url}',), CONNECTION);"
-        "far.reset(first_of(spec, 2), torch.arange(2)); print('open', flush=True)"
+        "far.reset(begin(spec, 2), torch.arange(2)); print('open', flush=True)"
     ).replace("BIMANUAL_POSES", "__import__('tests.embodiments').embodiments.BIMANUAL_POSES")
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.stdout == "open\n", done.stderr
@@ -232,8 +245,8 @@ def test_servers_that_answer_nonsense(path: str, status: int, body: bytes, messa
     try:
         far = RemoteSimulator(world_spec(ARM_DELTAS), 3, (url,), CONNECTION)
         with pytest.raises(RemoteError, match=message):
-            state = far.reset(first_of(far.spec, 1), torch.zeros(1, dtype=torch.int64))
-            far.step(state, future_of(far.spec, 1))
+            state = far.reset(begin(far.spec, 1), torch.zeros(1, dtype=torch.int64))
+            far.step(state, following(far.spec, 1))
     finally:
         httpd.shutdown()
 
@@ -241,7 +254,7 @@ def test_servers_that_answer_nonsense(path: str, status: int, body: bytes, messa
 def test_servers_that_never_answer_and_that_are_not_there(near: DiTSimulator) -> None:
     # type: ignore[func-returns-value]
     url, httpd = strange_server(lambda *_: (time.sleep(3), (200, b"{}"))[1])
-    first, seed = first_of(near.spec, 1), torch.zeros(1, dtype=torch.int64)
+    first, seed = begin(near.spec, 1), torch.zeros(1, dtype=torch.int64)
     try:
         began = time.monotonic()
         with pytest.raises(RemoteError, match=r"deadline_s=0\.3 after 2 tries"):
@@ -263,7 +276,7 @@ def test_a_refusal_is_told_at_once_in_the_servers_words(near: DiTSimulator) -> N
     try:
         began = time.monotonic()
         with pytest.raises(RemoteError, match=r"413.*serve\.body_mb=0\.0003"):
-            remote(server.url, of=near, retries=5).reset(first_of(near.spec, 1), torch.zeros(1).long())
+            remote(server.url, of=near, retries=5).reset(begin(near.spec, 1), torch.zeros(1).long())
         assert time.monotonic() - began < 1.0 and server.host.sessions == {}
     finally:
         server.stop()
@@ -273,7 +286,7 @@ def test_a_lost_answer_is_asked_for_again_where_that_is_safe(
     server: Running, near: DiTSimulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     far = remote(server.url, of=near)
-    state = far.reset(first_of(far.spec, 1), torch.arange(1))
+    state = far.reset(begin(far.spec, 1), torch.arange(1))
     post, lost = requests.Session.post, []
 
     def flaky(self: requests.Session, url: str, **more: object) -> requests.Response:
@@ -284,7 +297,7 @@ def test_a_lost_answer_is_asked_for_again_where_that_is_safe(
         return answer
 
     monkeypatch.setattr(requests.Session, "post", flaky)
-    far.step(state, future_of(far.spec, 1))
+    far.step(state, following(far.spec, 1))
     (session,) = server.host.sessions.values()
     assert lost and session.chunk == 1
 

@@ -2,36 +2,75 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
-from pipeline.cli.main import main
+from pipeline.cli.main import COMMANDS, main
 
 ROOT = Path(__file__).resolve().parent.parent.parent
+Answer = subprocess.CompletedProcess[str]
 
 
-def worldloop(*words: str) -> subprocess.CompletedProcess[str]:
+def process(*words: str) -> Answer:
+    """`python -m pipeline <words>`, as a shell runs it."""
     return subprocess.run(
         [sys.executable, "-m", "pipeline", *words], cwd=ROOT, capture_output=True, text=True, check=False
     )
 
 
-def test_help_lists_the_commands_without_loading_torch() -> None:
-    out = worldloop("--help")
+def worldloop(*words: str) -> Answer:
+    """The same in this process, which has imported what it needs."""
+    out, err, status = io.StringIO(), io.StringIO(), 0
+    with patch.object(sys, "argv", ["worldloop", *words]):
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            try:
+                main()
+            except SystemExit as end:
+                assert isinstance(end.code, int)
+                status = end.code
+    return subprocess.CompletedProcess(list(words), status, out.getvalue(), err.getvalue())
+
+
+def test_help_lists_the_commands() -> None:
+    out = process("--help")
     assert out.returncode == 0 and "doctor" in out.stdout and "controls" in out.stdout
-    loaded = "assert not {'torch', 'ray', 'wandb'} & set(sys.modules)"
-    code = f"import sys; from pipeline.cli.main import _help; _help(); {loaded}"
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 
 
-def test_mistakes_are_one_line() -> None:
+def test_what_needs_no_learning_is_answered_without_loading_torch() -> None:
+    code = """if True:
+        import sys
+        from pipeline.cli.main import main
+        for words in sys.argv[1:]:
+            sys.argv = ["worldloop", *words.split()]
+            try:
+                main()
+            except SystemExit as end:
+                assert end.code in (1, 2), words
+            assert not {"torch", "ray", "wandb"} & set(sys.modules), words
+        """
+    light = ["--help", "run --help", "evalute", "stage", "tasks", "completion bash", "config simulator=gan"]
+    light += [f"{name} nope=1" for name in ("run", "rl", "stages", "evaluate", "controls", "finetune")]
+    done = subprocess.run([sys.executable, "-c", code, *light], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("run", [process, worldloop])
+def test_a_mistake_is_one_line(run: Callable[..., Answer]) -> None:
+    wrong = run("config", "nope=1")
+    assert wrong.returncode == 1 and wrong.stderr.count("\n") == 1 and "nope" in wrong.stderr, wrong
+
+
+def test_mistakes_name_the_fix() -> None:
     unknown = worldloop("evalute")
     assert unknown.returncode == 2 and "did you mean evaluate" in unknown.stderr
     for words, said in (
-        (("config", "nope=1"), "nope"),
         (("controls", "experiment=smoke", "name=never-run"), "worldloop run"),
         (("compare", "/nowhere"), "result.json is not there"),
         (("stage",), "worldloop stages"),
@@ -41,8 +80,6 @@ def test_mistakes_are_one_line() -> None:
 
 
 def test_every_command_explains_itself_at_once_and_starts_nothing() -> None:
-    from pipeline.cli.main import COMMANDS
-
     for name in ("run", "chaos", "convert"):
         out = worldloop(name, "--help")
         assert out.returncode == 0 and out.stdout.startswith(f"worldloop {name} "), out
@@ -51,8 +88,9 @@ def test_every_command_explains_itself_at_once_and_starts_nothing() -> None:
 
 
 def test_shells_complete_commands_and_choices() -> None:
+    script = worldloop("completion", "bash").stdout
+
     def completed(*words: str) -> list[str]:
-        script = worldloop("completion", "bash").stdout
         ask = f"COMP_WORDS=({' '.join(words)}); COMP_CWORD={len(words) - 1}; _worldloop"
         line = f'{script}\n{ask}; echo "${{COMPREPLY[@]}}"'
         return subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True).stdout.split()

@@ -21,6 +21,13 @@ def moving_square(spec: WorldSpec, place: Tensor) -> Tensor:
     return frame[..., None, None, :, :].expand(*place.shape, spec.views, 3, height, width).contiguous()
 
 
+def blocks(shape: torch.Size, generator: torch.Generator) -> Tensor:
+    """Random pictures uint8 [*, H, W] in blocks of 8 x 8 pixels, which JPEG keeps."""
+    *lead, height, width = shape
+    small = torch.randint(0, 255, (*lead, -(-height // 8), -(-width // 8)), generator=generator)
+    return small.repeat_interleave(8, -2).repeat_interleave(8, -1)[..., :height, :width].to(torch.uint8)
+
+
 def clip(spec: WorldSpec, batch: int, memory: int, chunks: int = 1, seed: int = 0) -> TensorDict:
     """A clip [batch] as ClipStore.clips gives it; the square moves by a twentieth of the action's first
     number.
@@ -38,7 +45,7 @@ def clip(spec: WorldSpec, batch: int, memory: int, chunks: int = 1, seed: int = 
     if spec.embodiment.calibrated:
         arrays["c2w"] = camera_poses(spec, batch, length)
     if spec.pose_map:
-        arrays["pose_map"] = torch.randint(0, 255, frames.shape, dtype=torch.uint8, generator=generator)
+        arrays["pose_map"] = blocks(frames.shape, generator)
     index = memory_indices(begin + 1 + spec.chunk * torch.arange(chunks), memory).expand(batch, -1, -1)
     rows = torch.arange(batch)[:, None, None]
     maps = [name for name in ("pose_map", "c2w") if name in arrays]

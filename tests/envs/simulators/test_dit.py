@@ -15,7 +15,7 @@ from envs.simulators.dit.shape import DiTShape
 from envs.simulators.inputs import build_inputs
 from envs.simulators.state_experts.flow import StateExpert, StateTokens
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES, EMBODIMENTS, world_spec
-from tests.envs.clips_of import clip_of, first_of, future_of
+from tests.envs.simulators.clips import clip, first_of, future_of
 
 NET = {"layers": 3, "heads": 2, "head_dim": 24, "adaln_rank": 8, "patch": 2, "stem": 8}
 DENOISING: dict[str, Any] = {
@@ -50,12 +50,12 @@ def dit() -> DiTSimulator:
 def test_rows_depend_on_seed_and_commands_and_on_no_other_row(robot: str) -> None:
     world = make(robot)
     expert, spec = expert_of(world), world.spec
-    first, seeds = first_of(spec, 3), torch.tensor([7, 8, 7])
-    first[2] = first[0]
+    clips, seeds = clip(spec, 3, 3, chunks=2), torch.tensor([7, 8, 7])
+    clips[2] = clips[0]
+    first = first_of(spec, clips)
     together, alone = world.reset(first, seeds), world.reset(first[1:2], seeds[1:2])
     for step in range(2):
-        future = future_of(spec, 3, step)
-        future[2] = future[0]
+        future = future_of(spec, clips, step)
         frames, features, together = world.step(together, future)
         states = expert.follow(together, spec.chunk, features)
         assert frames.shape == (3, spec.chunk, spec.views, 3, *spec.size) and frames.dtype == torch.uint8
@@ -68,7 +68,7 @@ def test_rows_depend_on_seed_and_commands_and_on_no_other_row(robot: str) -> Non
         assert torch.allclose(states[1], expert.follow(alone, spec.chunk, own)[0], atol=1e-3)
     # Another command, other frames: the action vector tells, whether or not there is a pose map.
     again = world.reset(first[:1], seeds[:1])
-    other = future_of(spec, 1)
+    other = future_of(spec, clips[:1])
     frames = world.step(again.clone(), other)[0]
     other["commands"] = other["commands"] + 1.0
     assert not torch.equal(world.step(again, other)[0], frames)
@@ -76,12 +76,13 @@ def test_rows_depend_on_seed_and_commands_and_on_no_other_row(robot: str) -> Non
 
 def test_a_partial_reset_is_a_masked_write(dit: DiTSimulator) -> None:
     spec = dit.spec
-    state = dit.reset(first_of(spec, 2), torch.tensor([1, 2]))
-    _, _, state = dit.step(state, future_of(spec, 2))
-    fresh = first_of(spec, 1, seed=9)
+    clips = clip(spec, 2, 3, chunks=2)
+    state = dit.reset(first_of(spec, clips), torch.tensor([1, 2]))
+    _, _, state = dit.step(state, future_of(spec, clips))
+    fresh = first_of(spec, clip(spec, 1, 3, seed=9))
     state = memory.replace(state, torch.tensor([True, False]), dit.reset(fresh, torch.tensor([5])))
     assert state["length"].tolist() == [1, 1 + spec.chunk] and state["chunk_index"].tolist() == [0, 1]
-    future = future_of(spec, 2, 3)
+    future = future_of(spec, clips, 1)
     mixed = dit.step(state, future)[0]
     again = dit.step(dit.reset(fresh, torch.tensor([5])), future[:1])[0]
     assert (mixed[0].int() - again[0].int()).abs().max() <= 1
@@ -90,18 +91,18 @@ def test_a_partial_reset_is_a_masked_write(dit: DiTSimulator) -> None:
 @pytest.mark.parametrize("robot", EMBODIMENTS)
 def test_every_weight_learns_and_nothing_of_the_autoencoder(robot: str) -> None:
     world = make(robot)
-    clip = clip_of(world.spec, 2, 3, chunks=2)
-    loss, _ = world.loss(clip, torch.Generator().manual_seed(1))
+    clips = clip(world.spec, 2, 3, chunks=2)
+    loss, _ = world.loss(clips, torch.Generator().manual_seed(1))
     loss.backward()
     assert [n for n, p in world.named_parameters() if p.requires_grad and p.grad is None] == []
     dead = [n for n, p in world.named_parameters() if p.grad is not None and not p.grad.abs().sum() > 0]
     assert dead == []
     assert all(p.grad is None for p in world.codec.parameters())
     expert = expert_of(world)
-    inputs = build_inputs(world.spec, clip, 0, generator=torch.Generator().manual_seed(0))
+    clips = clip(world.spec, 2, 3)
+    inputs = build_inputs(world.spec, clips, 0, generator=torch.Generator().manual_seed(0))
     features = expert.read(expert.look(world, inputs))
-    future = clip["future"][:, : world.spec.chunk]
-    expert.loss(features, clip["history"], future, torch.Generator().manual_seed(0)).backward()
+    expert.loss(features, clips["history"], clips["future"], torch.Generator().manual_seed(0)).backward()
     dead = [n for n, p in expert.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
     # of one key's bias the softmax over all keys takes no notice
     assert all(name.endswith("to_k.bias") for name in dead), dead
@@ -110,13 +111,13 @@ def test_every_weight_learns_and_nothing_of_the_autoencoder(robot: str) -> None:
 @pytest.mark.parametrize("prediction", ["velocity", "clean"])
 def test_loss_falls_and_frames_come_nearer(prediction: str) -> None:
     world = make("one_arm_deltas", prediction=prediction, augment=0.0)
-    clip = clip_of(world.spec, 4, 3)
-    world.normalise(clip["future", "commands"].flatten(0, 1), torch.zeros(1, 4), clip["now", "state"])
+    clips = clip(world.spec, 4, 3)
+    world.normalise(clips["future", "commands"].flatten(0, 1), torch.zeros(1, 4), clips["now", "state"])
     optimiser = torch.optim.Adam([p for p in world.parameters() if p.requires_grad], 3e-3)
     generator, losses = torch.Generator().manual_seed(0), []
     for _ in range(60):
         optimiser.zero_grad()
-        loss = world.loss(clip, generator)[0]
+        loss = world.loss(clips, generator)[0]
         loss.backward()
         optimiser.step()
         losses.append(float(loss.detach()))
@@ -140,7 +141,7 @@ def test_predictions_follow_the_flow_to_the_data(dit: DiTSimulator) -> None:
 
 def test_the_expert_learns_its_mix_and_the_simulator_takes_it_over(dit: DiTSimulator) -> None:
     expert = expert_of(dit)
-    inputs = build_inputs(dit.spec, clip_of(dit.spec, 2, 3), 0, generator=torch.Generator().manual_seed(0))
+    inputs = build_inputs(dit.spec, clip(dit.spec, 2, 3), 0, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         expert.net.video_buffer_weights.copy_(torch.tensor([0.5, 2.0, -1.0]))
     expert.attach(dit)
@@ -202,7 +203,7 @@ def test_checkpointed_blocks_give_the_same_gradients(dit: DiTSimulator) -> None:
     for checkpointing in (False, True):
         dit.net.checkpointing = checkpointing
         dit.zero_grad()
-        dit.loss(clip_of(dit.spec, 1, 3), torch.Generator().manual_seed(0))[0].backward()
+        dit.loss(clip(dit.spec, 1, 3), torch.Generator().manual_seed(0))[0].backward()
         grads.append(dit.net.transformer_blocks[1].attn1.to_q.weight.grad.clone())
     assert torch.allclose(*grads, atol=1e-7)
 

@@ -31,7 +31,7 @@ from envs.transforms import world_transforms
 from envs.world import WorldEnv
 from tests.arms import two_arms
 from tests.embodiments import BIMANUAL_JOINTS, BIMANUAL_POSES
-from tests.envs.clips_of import clip_of, first_of, future_of
+from tests.envs.simulators.clips import clip, first_of, future_of
 from tests.envs.simulators.gesim_tiny import NET, SPEC, VAE, build, write_checkpoint
 
 
@@ -46,12 +46,12 @@ def world(folder: Path) -> GESimulator:
 
 
 def begin(world: GESimulator, seeds: list[int]) -> TensorDict:
-    first = torch.cat([first_of(SPEC, 1)] * len(seeds))
+    first = torch.cat([first_of(SPEC, clip(SPEC, 1, 4))] * len(seeds))
     return world.reset(first, torch.tensor(seeds))
 
 
 def chunk(seed: int, count: int = 1) -> TensorDict:
-    return torch.cat([future_of(SPEC, 1, seed)] * count)
+    return torch.cat([future_of(SPEC, clip(SPEC, 1, 4, seed=seed))] * count)
 
 
 def test_the_released_folder_loads_with_one_path(world: GESimulator, folder: Path) -> None:
@@ -132,18 +132,18 @@ def test_it_trains_whole_and_for_other_robots() -> None:
     for spec in (SPEC, WorldSpec(BIMANUAL_POSES, (32, 48), 5, pose_map=True, ray_map=True)):
         torch.manual_seed(0)
         world = build(None, spec).train()
-        clip = clip_of(spec, 1, 4)
-        world.loss(clip, torch.Generator().manual_seed(0))[0].backward()
+        clips = clip(spec, 1, 4)
+        world.loss(clips, torch.Generator().manual_seed(0))[0].backward()
         trained = {name: p for name, p in world.named_parameters() if p.requires_grad}
         # An untrained prompt is zero, so nobody asks it anything.
         unused = [
             n for n, p in trained.items() if p.grad is None and ".attn2." not in n and ".norm2." not in n
         ]
         assert trained and unused == []
-        inputs = build_inputs(spec, clip, 0)
+        inputs = build_inputs(spec, clips, 0)
         for expert in (GESimStateExpert(world, None), StateExpert(world, 1, 2, 16, 2)):
             features = expert.read(expert.look(world, inputs))
-            loss = expert.loss(features, clip["history"], clip["future"], torch.Generator().manual_seed(0))
+            loss = expert.loss(features, clips["history"], clips["future"], torch.Generator().manual_seed(0))
             loss.backward()
             assert torch.isfinite(loss) and all(p.grad is not None for p in expert.parameters())
 
@@ -198,7 +198,7 @@ def test_rl_runs_inside_a_joint_world(tmp_path: Path) -> None:
     judge = LearnedJudge(
         spec, hold=99, margin=0.0, discount=0.9, width=8, points=8, text=8, hidden=16, cameras="all"
     )
-    starts = InitialStates(first_of(spec, 3), ["pour"] * 3)
+    starts = InitialStates(first_of(spec, clip(spec, 3, 4)), ["pour"] * 3)
     base = WorldEnv(world, starts, 2, 10, ActionMode.RELATIVE, bf16=False)
     expert = GESimStateExpert(world, None).eval()
     transforms = world_transforms(
