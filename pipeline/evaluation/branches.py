@@ -64,7 +64,7 @@ def branch(
         imagined, chunks = _imagine(world, policy, slots)
         width = physics.batch_size[0]
         parts = [
-            _carry_out(physics, policy, judge, points, some, made)
+            carry_out(physics, policy, judge, points, some, made)
             for some, made in zip(slots.split(width), chunks.split(width, 1), strict=True)
         ]
     seen, outcome = (torch.cat(values, -1) for values in zip(*parts, strict=True))
@@ -87,7 +87,7 @@ def _imagine(world: EnvBase, policy: SafePolicyWrapper, slots: Tensor) -> tuple[
     return torch.stack(progress), torch.stack(chunks)
 
 
-def _carry_out(
+def carry_out(
     physics: PhysicsEnv,
     policy: SafePolicyWrapper,
     judge: Judge,
