@@ -109,7 +109,11 @@ def _of(kind: type[Any], section: Any, key: str, given: tuple[str, ...] = ()) ->
         yield f"{key}={section!r} should be a section with {sorted(field.name for field in fields(kind))}"
         return
     yield from unknown_names(kind, section, f"section {key}", key)
-    needed = [field.name for field in fields(kind) if field.default is MISSING and field.name not in given]
+    needed = [
+        field.name
+        for field in fields(kind)
+        if field.default is field.default_factory is MISSING and field.name not in given
+    ]
     yield from (f"{key}.{name} is missing" for name in needed if name not in section)
     yield from value_faults(kind, section, key)
 
