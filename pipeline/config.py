@@ -63,6 +63,8 @@ def _unknown_key(overrides: Sequence[str]) -> str:
     paths = list(_paths(base))
     for word in overrides:
         key = word.split("=")[0]
+        if not key:
+            return f"{word} names no key; say key=value"
         if word in choices or key.startswith(("+", "~")) or key in paths:
             continue
         parent = key.rpartition(".")[0]

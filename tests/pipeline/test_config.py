@@ -42,7 +42,7 @@ from pipeline.loop import build_loop
         (["imitation.fit.batch=7", "microbatches=2"], r"imitation\.fit: batch=7 must be a multiple of micro"),
         (["collect.noise_level=[0.6,0.1]"], r"collect\.noise_level"),
         (["simulator=null"], r"simulator=null cannot be read"),
-        (["=3"], r"=3 cannot be read"),
+        (["=3"], r"=3 names no key"),
         (["name="], r"name='' should have at least 1 character"),
         (["collect.episodes=5"], r"collect\.episodes"),
         (["launch.device=gpu"], r"launch\.device='gpu' should be auto, cpu, cuda or"),
@@ -66,8 +66,8 @@ def test_all_mistakes_are_told_at_once() -> None:
 
 WRONG: dict[type, list[Any]] = {
     bool: ["perhaps", None, 3],
-    int: ["many", None, -7, [1], {}, 10**30],
-    float: ["much", None, [1.0], -1e9, float("nan"), float("inf")],
+    int: ["many", None, -7, [1], {}],
+    float: ["much", None, [1.0], float("nan"), float("inf")],
     str: [3, None, {}],
     list: [3, None, {}, {"a": 1}],
     dict: [3, None, "none", [1]],
