@@ -50,11 +50,11 @@ def line_chart(curves: Sequence[Curve], title: str, xlabel: str, ylabel: str) ->
     parts.append(_text(_WIDTH / 2, _HEIGHT - 5, xlabel, "tick middle"))
     parts.append(_text(_LEFT, 28, ylabel, "tick"))
     beside = _WIDTH - _RIGHT
-    for number, curve in enumerate(curves):
+    for number, curve in reversed(list(enumerate(curves))):  # the legend is laid out from the right
         known = [place(x, y) for x, y in zip(curve.x, curve.y, strict=True) if math.isfinite(y)]
         parts.append(f'<path class="line c{number % 6}" d="{_path(known)}"/>')
         if len(curves) > 1:
-            beside -= 11 + 6.2 * len(curve.label)
+            beside -= 22 + 6.6 * len(curve.label)
             parts.append(f'<rect class="c{number % 6}" x="{beside:.0f}" y="20" width="8" height="8" rx="2"/>')
             parts.append(_text(beside + 11, 28, curve.label, "tick"))
     box = f"0 0 {_WIDTH:.0f} {_HEIGHT:.0f}"

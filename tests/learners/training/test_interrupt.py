@@ -55,14 +55,14 @@ def test_an_interrupted_fit_goes_on_to_the_same_metrics_weights_and_result(
     def run(folder: Path, disturb: Callable[[int], None]) -> tuple[list[Any], Tensor, float]:
         torch.manual_seed(0)
         module = nn.Linear(3, 1)
-        steps: list[int] = []
+        learned: list[Tensor] = []
 
         def batch(step: int, generator: torch.Generator) -> Tensor:
-            steps.append(step)
             return torch.randn(4, 3, generator=generator)
 
         def loss(data: Tensor, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
-            disturb(steps[-1])
+            disturb(len(learned))  # batches are made ahead of their steps
+            learned.append(data)
             return module(data).square().mean(), {}
 
         result = fit("x", module, batch, loss, FitConfig(steps=8, batch=4, bf16=False), folder)
