@@ -161,7 +161,6 @@ def tasks(words: Words) -> None:
     """list what can be tried in physics: suites, robots, tasks, scenes; of one all, and its pictures into a
     folder: worldloop tasks task=metaworld [pictures=FOLDER]
     """
-    from pipeline.commands.task_pictures import draw
     from pipeline.commands.tasks import table
 
     own = {key: value for key, _, value in (word.partition("=") for word in words)}
@@ -169,6 +168,8 @@ def tasks(words: Words) -> None:
         raise ConfigError("say worldloop tasks, or worldloop tasks task=metaworld [pictures=FOLDER]")
     print(table(own.get("task", "")))
     if own.get("pictures"):
+        from pipeline.commands.task_pictures import draw  # loads torch
+
         for path in draw(own["task"], Path(own["pictures"])):
             print(path)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from envs.episodes.clips import ClipStore
 from envs.simulators.base import Simulator
 from envs.simulators.replay import Replay, replay
-from pipeline.evaluation.object_error import object_error
+from pipeline.evaluation.objects.error import object_error
 from pipeline.evaluation.quantiles import quantiles
 
 _LAST = 4  # frames at the end of an episode

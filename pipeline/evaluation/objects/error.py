@@ -13,7 +13,7 @@ from envs.episodes.clips import ClipStore
 from envs.episodes.privileged import read_privileged
 from envs.geometry.cameras import on_plane, project
 from envs.simulators.replay import Replay
-from pipeline.evaluation.object_locator import locate
+from pipeline.evaluation.objects.locator import locate
 from pipeline.evaluation.quantiles import quantiles
 
 POSES = "object_poses"  # privileged: [x, y, z, heading] of every object, metres and radians
