@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import os
 
@@ -44,6 +45,8 @@ class Offscreen:
             # its destructor reads the field, which a constructor that a signal interrupts has not set
             gl_context._context = None
             self._gl = gl_context(width, height)
+            # Before EGL itself ends, which mujoco has asked for earlier; afterwards freeing it is an error.
+            atexit.register(self._gl.free)
             self._gl.make_current()
             self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
         except Exception as error:
