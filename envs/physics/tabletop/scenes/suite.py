@@ -22,6 +22,7 @@ from envs.physics.tabletop.scenes.words import STYLES, instruction
 from envs.physics.tabletop.suite import TwoArmSuite
 from envs.ranges import NonNegative, Positive
 
+_NUMBERS = {name: number for number, name in enumerate(SCENES)}
 IN_DOMAIN, OUT_OF_DOMAIN = "in_domain", "out_of_domain"
 
 
@@ -105,9 +106,8 @@ class TabletopScenes(TwoArmSuite):
         and of scripted episodes noise_level and the place of their manner in behaviour.MANNERS, -1 for
         neither.
         """
-        scene = list(SCENES).index(self.request.layout.scene.name)
         return super().privileged() | {
-            "scene": np.array(scene),
+            "scene": np.array(_NUMBERS[self.request.layout.scene.name]),
             "noise_level": np.array(self.noise_level),
             "manner": np.array(self.manner),
         }
