@@ -19,7 +19,7 @@ from envs.simulators.dit.shape import DiTShape
 from envs.simulators.samplers import Euler
 from envs.simulators.tokenizers.autoencoder import STRIDE, Autoencoder
 from envs.specs import WorldSpec
-from envs.targets import OptionsOf
+from envs.targets import OptionsOf, options
 
 # The public network embeds levels as they are; at thousandfold they span the sinusoids' range.
 TIME_SCALE = 1000.0
@@ -101,7 +101,7 @@ class DiTSimulator(LatentWorld):
 
     Raises:
         ValueError: if sizes do not fit.
-        TypeError: naming an option that is unknown or missing.
+        ConfigError: naming an option that is unknown, missing or out of range.
     """
 
     codec: Autoencoder
@@ -116,8 +116,8 @@ class DiTSimulator(LatentWorld):
     ):
         vector, tokenizer = ActionVector(spec.embodiment), Autoencoder(**codec)
         trunk = MultiViewDiT(Trunk(**net).shape(spec, tokenizer.channels, vector.size))
-        options = Denoising(**denoising)
-        super().__init__(spec, memory_frames, trunk, tokenizer, options.diffusion())
+        sampling = options(Denoising, denoising, "simulator.denoising")
+        super().__init__(spec, memory_frames, trunk, tokenizer, sampling.diffusion())
         self.action_vector = vector
         with torch.no_grad():
             # It starts from no change, or no flow: random output takes long to unlearn.

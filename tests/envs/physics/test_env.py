@@ -27,7 +27,7 @@ def on_target(env_or_pool: Any) -> None:
     """Put the block of slot 0 where it belongs."""
     pool = env_or_pool.pool if isinstance(env_or_pool, PhysicsEnv) else env_or_pool
     bench = pool._inline.slots[0].suite._bench
-    bench.data.qpos[bench.task.joint : bench.task.joint + 2] = bench.task.target
+    bench.data.qpos[bench.goal.joint : bench.goal.joint + 2] = bench.goal.target
 
 
 def test_success_ends_an_episode_with_a_bonus_once() -> None:
