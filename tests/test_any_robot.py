@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from envs.embodiment import Embodiment
 from envs.episodes.formats.lerobot_info import from_info
+from tests.commands import worldloop
 from tests.envs.episodes.lerobot_sets import FakeSet, write_set
 
-ROOT = Path(__file__).resolve().parent.parent
 POSE = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
 SMALL = (
     "experiment=smoke",
@@ -28,11 +26,10 @@ SMALL = (
 )
 
 
-def worldloop(command: str, folder: Path, *words: str) -> None:
+def loop(command: str, folder: Path, *words: str) -> None:
     """Run a command of the loop in a process of its own: `run`, or `rl` up to the last policy."""
-    line = [sys.executable, "-m", "pipeline", command, *SMALL, f"runs={folder}", *words]
-    out = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert out.returncode == 0, out.stderr[-4000:]
+    out = worldloop(folder, command, *SMALL, f"runs={folder}", *words)
+    assert out.status == 0, out.said[-4000:]
     assert list((folder / "smoke/stages").glob("rl-1-*/weights.safetensors"))
 
 
@@ -44,7 +41,7 @@ def robot_of(folder: Path) -> Embodiment:
 
 @pytest.mark.slow
 def test_two_arms_by_poses_with_calibrated_cameras(tmp_path: Path) -> None:
-    worldloop("rl", tmp_path, "task=push", "task.chunk=4", "task.horizon=12", "task.size=[48,48]")
+    loop("rl", tmp_path, "task=push", "task.chunk=4", "task.horizon=12", "task.size=[48,48]")
     robot = robot_of(tmp_path)
     assert robot.action_dim == 14 and robot.calibrated and len(robot.cameras) == 3
 
@@ -58,14 +55,14 @@ def test_two_arms_by_joints_inside_gesim(tmp_path: Path) -> None:
         "task.horizon=10",
         "task.size=[32,48]",
     )
-    worldloop("rl", tmp_path, *joints, "simulator=gesim_tiny", "task.mode=absolute")
+    loop("rl", tmp_path, *joints, "simulator=gesim_tiny", "task.mode=absolute")
     assert robot_of(tmp_path).action_dim == 16
 
 
 @pytest.mark.slow
 def test_one_arm_by_deltas_of_meta_world(tmp_path: Path) -> None:
     pytest.importorskip("metaworld", reason="make setup installs metaworld")
-    worldloop(
+    loop(
         "rl",
         tmp_path,
         "task=metaworld",
@@ -90,7 +87,7 @@ def test_one_arm_from_recordings_with_cameras_of_different_sizes(tmp_path: Path)
         "task.horizon=8",
         "task.size=[32,32]",
     )
-    worldloop("run", tmp_path, *words, "imitation.sources=['*']")
+    loop("run", tmp_path, *words, "imitation.sources=['*']")
     result = json.loads((tmp_path / "smoke/result.json").read_text())
     assert result["physics_after"] is None and result["imagined_after"]["episodes"] > 0
 
@@ -101,5 +98,5 @@ def test_somebody_elses_task_policy_and_algorithm(tmp_path: Path) -> None:
     task = f"+task={{{suite}, name: reach, size: [32,32], chunk: 4, horizon: 12, mode: absolute}}"
     policy = "+policy={_target_: examples.policy.CoarsePolicy, width: 32, std: 0.3}"
     algorithm = "+algorithm={_target_: examples.algorithm.Reinforce, entropy: 0.0}"
-    worldloop("rl", tmp_path, "~task", task, "~policy", policy, "~algorithm", algorithm)
+    loop("rl", tmp_path, "~task", task, "~policy", policy, "~algorithm", algorithm)
     assert robot_of(tmp_path).robot == "dot"

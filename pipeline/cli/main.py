@@ -5,7 +5,9 @@ What a command needs is imported when it runs, so that help and mistakes answer 
 
 from __future__ import annotations
 
+import atexit
 import os
+import signal
 import sys
 from collections.abc import Callable
 
@@ -90,3 +92,7 @@ def main() -> None:
             raise
         print(f"worldloop {words[0]}: {error}", file=sys.stderr)
         sys.exit(1)
+    finally:
+        # What is registered last runs first: from now on there is nothing left to save, and libraries' own
+        # endings answer Ctrl-C with a traceback.
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_DFL)

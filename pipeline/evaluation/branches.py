@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from tqdm import tqdm
 
 from actors.policies.safe import SafePolicyWrapper
 from envs.episodes.clips import ClipStore
@@ -65,7 +66,13 @@ def branch(
         width = physics.batch_size[0]
         parts = [
             carry_out(physics, policy, judge, points, some, made)
-            for some, made in zip(slots.split(width), chunks.split(width, 1), strict=True)
+            for some, made in tqdm(
+                list(zip(slots.split(width), chunks.split(width, 1), strict=True)),
+                desc="carried out",
+                unit="batch",
+                dynamic_ncols=True,
+                leave=False,
+            )
         ]
     seen, outcome = (torch.cat(values, -1) for values in zip(*parts, strict=True))
     shape = (len(which), futures)

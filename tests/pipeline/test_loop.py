@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,33 +16,27 @@ from actors.process import prepare_process
 from envs.manifest import write_manifest
 from pipeline.config import load_config
 from pipeline.loop import build_loop
+from tests.commands import worldloop
 
-ROOT = Path(__file__).resolve().parent.parent.parent
 LEARNED = ("imitation", "simulator-1", "state-1", "judge-1", "clone-1", "rl-1")
-
-
-def worldloop(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "pipeline", *words], cwd=ROOT, capture_output=True, text=True, check=False
-    )
 
 
 @pytest.mark.slow
 def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     words = ("experiment=smoke", f"runs={tmp_path}", "track=disabled")
-    out = worldloop("run", *words)
-    assert out.returncode == 0, out.stderr[-3000:]
+    out = worldloop(tmp_path, "run", *words)
+    assert out.status == 0, out.said[-3000:]
     run = tmp_path / "smoke"
     result = json.loads((run / "result.json").read_text())
     assert result["physics_before"]["episodes"] == 20 and len(result["rounds"]) == 2
     assert "on-policy" in result["rollout"] and not (run / "wandb.json").exists()
     assert "data:video/mp4" in (run / "report.html").read_text()
-    table = worldloop("compare", str(run), str(run)).stdout
+    table = worldloop(tmp_path, "compare", str(run), str(run)).said
     assert "| algorithm; seed | PPO; 0 | PPO; 0 |" in table
-    again = worldloop("run", *words)
-    assert (again.stdout + again.stderr).count("is finished, reused") == 24
-    controls = worldloop("controls", *words)
-    assert controls.returncode == 0, controls.stderr[-3000:]
+    again = worldloop(tmp_path, "run", *words)
+    assert again.said.count("is finished, reused") == 24
+    controls = worldloop(tmp_path, "controls", *words)
+    assert controls.status == 0, controls.said[-3000:]
     rows = json.loads((run / "controls.json").read_text())
     assert set(rows) > {"before", "loop", "loop without imagined decisions", "filtered BC"}
     assert "equal steps" in (run / "report.html").read_text()

@@ -54,22 +54,24 @@ LASTS = {
         ["evaluate", "policy=imitation", *SOAK, "name=known", "evaluate.episodes=4000"],
         r"physics: +\d",
     ),
+    "trust": (["trust", *SOAK, "name=known", "depth=1", "futures=300"], r"carried out: +\d"),
     "controls": (["controls", *SOAK, "name=known"], r"=== \S+ ->"),
     "finetune": (
         ["finetune", "simulator=unet_small", "task=lerobot", "name=new", "track=disabled", *ENDLESS],
         r"simulator: +\d+%.*loss",
     ),
     "serve": (["serve", *SOAK, "name=known", "serve.port=0"], r"http://127\.0\.0\.1:\d+"),
+    "play": (["play", *SOAK, "name=known", "serve.port=0"], r"http://127\.0\.0\.1:\d+"),
     "bench": (["bench", "learning", "track=disabled"], r"\w"),
     "chaos": (["chaos", "chaos.events=0", "chaos.seconds=500"], r"0 iterations"),
     "chaos soak": (["chaos", "chaos.events=500", "seed=770019"], r"life 1 begins"),
-    "convert": (["convert"], r"convert: +\d"),
     "inspect": (["inspect"], r"\w"),
     "verify": (["verify"], r"verify: +\d"),
 }
-SHORT = ("convert", "inspect", "verify")  # may have ended before they are asked to
+SHORT = ("inspect", "verify")  # may have ended before they are asked to, or be about to
+SERVERS = ("serve", "play")  # this is how they end
 # answer from what is there, or hand over to a cluster
-AT_ONCE = {"stages", "compare", "submit", "tasks", "config", "doctor", "completion"}
+AT_ONCE = {"convert", "stages", "compare", "submit", "tasks", "config", "doctor", "completion"}
 
 
 def test_every_command_is_tried() -> None:
@@ -83,7 +85,7 @@ def test_a_signal_ends_a_command_and_all_that_it_began(name: str, number: signal
     mark, data = f"{name}-{number}", next(run.glob("stages/collect-*/dataset"))
     if name == "finetune":
         words = [*words, f"task.data=[{data}]", f"finetune.data=[{data}]"]
-    if name in ("convert", "inspect"):
+    if name == "inspect":
         words = [*words, str(data), str(run.parent / mark)]
     elif name == "verify":
         words = [*words, str(run)]
@@ -100,7 +102,8 @@ def test_a_signal_ends_a_command_and_all_that_it_began(name: str, number: signal
             os.kill(process.pid, number)
         process.join(60)
         said = log.read_text(errors="replace")
-        assert process.exitcode in ((0,) if name in (*SHORT, "serve") else ()) + (128 + number,), said
+        ends = {128 + number, *((0, -number) if name in SHORT else ()), *((0,) if name in SERVERS else ())}
+        assert process.exitcode in ends, said
         assert "Traceback" not in said, said
         nothing_left(mark, process.pid, AssertionError)
         nothing_left("770019-1", process.pid, AssertionError)  # what a soak began
