@@ -10,28 +10,41 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextmanager
 def clean_ending() -> Iterator[None]:
-    """Within, SIGTERM raises SystemExit(143), so that whoever is at work can clean up; a second one kills."""
+    """Within, SIGTERM raises SystemExit(143) and SIGINT KeyboardInterrupt, so that whoever is at work can
+    clean up; a second SIGTERM kills. Libraries written in C turn what a handler raises in them into
+    errors of their own; it is the signal that ends the command all the same.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.getsignal(signal.SIGTERM)
+    asked = 0
+    before: dict[int, Any] = {number: signal.getsignal(number) for number in _SIGNALS}
 
     def end(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        nonlocal asked
+        asked = number
+        signal.signal(number, signal.SIG_DFL if number == signal.SIGTERM else before[number])
         leave(number)
 
-    signal.signal(signal.SIGTERM, end)
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:  # as shells start what runs in the background
+            signal.signal(number, end)
     try:
         yield
+    except Exception as error:
+        if asked:
+            leave(asked, error)
+        raise
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager
@@ -67,8 +80,8 @@ def deferred_signals() -> Iterator[Callable[[], int]]:
         leave(asked)
 
 
-def leave(number: int) -> NoReturn:
+def leave(number: int, cause: Exception | None = None) -> NoReturn:
     """End as the signal asks, with the exit status that shells expect of it."""
     if number == signal.SIGINT:
-        raise KeyboardInterrupt
-    raise SystemExit(128 + number)
+        raise KeyboardInterrupt from cause
+    raise SystemExit(128 + number) from cause

@@ -37,6 +37,20 @@ def test_the_first_signal_waits_and_the_second_does_not(
 
 
 @pytest.mark.parametrize(("number", "end"), ENDS)
+def test_a_signal_that_a_library_turned_into_its_own_error_ends_the_command(
+    number: signal.Signals, end: type[BaseException]
+) -> None:
+    with pytest.raises(end), clean_ending():
+        try:
+            os.kill(os.getpid(), number)
+            time.sleep(1)
+        except (KeyboardInterrupt, SystemExit) as interrupted:
+            raise ValueError("argument 1: " + repr(interrupted)) from None
+    with pytest.raises(ValueError, match="its own"), clean_ending():
+        raise ValueError("its own")
+
+
+@pytest.mark.parametrize(("number", "end"), ENDS)
 def test_a_signal_after_the_last_question_is_answered_too(
     number: signal.Signals, end: type[BaseException]
 ) -> None:
