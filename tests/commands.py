@@ -20,7 +20,7 @@ def worldloop(folder: Path, *words: str) -> Ended:
     """Run `worldloop <words>` to its end, or to that of the test's time; `folder` receives its log."""
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / f"{words[0]}-{len(list(folder.glob('*.log')))}.log"
-    process = life.begin(list(words), str(log), log, folder)
+    process = life.begin(list(words), str(log), log)
     try:
         process.join()
     finally:
