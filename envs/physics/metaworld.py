@@ -27,6 +27,7 @@ from envs.physics.suite import (
     check_cameras,
     check_noise_level,
     check_task,
+    checked_action,
 )
 from envs.ranges import NonNegative, Positive
 
@@ -162,9 +163,7 @@ class MetaWorld(TaskSuite):
         Raises:
             ValueError: if it is not finite or has another shape.
         """
-        action = np.asarray(action, dtype=np.float64)
-        if action.shape != (4,) or not np.isfinite(action).all():
-            raise ValueError(f"an action of Meta-World is 4 finite numbers, got {action}")
+        action = checked_action(action, self.embodiment.action_names)
         self.command = np.clip(action, -1.0, 1.0)
         for _ in range(self.substeps):
             self._sight, self._reward, _, _, self._info = self._env.step(self.command)

@@ -192,6 +192,18 @@ def check_cameras(cameras: Iterable[str], known: Iterable[str]) -> None:
         raise SuiteError(f"task.suite.cameras holds {unknown}; the cameras of this suite are {list(known)}")
 
 
+def checked_action(action: Array, names: Sequence[str]) -> Array:
+    """One action as float64 [A].
+
+    Raises:
+        ValueError: if it is not finite or has another shape, naming its numbers.
+    """
+    action = np.asarray(action, dtype=np.float64)
+    if action.shape != (len(names),) or not np.isfinite(action).all():
+        raise ValueError(f"an action here is {len(names)} finite numbers {list(names)}, got {action}")
+    return action
+
+
 def check_noise_level(noise_level: float) -> None:
     """Refuse noise levels outside [0, 1].
 

@@ -28,6 +28,7 @@ from envs.physics.suite import (
     TaskSuite,
     check_cameras,
     check_task,
+    checked_action,
 )
 from envs.ranges import NonNegative, Positive
 
@@ -119,9 +120,7 @@ class Aloha(TaskSuite):
         Raises:
             ValueError: if it is not finite or has another shape.
         """
-        action = np.asarray(action, dtype=np.float64)
-        if action.shape != (14,) or not np.isfinite(action).all():
-            raise ValueError(f"an action of gym-aloha is 14 finite numbers, got {action}")
+        action = checked_action(action, self.embodiment.action_names)
         self._bench.step(action, self.substeps)
         self.condition.update(self._bench.reward == MAX_REWARD)
 

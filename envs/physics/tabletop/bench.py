@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.physics.render import offscreen_for
-from envs.physics.suite import HeldCondition
+from envs.physics.suite import HeldCondition, checked_action
 from envs.physics.tabletop.actions import ActionInterface, Target
 from envs.physics.tabletop.arms import ArmKinematics
 from envs.physics.tabletop.scene import ARMS, FINGER_TRAVEL, HOME
@@ -92,12 +92,7 @@ class Bench:
         Raises:
             ValueError: if it is not finite or has another shape.
         """
-        action = np.asarray(action, dtype=np.float64)
-        names = self.actions.names
-        if action.shape != (len(names),) or not np.isfinite(action).all():
-            raise ValueError(
-                f"an action of this bench is {len(names)} finite numbers {list(names)}, got {action}"
-            )
+        action = checked_action(action, self.actions.names)
         before = self.target
         self.target = after = self.actions.advance(action, before)
         for k in range(self.glides):
