@@ -11,11 +11,11 @@ from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.episodes.formats.lerobot_columns import PRIVILEGED
 
 
-def read_privileged(store: ClipStore, name: str) -> Tensor:
-    """The column privileged.<name> [N, ...] of all rows of a store, read from the data anew.
-
-    Raises:
-        EpisodeError: if a data set has no such column; the message names those it has.
+def read_privileged(store: ClipStore, name: str) -> Tensor | None:
+    """The column privileged.<name> [N, ...] of all rows of a store, read from the data anew; None where a data
+    set has no such column, as recordings of a real robot have none.
     """
     sets = [LeRobotDataset(part.folder, store.spec.size, privileged=True) for part in store.parts]
+    if any(PRIVILEGED + name not in data.features for data in sets):
+        return None
     return torch.from_numpy(np.concatenate([data.column(PRIVILEGED + name) for data in sets]))
