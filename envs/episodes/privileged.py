@@ -12,8 +12,9 @@ from envs.episodes.formats.lerobot_columns import PRIVILEGED
 
 
 def read_privileged(store: ClipStore, name: str) -> Tensor | None:
-    """The column privileged.<name> [N, ...] of all rows of a store, read from the data anew; None where a data
-    set has no such column, as recordings of a real robot have none.
+    """The column privileged.<name> [N, ...] of all rows of a store, read from the data anew.
+
+    None where a data set has no such column, as recordings of real robots have none.
     """
     sets = [LeRobotDataset(part.folder, store.spec.size, privileged=True) for part in store.parts]
     if any(PRIVILEGED + name not in data.features for data in sets):

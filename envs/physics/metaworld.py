@@ -193,10 +193,10 @@ class MetaWorld(TaskSuite):
         )
 
     def privileged(self) -> dict[str, Array]:
-        """Meta-World's full observation less what the robot knows: object_poses [14] (up to two of position
-        and quaternion, zeros where there is no second), and goal [3], in metres.
+        """Meta-World's full observation less what the robot knows: object_poses [2, 7] (metres and
+        quaternion, zeros where there is no second), and goal [3] in metres.
         """
-        return {"object_poses": self._sight[4:18].copy(), "goal": self._sight[36:39].copy()}
+        return {"object_poses": self._sight[4:18].reshape(2, 7).copy(), "goal": self._sight[36:39].copy()}
 
     def expert(self, noise_level: float, rng: np.random.Generator) -> Expert:
         """Meta-World's scripted policy of the task, bent by noise; see NoisyPolicy."""

@@ -162,13 +162,13 @@ class OGBench(TaskSuite):
         )
 
     def privileged(self) -> dict[str, Array]:
-        """object_poses [14]: metres and quaternion of up to two cubes, zeros where there is no second; goal
+        """object_poses [2, 7]: metres and quaternion of up to two cubes, zeros where there is no second; goal
         [3] in metres, of the cube, handle or button that is meant.
         """
-        seen, poses = self._seen, np.zeros(14)
+        seen, poses = self._seen, np.zeros((2, 7))
         for k in range(self._env._num_cubes):
             block = (seen[f"privileged/block_{k}_pos"], seen[f"privileged/block_{k}_quat"])
-            poses[7 * k : 7 * k + 7] = np.concatenate(block)
+            poses[k] = np.concatenate(block)
         return {"object_poses": poses, "goal": np.array(self._places()[1])}
 
     def expert(self, noise_level: float, rng: np.random.Generator) -> Expert:

@@ -94,7 +94,11 @@ class TaskSuite(ABC):
 
     @abstractmethod
     def privileged(self) -> dict[str, Array]:
-        """What only physics knows (such as true object poses), by name; recorded under `privileged.*`."""
+        """What only physics knows, by name; recorded under `privileged.*`, and {} is fine.
+
+        Evaluation measures the first of `object_poses` [O, n], a row per object that begins with its centre's
+        x, y, z in metres. Shapes are those of the suite, whatever the task and the frame.
+        """
 
     @abstractmethod
     def expert(self, noise_level: float, rng: np.random.Generator) -> Expert:

@@ -149,9 +149,9 @@ class Aloha(TaskSuite):
         )
 
     def privileged(self) -> dict[str, Array]:
-        """object_poses [14]: metres and quaternion of the cube, then zeros, or of peg and socket."""
-        poses = self._bench.objects().flatten()
-        return {"object_poses": np.pad(poses, (0, 14 - len(poses)))}
+        """object_poses [2, 7]: metres and quaternion of the cube, then zeros, or of peg and socket."""
+        poses = self._bench.objects()
+        return {"object_poses": np.pad(poses, ((0, 2 - len(poses)), (0, 0)))}
 
     def expert(self, noise_level: float, rng: np.random.Generator) -> Expert:
         """The task's script for both hands, bent by noise; see NoisyScript."""

@@ -16,7 +16,7 @@ from envs.simulators.replay import Replay
 from pipeline.evaluation.objects.locator import locate
 from pipeline.evaluation.quantiles import quantiles
 
-POSES = "object_poses"  # privileged: [x, y, z, heading] of every object, metres and radians
+POSES = "object_poses"  # privileged: [O, n], for every object x, y, z in metres and what else a suite knows
 
 
 def object_error(store: ClipStore, episodes: Tensor, made: Replay, truth: Tensor) -> dict[str, Any]:
@@ -28,15 +28,15 @@ def object_error(store: ClipStore, episodes: Tensor, made: Replay, truth: Tensor
     Returns:
         object_px and object_cm (median, 90th percentile over all frames), object_cm_at_end, object_lost
         (share of frames), and locator_px, the locator's own error on true video; {} where this cannot be
-        measured.
+        measured: without calibration, without the column, or where it has no row of positions per object.
     """
     view = store.spec.embodiment.main_view
     if not store.spec.embodiment.calibrated or store.spec.embodiment.cameras[view].wrist is not None:
         return {}
     poses = read_privileged(store, POSES)
-    if poses is None:
+    if poses is None or poses.ndim != 3 or poses.shape[-1] < 3:
         return {}
-    places = poses.reshape(len(poses), -1, 4)[:, 0, :3]
+    places = poses[:, 0, :3]
     start = store.start[episodes]
     first = store.frames(start)[:, view]
     intrinsic, c2w = store.intrinsic[episodes][:, view], store.arrays["c2w"][start][:, view]

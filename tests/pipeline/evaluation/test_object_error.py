@@ -1,4 +1,4 @@
-"""Errors of an object's place in generated video: where they can be measured, and silence where they cannot."""
+"""Errors of an object's place in generated video, measured where they can be."""
 
 from __future__ import annotations
 
@@ -7,21 +7,27 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from envs.episodes import Episode, LeRobotWriter
 from envs.episodes.clips import ClipStore
+from envs.physics.pool import TaskPool
+from envs.physics.suite import build_suite
 from envs.simulators.replay import Replay
+from envs.specs import WorldSpec
+from envs.targets import ConfigError
 from pipeline.evaluation.measurement import rollout_error
 from tests.embodiments import BIMANUAL_POSES, world_spec
-from tests.moving_square import SIZE, moving_square
+from tests.envs.physics.sections import task_section
+from tests.moving_square import SIZE, SQUARE, moving_square
 
 MEASURED = {"object_px", "object_cm", "object_cm_at_end", "object_lost", "locator_px"}
 
 
 def store_of(folder: Path, change: Callable[[Episode], Episode]) -> ClipStore:
     """Calibrated episodes of the moving square, changed."""
-    made = [change(moving_square(BIMANUAL_POSES, seed)) for seed in range(3)]
+    made = [change(moving_square(BIMANUAL_POSES, seed, "random")) for seed in range(3)]
     LeRobotWriter(folder / "set", BIMANUAL_POSES.at(SIZE)).write(made)
     return ClipStore([folder / "set"], world_spec(BIMANUAL_POSES.at(SIZE), SIZE), folder / "cache")
 
@@ -39,3 +45,61 @@ def test_calibrated_data_without_privileged_columns_are_measured(tmp_path: Path)
     episodes = torch.arange(3)
     result = rollout_error(store, episodes, recorded(store, episodes))
     assert result["psnr_last_frames"] == 80.0 and not MEASURED & result.keys()
+
+
+def with_positions(more: int) -> Callable[[Episode], Episode]:
+    """Records where the square is, as the first of two objects; `more` numbers follow each position."""
+
+    def change(episode: Episode) -> Episode:
+        assert episode.intrinsic is not None
+        centre = (
+            episode.privileged["object_pose"] * (SIZE[1] - SQUARE) + SQUARE / 2
+        )  # pixels of the main view
+        poses = np.zeros((len(episode), 2, 3 + more), np.float32)
+        # The camera of tests.embodiments is a metre up and looks down, its y against the world's.
+        poses[:, 0, :2] = (centre - SIZE[1] / 2) / episode.intrinsic[0, 0, 0] * (1, -1)
+        return replace(episode, privileged={"object_poses": poses})
+
+    return change
+
+
+@pytest.mark.parametrize("more", [0, 1, 4])
+def test_the_first_object_is_measured_however_much_a_suite_says_of_it(more: int, tmp_path: Path) -> None:
+    store, episodes = store_of(tmp_path, with_positions(more)), torch.arange(3)
+    exact = rollout_error(store, episodes, recorded(store, episodes))
+    assert exact["object_px"]["p90"] < 1.0 and exact["object_lost"] == 0.0
+    shifted = rollout_error(store, episodes, recorded(store, episodes, shift=4))
+    assert shifted["object_px"]["median"] == pytest.approx(4.0, abs=1.0)
+    assert shifted["object_cm"]["median"] == pytest.approx(4 / 32 * 100, abs=3.0)
+    assert shifted["locator_px"] == exact["locator_px"]
+
+
+def test_poses_that_are_no_rows_of_objects_are_left_alone(tmp_path: Path) -> None:
+    def flat(episode: Episode) -> Episode:
+        return replace(episode, privileged={"object_poses": np.ones((len(episode), 14), np.float32)})
+
+    store, episodes = store_of(tmp_path, flat), torch.arange(3)
+    assert not MEASURED & rollout_error(store, episodes, recorded(store, episodes)).keys()
+
+
+@pytest.mark.parametrize("choice", ["metaworld", "aloha", "ogbench"])
+def test_calibrated_suites_are_measured(choice: str, tmp_path: Path) -> None:
+    section = task_section(choice, calibrated=True, size=[64, 64])
+    try:
+        robot = build_suite(section["suite"]).embodiment
+    except ConfigError as error:
+        if "needs more packages" not in str(error):
+            raise
+        pytest.skip(str(error))
+    pool = TaskPool(section["suite"], section["name"], 2, 4, workers=1)
+    try:
+        tracks = pool.script([(1, 0.0), (2, 0.0)], 1)
+    finally:
+        pool.close()
+    LeRobotWriter(tmp_path / "set", robot).write(
+        [Episode.from_track(track, "scripted", robot) for track in tracks]
+    )
+    store = ClipStore([tmp_path / "set"], WorldSpec(robot, robot.cameras[0].size, 2))
+    episodes = torch.arange(2)
+    result = rollout_error(store, episodes, recorded(store, episodes))
+    assert result.keys() >= MEASURED and result["object_px"] == result["locator_px"]
