@@ -1,8 +1,9 @@
 """Which episodes are for training, which are held out, and on which judges are calibrated.
 
-A data set says it in LeRobot's own field, info.json's `splits`: a name and a contiguous range of episodes,
-such as {"train": "0:40", "held_out": "40:48", "calibration": "48:56"}. One that knows only "train", as
-LeRobot writes it, is divided by episode number: every eighth is held out, every fourth calibrates.
+A data set says it in LeRobot's own field, info.json's `splits`: a name and a range of episodes, such as
+{"train": "0:40,56:60", "held_out": "40:48", "calibration": "48:56"}; more than one range where episodes were
+appended later. A set that knows only "train", as LeRobot writes it, is divided by episode number: every
+eighth is held out, every fourth calibrates.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from envs.episodes.episode import EpisodeError
 from envs.episodes.formats.lerobot_files import read_info
 from envs.files import write_atomically
 
-NAMES = ("train", "held_out", "calibration")
+TRAIN = "train"
+NAMES = (TRAIN, "held_out", "calibration")
 
 
 def range_of(splits: Mapping[str, str], name: str, count: int, folder: Path) -> list[int]:
@@ -24,22 +26,22 @@ def range_of(splits: Mapping[str, str], name: str, count: int, folder: Path) -> 
     Raises:
         EpisodeError: if its splits lack the name, or say no range.
     """
-    if name in NAMES and not set(splits) - {"train"}:
+    if name in NAMES and not set(splits) - {TRAIN}:
         return [number for number in range(count) if _by_number(number) == name]
     try:
-        begin, end = (int(part) for part in splits[name].split(":"))
+        ranges = [tuple(int(end) for end in part.split(":")) for part in splits[name].split(",")]
+        return sorted({number for begin, end in ranges for number in range(begin, min(end, count))})
     except (KeyError, ValueError) as error:
         raise EpisodeError(
             f"{folder / 'meta/info.json'}: splits are {dict(splits)}; {name!r} must be among them, as"
-            ' "first:end"'
+            ' "first:end" or "first:end,first:end"'
         ) from error
-    return list(range(begin, min(end, count)))
 
 
 def write_splits(root: Path, sizes: Mapping[str, int]) -> None:
     """Say in a finished data set how many of its episodes, in their order, each split takes.
 
-    Appending to the data set afterwards makes it forget them.
+    Episodes that are appended afterwards are added to one split; see LeRobotWriter.write.
 
     Raises:
         EpisodeError: if the sizes do not add up to the episodes that are there.
@@ -57,7 +59,19 @@ def write_splits(root: Path, sizes: Mapping[str, int]) -> None:
     write_atomically(path, lambda target: target.write_text(text))
 
 
+def extend_splits(splits: Mapping[str, str], name: str, before: int, count: int) -> dict[str, str]:
+    """The splits of a data set that grew from `before` episodes to `count`: the new ones are in split `name`,
+    the old ones where they were.
+    """
+    if count <= before:
+        return dict(splits)
+    old = splits.get(name, "")
+    head, _, end = old.rpartition(":")
+    joined = f"{head}:{count}" if end == f"{before}" else ",".join(filter(None, (old, f"{before}:{count}")))
+    return {**splits, name: joined}
+
+
 def _by_number(number: int) -> str:
     if number % 8 == 7:
         return "held_out"
-    return "calibration" if number % 4 == 2 else "train"
+    return "calibration" if number % 4 == 2 else TRAIN

@@ -43,6 +43,7 @@ from envs.episodes.formats.lerobot_files import (
 from envs.episodes.formats.lerobot_info import IMAGE_PREFIX
 from envs.episodes.formats.lerobot_robot import agreed_robot
 from envs.episodes.formats.lerobot_stats import column_stats, merge_stats, picture_stats
+from envs.episodes.splits import TRAIN, extend_splits
 from envs.episodes.video import write_video
 from envs.files import write_atomically
 
@@ -82,10 +83,10 @@ class LeRobotWriter:
                     f"{root}: info.json says {key}={info.get(key)!r}; Worldloop writes {kind!r} and"
                     " appends to nothing else. Choose another folder."
                 )
-        self._finish_journal()
+        split = self._finish_journal()
         self._rows = read_episode_rows(self.root, stats=True)
         if len(self._rows) != info.get("total_episodes"):  # interrupted before the description was rewritten
-            self._describe(info["features"])
+            self._describe(info["features"], split)
 
     @property
     def shards(self) -> int:
@@ -97,8 +98,11 @@ class LeRobotWriter:
         """Number of finished episodes."""
         return len(self._rows)
 
-    def write(self, episodes: Sequence[Episode]) -> None:
+    def write(self, episodes: Sequence[Episode], split: str = TRAIN) -> None:
         """Add one shard; afterwards the data set on disk is complete and consistent.
+
+        Args:
+            split: to which info.json counts the shard's episodes; those that are there stay where they are.
 
         Raises:
             EpisodeError: if an episode has other features than the data set.
@@ -113,7 +117,7 @@ class LeRobotWriter:
         videos = {view: IMAGE_PREFIX + view for view in self.embodiment.views}
         paths = {view: VIDEO_PATH.format(video_key=key, **place) for view, key in videos.items()}
         data, listing = DATA_PATH.format(**place), EPISODES_PATH.format(**place)
-        journal = {"listing": listing, "files": [data, *paths.values()]}
+        journal = {"listing": listing, "files": [data, *paths.values()], "split": split}
         self._write_json(_JOURNAL, journal)
         tasks = self._write_tasks(episodes)
         for k, view in enumerate(self.embodiment.views):
@@ -148,7 +152,7 @@ class LeRobotWriter:
         table = self._like_existing(pa.Table.from_pylist(records))
         write_atomically(self.root / listing, lambda path: write_groups(path, [table]))
         self._rows = [*rows, *records]
-        self._describe(features)
+        self._describe(features, split)
         (self.root / _JOURNAL).unlink()
 
     # -- what is there already
@@ -189,16 +193,21 @@ class LeRobotWriter:
                     used.append(int(found[1]) * CHUNK_FILES + int(found[2]))
         return max(used) + 1
 
-    def _finish_journal(self) -> None:
-        """Remove what an interrupted shard left: the journal's files, if their episodes file is missing."""
+    def _finish_journal(self) -> str:
+        """Remove what an interrupted shard left: the journal's files, if their episodes file is missing.
+
+        Returns:
+            the split of a shard that was interrupted when only the description was missing.
+        """
         path = self.root / _JOURNAL
         if not path.exists():
-            return
+            return TRAIN
         journal = json.loads(path.read_text())
         if not (self.root / journal["listing"]).exists():
             for name in journal["files"]:
                 (self.root / name).unlink(missing_ok=True)
         path.unlink()
+        return str(journal.get("split", TRAIN))
 
     def _like_existing(self, table: pa.Table) -> pa.Table:
         """The table with columns, order and types of existing episodes files: LeRobot reads them as one."""
@@ -227,11 +236,14 @@ class LeRobotWriter:
             write_atomically(self.root / "meta/tasks.parquet", lambda path: write_tasks(path, tasks))
         return tasks
 
-    def _describe(self, features: dict[str, Any]) -> None:
-        """Rewrite stats.json and info.json from the finished shards."""
+    def _describe(self, features: dict[str, Any], split: str) -> None:
+        """Rewrite stats.json and info.json from the finished shards; what is new belongs to `split`."""
         if self._rows:
             self._write_json("meta/stats.json", merge_stats(self._rows))
-        self._write_json("meta/info.json", self._info(features, self._rows, read_tasks(self.root)))
+        info = self._info(features, self._rows, read_tasks(self.root))
+        before = int(read_info(self.root)["total_episodes"])
+        info["splits"] = extend_splits(info["splits"], split, before, len(self._rows))
+        self._write_json("meta/info.json", info)
 
     def _info(
         self, features: dict[str, Any], rows: list[dict[str, Any]], tasks: dict[str, int]
@@ -247,12 +259,12 @@ class LeRobotWriter:
             "video_files_size_in_mb": 200,
             "data_path": DATA_PATH,
             "video_path": VIDEO_PATH,
+            "splits": {TRAIN: f"0:{info.get('total_episodes', 0)}"},
         }
         counts = {
             "total_episodes": len(rows),
             "total_frames": sum(int(row["length"]) for row in rows),
             "total_tasks": len(tasks),
-            "splits": {"train": f"0:{len(rows)}"},
         }
         return {**new, **info, **counts, "features": features}
 
