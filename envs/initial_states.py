@@ -47,8 +47,12 @@ class InitialStates:
         """Most recorded frames that precede an imagined one."""
         return 1
 
-    def past(self, which: Tensor) -> tuple[TensorDict, Tensor]:
-        """What was recorded up to moments [B], as Simulator.resume takes it: rows [B, P] and lengths [B]."""
+    def past(self, which: Tensor, capacity: int = 1) -> tuple[TensorDict, Tensor]:
+        """What was recorded up to moments [B], as Simulator.resume takes it: rows [B, P] and lengths [B].
+
+        Args:
+            capacity: rows that the session will need; those who read many frames keep room for them.
+        """
         return self.first[which].unsqueeze(1), torch.ones_like(which)
 
 
@@ -75,12 +79,10 @@ class DecisionPoints(InitialStates):
         """See InitialStates.longest."""
         return int(self.frame.max()) + 1
 
-    def past(self, which: Tensor) -> tuple[TensorDict, Tensor]:
-        """See InitialStates.past; rows beyond a moment repeat it."""
-        episode, now = self.episode[which], self.frame[which]
-        ahead = torch.arange(int(now.max()) + 1)
-        at = torch.minimum(ahead, now[:, None])
-        return self.store.at(episode[:, None].expand_as(at), at), now + 1
+    def past(self, which: Tensor, capacity: int = 1) -> tuple[TensorDict, Tensor]:
+        """See InitialStates.past; pictures beyond a moment hold anything."""
+        now = self.frame[which]
+        return self.store.until(self.episode[which], now, capacity), now + 1
 
 
 def decision_points(store: ClipStore, episodes: Tensor) -> tuple[Tensor, Tensor]:

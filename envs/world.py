@@ -94,11 +94,11 @@ class WorldEnv(ChunkedEnv):
         mask = self._reset_mask(tensordict)
         seeds = self._next_seeds(mask)[mask]
         start = seeds % len(self.starts)
-        past, length = self.starts.past(start)
+        room = self.starts.longest + self.horizon
+        past, length = self.starts.past(start, room)
         if self.session is not None:
             self.simulator.release(self.session, mask)
         noise = (start if self.shared_noise else seeds).to(self.device)
-        room = self.starts.longest + self.horizon
         begun = self.simulator.resume(past.to(self.device), length.to(self.device), noise, room)
         if self.session is None or mask.all():
             self.session = begun

@@ -120,6 +120,17 @@ class ClipStore:
             out[at] = getattr(part, name)[flat[at] - self._bounds[k]]
         return torch.from_numpy(out).reshape(shape)
 
+    def _spans(self, name: str, start: Tensor, count: Tensor, rows: int) -> Tensor:
+        """Pictures uint8 [B, rows, V, 3, H, W] whose first `count` [B] are those from row `start` [B] on; the
+        rest hold anything. Whole spans are read several times faster than row by row.
+        """
+        out = np.empty((len(start), rows, self.spec.views, 3, *self.spec.size), np.uint8)
+        owner = np.searchsorted(self._bounds, start.numpy(), side="right") - 1
+        for slot, (part, first, size) in enumerate(zip(owner, start.tolist(), count.tolist(), strict=True)):
+            begin = first - self._bounds[part]
+            out[slot, :size] = getattr(self.parts[part], name)[begin : begin + size]
+        return torch.from_numpy(out)
+
     def frames(self, rows: Tensor) -> Tensor:
         """Video frames uint8 [*rows.shape, V, 3, H, W] of flat row numbers."""
         return self._pictures("frames", rows)
@@ -206,6 +217,30 @@ class ClipStore:
         if self.spec.embodiment.calibrated:
             out["intrinsic"] = self.intrinsic[episodes]
         return TensorDict(out, episodes.shape)
+
+    def until(self, episodes: Tensor, frame: Tensor, capacity: int = 1) -> TensorDict:
+        """All frames of `episodes` [B] up to and with `frame` [B], as Simulator.resume takes them.
+
+        Args:
+            capacity: rows at least, so that a session has room for what it will imagine.
+
+        Returns:
+            TensorDict [B, P] with what `at` gives of a frame; pictures of rows beyond `frame` hold anything.
+        """
+        rows = max(int(frame.max()) + 1, capacity)
+        at = torch.minimum(torch.arange(rows), frame[:, None])
+        flat = self.start[episodes][:, None] + at
+        pictures = {"frames": "frames"} | ({"pose_map": "pose_maps"} if self.spec.pose_map else {})
+        out = {
+            "command": self.arrays["commands"][flat],
+            "state": self.arrays["states"][flat],
+            **{name: self._spans(kind, flat[:, 0], frame + 1, rows) for name, kind in pictures.items()},
+        }
+        if "c2w" in self.arrays:
+            out["c2w"] = self.arrays["c2w"][flat]
+        if self.spec.embodiment.calibrated:
+            out["intrinsic"] = self.intrinsic[episodes][:, None].expand(-1, rows, -1, -1, -1)
+        return TensorDict(out, flat.shape)
 
     def clips(self, episode: Tensor, begin: Tensor, spec: ClipSpec) -> TensorDict:
         """Clips that begin at frame `begin` [B] of `episode` [B].

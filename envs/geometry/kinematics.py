@@ -62,7 +62,7 @@ class Kinematics:
                     f"kinematics.joints names {len(names)} joints of arm {arm}, its actions have"
                     f" {values.shape[-1]}"
                 )
-        rows = [arm.reshape(-1, arm.shape[-1]).double().cpu().numpy() for arm in joints]
+        rows = [arm.reshape(arm.shape[:-1].numel(), arm.shape[-1]).double().cpu().numpy() for arm in joints]
         poses = np.asarray(self._solve(rows, dict(self.robot.held)), np.float64)
         wanted = (len(rows[0]), len(rows), 4, 4)
         if poses.shape != wanted or not np.isfinite(poses).all():

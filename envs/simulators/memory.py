@@ -72,12 +72,12 @@ def append(state: TensorDict, frames: Tensor, future: TensorDict) -> TensorDict:
     need = int(length.max()) + count
     if need > history.shape[1]:  # for twice as many frames, so that long rollouts copy seldom
         history = _with_capacity(history, max(need, 2 * history.shape[1]))
-    rows = _rows(state)
-    last = history["states"][rows.squeeze(1), length - 1]
-    at = length[:, None] + torch.arange(count, device=length.device)
+    last = history["states"][_rows(state).squeeze(1), length - 1]
     new = {**dict(future.items()), "frames": frames, "states": last[:, None].expand(-1, count, -1)}
-    for name in history.keys():
-        history[name][rows, at] = new[name].to(history[name].dtype)
+    # Slot by slot each is one piece of memory; indexed all at once, it is written byte by byte.
+    for slot, begin in enumerate(length.tolist()):
+        for name in history.keys():
+            history[name][slot, begin : begin + count] = new[name][slot]
     state = state.copy()  # of the names only
     state["history"], state["length"], state["chunk_index"] = (
         history,
