@@ -14,6 +14,8 @@ FILES = [path for room in ORDER for path in sorted((ROOT / room).rglob("*.py"))]
 # Where robots learn, act and are judged: nothing here may open what only physics knows.
 UNPRIVILEGED = (
     *("envs/simulators", "envs/judges", "envs/transforms", "envs/world.py", "actors", "learners"),
+    *("envs/conditioning", "envs/initial_states.py", "envs/encoders.py", "envs/language.py"),
+    *("envs/chunked.py", "envs/specs.py"),
     *("pipeline/stages", "pipeline/loop.py"),
 )
 # What physics workers import; torch takes seconds and hundreds of megabytes in each of them.
@@ -67,6 +69,11 @@ def test_imports_only_go_down(path: Path) -> None:
 @pytest.mark.parametrize("path", [path for path in FILES if within(path, UNPRIVILEGED)], ids=named)
 def test_nothing_that_learns_names_privileged_columns(path: Path) -> None:
     assert not [word for word in words(ast.parse(path.read_text())) if "privileged" in word.lower()]
+
+
+def test_every_place_that_learns_is_there() -> None:
+    for place in UNPRIVILEGED:
+        assert any(within(path, (place,)) for path in FILES), f"{place} is not searched: it does not exist"
 
 
 def test_only_evaluation_reads_privileged_columns() -> None:
