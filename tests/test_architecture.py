@@ -115,6 +115,12 @@ def test_files_are_short_and_say_what_they_are() -> None:
         assert path.stem not in {"utils", "helpers"}
 
 
+def test_the_readme_is_short() -> None:
+    lines = (ROOT / "README.md").read_text().splitlines()
+    assert len(lines) <= 150
+    assert not [line for line in lines if len(line) > 120]
+
+
 def test_folders_hold_about_a_dozen_files() -> None:
     for folder in {path.parent for path in FILES}:
         files = [path for path in folder.glob("*.py") if path.name != "__init__.py"]
