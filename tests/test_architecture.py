@@ -14,6 +14,8 @@ FILES = [path for room in ORDER for path in sorted((ROOT / room).rglob("*.py"))]
 # Where robots learn, act and are judged: nothing here may open what only physics knows.
 UNPRIVILEGED = (
     *("envs/simulators", "envs/judges", "envs/transforms", "envs/world.py", "actors", "learners"),
+    *("envs/conditioning", "envs/initial_states.py", "envs/encoders.py", "envs/language.py"),
+    *("envs/chunked.py", "envs/specs.py"),
     *("pipeline/stages", "pipeline/loop.py"),
 )
 # What physics workers import; torch takes seconds and hundreds of megabytes in each of them.
@@ -69,6 +71,11 @@ def test_nothing_that_learns_names_privileged_columns(path: Path) -> None:
     assert not [word for word in words(ast.parse(path.read_text())) if "privileged" in word.lower()]
 
 
+def test_every_place_that_learns_is_there() -> None:
+    for place in UNPRIVILEGED:
+        assert any(within(path, (place,)) for path in FILES), f"{place} is not searched: it does not exist"
+
+
 def test_only_evaluation_reads_privileged_columns() -> None:
     readers = {
         named(path)
@@ -106,6 +113,12 @@ def test_files_are_short_and_say_what_they_are() -> None:
             f"{path} has no docstring"
         )
         assert path.stem not in {"utils", "helpers"}
+
+
+def test_the_readme_is_short() -> None:
+    lines = (ROOT / "README.md").read_text().splitlines()
+    assert len(lines) <= 150
+    assert not [line for line in lines if len(line) > 120]
 
 
 def test_folders_hold_about_a_dozen_files() -> None:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from envs.conditioning import PoseMapStyle
 from envs.episodes.cache import CachedSet, open_cached
+from envs.episodes.columns import Columns
 from envs.episodes.episode import EpisodeError
 from envs.episodes.splits import range_of
 from envs.specs import WorldSpec, memory_indices, text_to_bytes
@@ -87,10 +88,12 @@ class ClipStore:
         self.text = text_to_bytes(self.instructions)
         self.length = torch.tensor([row["length"] for row in self.episodes])
         self.start = self.length.cumsum(0) - self.length
-        self.arrays = {
-            name: torch.from_numpy(np.concatenate([part.arrays[name] for part in self.parts]))
-            for name in self.parts[0].arrays
-        }
+        self.arrays = Columns(
+            {
+                name: torch.from_numpy(np.concatenate([part.arrays[name] for part in self.parts]))
+                for name in self.parts[0].arrays
+            }
+        )
         self.arrays["labelled"] = torch.tensor([row["success"] is not None for row in self.episodes])
         if not self.arrays["labelled"].any():
             del self.arrays["success"]

@@ -7,6 +7,9 @@ Beside a finished run stand, on the same evaluation seeds:
 - RL in physics with as many episodes as the loop deployed;
 - RL in physics with as many environment steps as the loop imagined;
 - filtered BC on everything that the loop recorded.
+
+RL in physics is rewarded by the suite's own progress and success, which no robot knows, and not by a learned
+judge: it is a bound on what a perfect judge would bring, and says so beside its rows.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from actors.world_config import rewards_of
 from envs.files import write_text
 from envs.targets import ConfigError
 from pipeline.evaluation.report import build_report
@@ -40,20 +44,22 @@ class Row:
         graph: the graph that holds its stages.
         node: the evaluation in physics that it shows.
         learned: stages that spent physics episodes, by their results' "episodes".
+        note: what must be known to compare it with the others; "" for nothing.
     """
 
     title: str
     graph: Graph
     node: str
     learned: tuple[str, ...]
+    note: str = ""
 
 
 def run_controls(cfg: Cfg, root: Path, tracker: Tracker | None = None) -> dict[str, Any]:
     """Run the controls of a finished run; writes controls.json and renders its report anew.
 
     Returns:
-        Rows by title: a rate entry, gain in points, paired (McNemar against the policy before), and
-        physics_episodes.
+        Rows by title: a rate entry, gain in points, paired (McNemar against the policy before),
+        physics_episodes, and note where there is one.
 
     Raises:
         ConfigError: if the run is not finished, or has no physics.
@@ -94,6 +100,8 @@ def control_rows(cfg: Cfg, root: Path, loop: Graph) -> list[Row]:
         "RL in physics, equal episodes": _rl_in_physics(loop, "equal-episodes", few),
         "RL in physics, equal steps": _rl_in_physics(loop, "equal-steps", iterations),
     }
+    told = "progress and success" if rewards_of(cfg).progress else "success"
+    note = f"rewarded by the suite's true {told}, which are privileged, not by a judge"
     loop.add("filtered-bc", only_here.filtered_bc, {"data": ["collect", *deploys]})
     loop.add("evaluate-filtered-bc", prove.evaluate_physics, {"policy": "filtered-bc"})
     without = build_loop(cfg, root, with_rl=False)
@@ -102,7 +110,7 @@ def control_rows(cfg: Cfg, root: Path, loop: Graph) -> list[Row]:
         Row("loop", loop, "evaluate-after", deploys),
         Row("loop without RL iterations", without, "evaluate-after", deploys),
         Row("loop without imagined decisions", blind, "evaluate-after", deploys),
-        *(Row(title, loop, f"evaluate-{name}", (name,)) for title, name in learned.items()),
+        *(Row(title, loop, f"evaluate-{name}", (name,), note) for title, name in learned.items()),
         Row("filtered BC", loop, "evaluate-filtered-bc", deploys),
     ]
 
@@ -120,6 +128,7 @@ def control_table(loop: Graph, rows: list[Row]) -> dict[str, Any]:
             "gain": 100 * (rate(entry) - rate(start)),
             "paired": mcnemar(before, success),
             "physics_episodes": sum(row.graph.result(name)["episodes"] for name in row.learned),
+            **({"note": row.note} if row.note else {}),
         }
     return table
 
@@ -133,7 +142,8 @@ def table_text(table: Mapping[str, Any]) -> str:
         if paired:
             flips = f"gained {paired['gained']} lost {paired['lost']} p {paired['p']:.2g}"
             gain = f", {row['gain']:+.1f} points, {flips}"
-        lines.append(f"{title:<30} {rate_line(row)}{gain}")
+        note = f"  ({row['note']})" if row.get("note") else ""
+        lines.append(f"{title:<30} {rate_line(row)}{gain}{note}")
     return "\n".join(lines)
 
 

@@ -39,7 +39,10 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     assert controls.status == 0, controls.said[-3000:]
     rows = json.loads((run / "controls.json").read_text())
     assert set(rows) > {"before", "loop", "loop without imagined decisions", "filtered BC"}
-    assert "equal steps" in (run / "report.html").read_text()
+    note = "rewarded by the suite's true progress and success, which are privileged, not by a judge"
+    noted = {title for title, row in rows.items() if row.get("note") == note}
+    assert noted == {"RL in physics, equal episodes", "RL in physics, equal steps"}
+    assert "equal steps" in (run / "report.html").read_text() and controls.said.count(note) == 2
 
 
 @pytest.mark.slow

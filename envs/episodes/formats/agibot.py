@@ -1,28 +1,37 @@
-"""AgiBot-World-Beta: one folder each for videos, camera parameters, joint readings and tasks."""
+"""AgiBot-World-Beta: one folder each for videos, camera parameters, joint readings and tasks.
+
+Commands are the targets that the recording holds (action/*). Where it holds none for every frame, measured
+joints stand in for them, which is said aloud: a policy then learns where the robot was, not where it was
+sent. Flange poses are always the measured ones, which fit the pictures.
+"""
 
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from envs.embodiment import Embodiment
 from envs.episodes.episode import Episode, EpisodeError
-from envs.episodes.formats.gesim import GENIE, VIEWS, flange_poses
+from envs.episodes.formats.gesim import GENIE, VIEWS, flange_poses, readings_of
 from envs.episodes.formats.recordings import Cut, Format, assemble
 from envs.episodes.video import read_video
 
-# Joint positions serve as state and as command: the set holds no targets. Grippers are as read, 35 open ..
-# 120 closed.
+# Grippers are as read, 35 open .. 120 closed.
 AGIBOT: Embodiment = replace(
     GENIE,
     robot="agibot_g1",
     state_names=GENIE.action_names,
     arms=tuple(replace(arm, gripper_range=(35.0, 120.0)) for arm in GENIE.arms),
 )
+
+
+Targets = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 def _find(source: Path) -> list[Path]:
@@ -40,6 +49,7 @@ def _read(place: Path, number: int, cut: Cut) -> Episode:
                 key: np.asarray(file[f"state/{key}"], np.float32)
                 for key in ("effector/position", "end/position", "end/orientation", "joint/position")
             }
+            sent = _targets(file, len(read["joint/position"]))
     except (OSError, KeyError) as error:
         raise EpisodeError(f"{readings}: {error}") from error
     length = len(read["joint/position"])
@@ -47,14 +57,14 @@ def _read(place: Path, number: int, cut: Cut) -> Episode:
     cameras = [_camera(folder, view, length) for view in VIEWS]
     videos = [read_video(place / f"videos/{view}_color.mp4") for view in VIEWS]
     length = min(length, *(len(video) for video in videos), cut.frames or length)
-    arms, hands = read["joint/position"][:length], read["effector/position"][:length].reshape(length, 2)
-    joints = np.concatenate([arms[:, :7], hands[:, :1], arms[:, 7:], hands[:, 1:]], 1)
+    hands = read["effector/position"][:length].reshape(length, 2)
+    joints = _in_order(read["joint/position"][:length], hands)
     return assemble(
         AGIBOT,
         {row: [video[row] for video in videos] for row in range(length)},
         length,
         place,
-        commands=joints,
+        commands=joints if sent is None else _in_order(sent[0][:length], sent[1][:length]),
         states=joints,
         poses=flange_poses(read["end/position"][:length], read["end/orientation"][:length], hands),
         c2w=np.stack([c2w[:length] for _, c2w in cameras], 1),
@@ -63,6 +73,41 @@ def _read(place: Path, number: int, cut: Cut) -> Episode:
         seed=int(name) if name.isdigit() else number,
         source="agibot",
     )
+
+
+def _targets(file: Any, length: int) -> Targets | None:
+    """Joint targets [T, 14] and gripper targets [T, 2], as read 35..120; None, with a warning, where they do
+    not cover all frames.
+    """
+    targets = []
+    for key, size in (("joint", 14), ("effector", 2)):
+        group = file.get(f"action/{key}")
+        if group is None or "position" not in group:
+            return _say_measured(f"there is no action/{key}/position")
+        values = np.asarray(group["position"], np.float32)
+        if values.shape != (length, size):
+            return _say_measured(f"action/{key}/position is not {size} numbers for every frame")
+        if "index" in group and not set(range(length)) <= set(np.asarray(group["index"]).tolist()):
+            return _say_measured(f"action/{key}/index says that no target was sent in some frames")
+        targets.append(values)
+    joints, closed = targets
+    if not np.isfinite(joints).all() or not ((closed > -0.1) & (closed < 1.1)).all():
+        return _say_measured("action/* holds NaN, or grippers that are no share of 0 open .. 1 closed")
+    return joints, readings_of(closed)
+
+
+def _say_measured(reason: str) -> Targets | None:
+    warnings.warn(
+        f"AgiBot: {reason}; measured joints stand in for commands, so `action` says where the robot was a"
+        " frame later and not where it was sent",
+        stacklevel=4,
+    )
+    return None
+
+
+def _in_order(arms: NDArray[np.float32], hands: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Joints [T, 14] and grippers [T, 2] as [L7, Lg, R7, Rg]."""
+    return np.concatenate([arms[:, :7], hands[:, :1], arms[:, 7:], hands[:, 1:]], 1)
 
 
 def _camera(folder: Path, view: str, length: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -127,14 +127,21 @@ class LeRobotDataset:
         """A column of numbers of all episodes, [N, ...] in their order.
 
         Raises:
-            EpisodeError: if there is none of that name.
+            EpisodeError: if there is none of that name, or it is privileged and was not asked for.
         """
+        if name.startswith(PRIVILEGED) and not self.privileged:
+            raise EpisodeError(
+                f"{self.root}: column {name} is asked for, which only physics knows and no robot does. Learn"
+                " from pictures, action and observation.state; pipeline/evaluation opens it with"
+                " privileged=True"
+            )
         parts = []
         for row in self.rows:
             table = self._table(row)[0]
             if name not in table.column_names:
                 raise EpisodeError(
-                    f"{self.root}: there is no column {name}; columns are {table.column_names}"
+                    f"{self.root}: there is no column {name}; record it, or ask for one of"
+                    f" {table.column_names}"
                 )
             parts.append(column_array(table, name).reshape(len(table), *self._shape(name)))
         return np.concatenate(parts)

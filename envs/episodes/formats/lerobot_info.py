@@ -1,11 +1,12 @@
 """A robot in the info.json of a LeRobot v3.0 data set.
 
-Feature names and shapes are most of its description; the rest stands in features.action.info.worldloop, which
-LeRobot's tools carry along, and may be missing.
+Feature names and shapes are most of its description, arms and grippers included where names tell them; the
+rest stands in features.action.info.worldloop, which LeRobot's tools carry along, and may be missing.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from math import prod
@@ -15,6 +16,8 @@ from envs.embodiment import PYTHON, ActionKind, Arm, Camera, Embodiment, Embodim
 
 INFO_KEY = "worldloop"  # of a feature's info, for what LeRobot has no place for
 IMAGE_PREFIX = "observation.images."
+_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+_ARM_JOINTS = ("joint", "waist", "shoulder", "elbow", "wrist", "forearm")
 
 
 def to_info(robot: Embodiment) -> dict[str, Any]:
@@ -64,7 +67,9 @@ def from_info(info: Mapping[str, Any]) -> Embodiment:
             action_names=action,
             action_kind=ActionKind(own.get("action_kind", kind)),
             delta=bool(own.get("delta", delta)),
-            arms=tuple(_arm(**arm) for arm in own.get("arms", ())),
+            arms=tuple(_arm(**arm) for arm in own["arms"])
+            if "arms" in own
+            else guess_arms(action, ActionKind(own.get("action_kind", kind))),
             state_names=state,
             cameras=tuple(
                 Camera(name, _image_size(features[key]), **about.get(name, {}))
@@ -141,6 +146,44 @@ def feature_names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(str(name) for name in names)
 
 
+def guess_arms(names: Sequence[str], kind: ActionKind) -> tuple[Arm, ...]:
+    """The arms and grippers of an action, as far as its names tell; () where they do not.
+
+    left_... and right_... are two arms, names without a side one arm called "arm". Of poses, x y z (roll
+    pitch yaw) belong to an arm; of joints, those named after a joint of an arm, such as left_waist,
+    shoulder_pan.pos or joint_3. What is called gripper is the arm's gripper; whatever else there is, such as
+    a head or wheels, belongs to none.
+    """
+    words = [re.split(r"[^a-z]+", name.lower().replace("delta", "")) for name in names]
+    sides = [next((word for word in parts if word in ("left", "right")), "") for parts in words]
+    found = []
+    for side in dict.fromkeys(side for side in sides if side) or ("",):
+        mine = [k for k in range(len(names)) if sides[k] == side]
+        grippers = [k for k in mine if "gripper" in words[k]]
+        others = [k for k in mine if k not in grippers]
+        numbers = _pose_numbers(others, words) if kind is ActionKind.END_EFFECTOR else ()
+        if kind is ActionKind.JOINTS:
+            numbers = tuple(k for k in others if any(joint in names[k].lower() for joint in _ARM_JOINTS))
+        if not numbers or len(grippers) > 1:
+            return ()
+        gripper = grippers[0] if grippers else None
+        # LeRobot's drivers write a gripper's .pos as 0 closed .. 100 open; else names say no range.
+        percent = gripper is not None and kind is ActionKind.JOINTS and words[gripper][-1] == "pos"
+        found.append(Arm(side or "arm", numbers, gripper, (100.0, 0.0) if percent else (0.0, 1.0)))
+    return tuple(found)
+
+
+def _pose_numbers(places: Sequence[int], words: Sequence[Sequence[str]]) -> tuple[int, ...]:
+    """Which of the places hold x, y, z and, if all three are there, roll, pitch, yaw; () unless each is there
+    once.
+    """
+    at = {axis: [k for k in places if [word for word in words[k] if word][-1:] == [axis]] for axis in _AXES}
+    if any(len(at[axis]) != 1 for axis in _AXES[:3]) or any(len(at[axis]) > 1 for axis in _AXES[3:]):
+        return ()
+    turned = all(at[axis] for axis in _AXES[3:])
+    return tuple(at[axis][0] for axis in (_AXES if turned else _AXES[:3]))
+
+
 def guess_action(names: tuple[str, ...]) -> tuple[ActionKind, bool]:
     """Kind of an action and whether it is a change, as far as its names tell; OTHER where they do not."""
     words = [name.lower() for name in names]
@@ -148,7 +191,7 @@ def guess_action(names: tuple[str, ...]) -> tuple[ActionKind, bool]:
     tails = {word.replace("delta", "").split(".")[-1].split("_")[-1] for word in words}
     if {"x", "y", "z"} <= tails:
         return ActionKind.END_EFFECTOR, delta
-    jointed = ("joint", "waist", "shoulder", "elbow", "wrist", "forearm", "motor", ".pos")
+    jointed = (*_ARM_JOINTS, "motor", ".pos")
     if sum(any(part in word for part in jointed) for word in words) > len(words) // 2:
         return ActionKind.JOINTS, delta
     return ActionKind.OTHER, delta

@@ -137,7 +137,7 @@ def write_set(root: Path, about: FakeSet) -> list[FakeEpisode]:
         for key in about.cameras if about.kind == "video" else ():
             path = root / f"videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
             path.parent.mkdir(parents=True, exist_ok=True)
-            _write_video(path, np.concatenate([episode.frames[key] for episode in made]), about.fps)
+            write_yuv420(path, np.concatenate([episode.frames[key] for episode in made]), about.fps)
     path = root / "meta/episodes/chunk-000/file-000.parquet"
     path.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(pa.Table.from_pylist(rows), path)
@@ -176,7 +176,8 @@ def _table(about: FakeSet, episode: FakeEpisode, number: int, first: int) -> pa.
     return pa.table(columns)
 
 
-def _write_video(path: Path, frames: NDArray[np.uint8], fps: float) -> None:
+def write_yuv420(path: Path, frames: NDArray[np.uint8], fps: float) -> None:
+    """A video uint8 [T, H, W, 3] as LeRobot encodes it, with a quarter of the colour."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=frame_rate(fps), options={"g": "2", "crf": "12"})
         stream.height, stream.width = frames.shape[1:3]

@@ -18,7 +18,7 @@ import torch
 
 from envs.conditioning import PoseMapStyle, end_effector_poses, render_pose_map
 from envs.embodiment import Embodiment
-from envs.episodes import Episode, EpisodeError, LeRobotWriter
+from envs.episodes import Episode, EpisodeError, LeRobotDataset, LeRobotWriter
 from envs.episodes.clips import ClipSpec, ClipStore
 from envs.episodes.privileged import read_privileged
 from envs.episodes.splits import write_splits
@@ -231,6 +231,32 @@ def test_privileged_columns_are_read_apart(dataset: Path, episodes: list[Episode
     assert read is not None and np.array_equal(read.numpy(), np.concatenate([truth, truth]))
     assert read_privileged(store, "centimetres") is None
     assert not any("object" in path.name for path in tmp_path.rglob("*"))
+
+
+def test_a_learner_that_asks_for_a_privileged_column_is_told_why_not(dataset: Path, tmp_path: Path) -> None:
+    store, name = ClipStore([dataset], SPEC, tmp_path), "privileged.object_pose"
+    with pytest.raises(
+        EpisodeError, match=r"'privileged\.object_pose' is asked for; only physics.*Learn from"
+    ):
+        store.arrays[name]
+    assert name not in store.arrays and store.arrays.get(name) is None
+    with pytest.raises(EpisodeError, match=r"privileged\.object_pose is asked for.*privileged=True"):
+        LeRobotDataset(dataset).column(name)
+    assert len(LeRobotDataset(dataset, privileged=True).column(name)) == len(store.arrays["states"])
+
+
+@pytest.mark.parametrize(
+    ("name", "fix"),
+    [("success", r"Record next\.success"), ("c2w", r"calibration\.c2w"), ("sates", r"there are .*'states'")],
+)
+def test_columns_that_a_store_has_not_are_refused_with_the_fix(name: str, fix: str, tmp_path: Path) -> None:
+    writer = LeRobotWriter(tmp_path / "set", ARM_DELTAS.at(SIZE))
+    writer.write([moving_square(ARM_DELTAS, 0, labelled=False)])
+    store = ClipStore([tmp_path / "set"], world_spec(ARM_DELTAS.at(SIZE), SIZE))
+    with pytest.raises(EpisodeError, match=f"column '{name}' is asked for; .*{fix}"):
+        store.arrays[name]
+    with pytest.raises(EpisodeError, match="no column sates; record it"):
+        LeRobotDataset(tmp_path / "set").column("sates")
 
 
 def test_noise_in_privileged_columns_changes_nothing_that_is_learned_from(

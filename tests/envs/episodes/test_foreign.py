@@ -170,7 +170,9 @@ def _agibot(root: Path, length: int = 6) -> Path:
 
 def test_agibot_folders(tmp_path: Path) -> None:
     root = _agibot(tmp_path / "beta")
-    (episode,) = read_foreign(root)
+    with pytest.warns(UserWarning, match="no action/joint/position; measured joints stand in for commands"):
+        (episode,) = read_foreign(root)
+    assert np.array_equal(episode.commands, episode.states)
     assert (episode.instruction, episode.seed) == ("Pickup items", 648642)
     assert episode.frames.shape == (6, 3, 3, 48, 64)
     assert episode.poses is not None and episode.c2w is not None and episode.intrinsic is not None
@@ -180,8 +182,49 @@ def test_agibot_folders(tmp_path: Path) -> None:
     assert episode.c2w[3, 1, 1, 3] == pytest.approx(0.3)
     assert episode.intrinsic[0].tolist() == [[60, 0, 32], [0, 61, 24], [0, 0, 1]]
     (root / "parameters/327/648642/parameters/camera/head_intrinsic_params.json").write_text("{}")
-    with pytest.raises(EpisodeError, match="head_intrinsic_params"):
+    with (
+        pytest.warns(UserWarning, match="measured joints"),
+        pytest.raises(EpisodeError, match="head_intrinsic_params"),
+    ):
         list(read_foreign(root))
+
+
+def test_agibots_targets_are_commands_where_they_cover_every_frame(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    import h5py
+
+    root, length = _agibot(tmp_path / "beta"), 6
+    path = root / "proprio_stats/327/648642/proprio_stats.h5"
+    targets = np.arange(14.0) + 0.1 * np.arange(length)[:, None]
+    with h5py.File(path, "a") as file:
+        file["action/joint/position"] = targets
+        file["action/effector/position"] = np.tile([[0.0, 1.0]], (length, 1))
+        file["action/joint/index"] = np.arange(length)
+    assert convert(root, tmp_path / "lerobot", Cut()) == 1
+    assert not recwarn.list
+    (episode,) = LeRobotDataset(tmp_path / "lerobot")
+    assert np.allclose(episode.commands[:, [*range(7), *range(8, 15)]], targets)
+    assert episode.commands[0, [7, 15]].tolist() == [35.0, 120.0]
+    assert np.array_equal(episode.states[3, :7], np.arange(7))
+    for change, reason in (
+        (lambda file: file.create_dataset("action/joint/index", data=[0, 1, 2]), "no target was sent"),
+        (lambda file: file.create_dataset("action/joint/position", data=np.ones((9, 14))), "every frame"),
+        (lambda file: file.create_dataset("action/effector/position", data=60 * np.ones((6, 2))), "share"),
+    ):
+        with h5py.File(path, "a") as file:
+            kept = {name: np.array(file[name]) for name in ("action/joint/position", "action/joint/index")}
+            kept["action/effector/position"] = np.array(file["action/effector/position"])
+            del file["action"]
+            made = change(file).name[1:]
+            for name in kept.keys() - {made}:
+                file[name] = kept[name]
+        with pytest.warns(UserWarning, match=reason):
+            (episode,) = read_foreign(root)
+        assert np.array_equal(episode.commands, episode.states)
+        with h5py.File(path, "a") as file:
+            del file[made]
+            file[made] = kept[made]
 
 
 def test_damage_is_named(shared: Path, tmp_path: Path) -> None:

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from envs.embodiment import ActionKind, Embodiment, EmbodimentError
-from envs.episodes.formats.lerobot_info import from_info, to_info
+from envs.embodiment import ActionKind, Arm, Embodiment, EmbodimentError
+from envs.episodes.formats.lerobot_info import from_info, guess_action, guess_arms, to_info
 from tests.embodiments import ARM_JOINTS, EMBODIMENTS
 
 
@@ -38,6 +38,35 @@ def test_a_few_keys_written_by_hand_are_enough() -> None:
     found = from_info(described(robot, {**own, "action_kind": "joints"}))
     assert found.action_kind is ActionKind.JOINTS and found.arms[0].gripper is None
     assert found.cameras[0].wrist == "arm" and not found.cameras[0].calibrated
+
+
+@pytest.mark.parametrize(
+    ("names", "arms"),
+    [
+        (("delta_x", "delta_y", "delta_z", "gripper"), (Arm("arm", (0, 1, 2), 3),)),
+        (("gripper", "yaw", "pitch", "roll", "z", "y", "x"), (Arm("arm", (6, 5, 4, 3, 2, 1), 0),)),
+        (("ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz"), (Arm("arm", (0, 1, 2)),)),
+        (
+            ("right_x", "right_y", "right_z", "left_x", "left_y", "left_z", "left_gripper"),
+            (Arm("right", (0, 1, 2)), Arm("left", (3, 4, 5), 6)),
+        ),
+        (("joint_1", "joint_2", "gripper_position"), (Arm("arm", (0, 1), 2),)),
+        (
+            ("arm_shoulder_pan.pos", "arm_elbow_flex.pos", "arm_wrist_roll.pos", "arm_gripper.pos", "x.vel"),
+            (Arm("arm", (0, 1, 2), 3, (100.0, 0.0)),),
+        ),
+        (("left_joint1", "left_gripper", "right_joint1", "right_gripper", "head_joint1"),
+         (Arm("left", (0,), 1), Arm("right", (2,), 3))),
+        (("joint_1", "gripper_left_finger", "gripper_right_finger"), ()),  # sides of one gripper
+        (("joint_1", "joint_2", "gripper_a", "gripper_b"), ()),  # which is the gripper?
+        (("x", "y", "z", "target_x", "target_y", "target_z"), ()),  # which is the pose?
+        (("motor_0", "motor_1"), ()),
+        (("0", "1", "2", "3", "4", "5", "6"), ()),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_arms_are_guessed_where_names_tell(names: tuple[str, ...], arms: tuple[Arm, ...]) -> None:
+    assert guess_arms(names, guess_action(names)[0]) == arms
 
 
 @pytest.mark.parametrize(

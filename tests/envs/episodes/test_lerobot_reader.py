@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from envs.embodiment import ActionKind, Embodiment
+from envs.embodiment import ActionKind, Arm, Embodiment
 from envs.episodes import EpisodeError, LeRobotDataset
 from envs.episodes.clips import ClipSpec, ClipStore
 from envs.specs import WorldSpec
@@ -73,7 +73,31 @@ def test_names_tell_what_actions_are(tmp_path: Path) -> None:
         and kinds["so101"].action_names[0] == "shoulder_pan.pos"
     )
     assert kinds["many_files"].action_kind is ActionKind.OTHER
-    assert not any(robot.commands_poses for robot in kinds.values())  # 14 joints are no two flange poses
+    poses = {name for name, robot in kinds.items() if robot.commands_poses}
+    assert poses == {"single_arm"}  # 14 joints are no two flange poses
+
+
+ARMS = {
+    "single_arm": (Arm("arm", (0, 1, 2, 3, 4, 5), 6),),
+    "aloha": (Arm("left", (0, 1, 2, 3, 4, 5), 6), Arm("right", (7, 8, 9, 10, 11, 12), 13)),
+    "so101": (Arm("arm", (0, 1, 2, 3, 4), 5, (100.0, 0.0)),),
+    "labelled": (Arm("arm", (0, 1, 2, 3, 4, 5), 6),),
+    "images": (Arm("arm", (0, 1, 2, 3, 4, 5), 6),),
+    "pusht": (),
+    "many_files": (),
+}
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_names_tell_arms_and_grippers(name: str, tmp_path: Path) -> None:
+    write_set(tmp_path, SETS[name])
+    assert LeRobotDataset(tmp_path, SIZE).embodiment.arms == ARMS[name]
+    info = json.loads((tmp_path / "meta/info.json").read_text())
+    info["features"]["action"]["info"] = {
+        "worldloop": {"arms": []}
+    }  # what is said goes before what is guessed
+    (tmp_path / "meta/info.json").write_text(json.dumps(info))
+    assert LeRobotDataset(tmp_path, SIZE).embodiment.arms == ()
 
 
 def test_episodes_may_share_files_in_any_way(tmp_path: Path) -> None:

@@ -28,14 +28,14 @@ from tests.moving_square import SIZE, moving_square
 FIELDS = ("commands", "states", "success", "c2w", "intrinsic", "poses", "present")
 
 
-def assert_equal(one: Episode, two: Episode) -> None:
+def assert_equal(one: Episode, two: Episode, apart: float = 2.0) -> None:
     for name in FIELDS:
         mine, theirs = getattr(one, name), getattr(two, name)
         assert (mine is None) == (theirs is None), name
         assert mine is None or np.array_equal(mine, theirs, equal_nan=True), name
     assert one.embodiment == two.embodiment
     assert (one.instruction, one.seed, one.source) == (two.instruction, two.seed, two.source)
-    assert np.abs(one.frames.astype(int) - two.frames).mean() < 2.0  # the video is compressed
+    assert np.abs(one.frames.astype(int) - two.frames).mean() < apart  # the video is compressed
 
 
 def whole_episode(seed: int = 0) -> Episode:

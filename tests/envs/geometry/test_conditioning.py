@@ -137,6 +137,32 @@ def test_grippers_beyond_their_range_take_the_ends_of_the_colour_map() -> None:
     assert shades == [0, 68, 74, 255, 255]
 
 
+@pytest.mark.parametrize("grip", [-0.2, -0.035, 0.0, 0.5, 1.0, 1.03])
+@pytest.mark.parametrize(("arm", "shades"), [(0, "Greens"), (1, "Reds")])
+def test_stray_grippers_are_filled_as_the_released_code_fills_them(
+    grip: float, arm: int, shades: str
+) -> None:
+    """With the colour map at (g * 85 + 35) / 120, whatever g; a reading of 0..1 is not enforced before."""
+    import matplotlib
+
+    def released(value: float) -> list[int]:
+        rgba = matplotlib.colormaps[shades]((value * 85 + 35) / 120)
+        return [int(255 * part) for part in rgba[:3]]
+
+    poses, c2w, intrinsic = scene(1)
+    poses[..., 6] = grip
+    both = poses[:, :1].repeat(1, 2, 1)
+    both[:, 1 - arm, 2] = -10.0  # behind the camera, where nothing is drawn
+    drawn = render_pose_map(both, c2w, intrinsic, (64, 64), PoseMapStyle(cull_behind=True))[0, 0]
+    colours = drawn.flatten(1).T.tolist()
+    assert colours.count(released(grip)) > 20
+    if not 0 <= grip <= 1:  # nobody clamped the reading
+        limit = released(min(max(grip, 0.0), 1.0))
+        assert limit not in colours or limit == released(grip)
+    if grip < 0:
+        assert released(grip) != released(0.0)
+
+
 @pytest.mark.parametrize("name", sorted(EMBODIMENTS))
 def test_action_vectors_of_any_robot(name: str) -> None:
     robot = EMBODIMENTS[name]

@@ -161,6 +161,10 @@ def test_the_page_shows_controls_and_runs_without_physics(inputs: Inputs) -> Non
     controls = {"before": {**entry(40), "paired": None, "physics_episodes": 0}, "filtered BC": row}
     page = build_report({}, inputs, {**result(), "verdict": "gain"}, controls)
     assert "filtered BC" in page and "+10.0" in page and "have not been run" not in page
+    assert "privileged" not in page
+    told = {**controls, "RL in physics": {**row, "note": "rewarded by what is privileged"}}
+    page = build_report({}, inputs, {**result(), "verdict": "gain"}, told)
+    assert page.count("rewarded by what is privileged") == 1
     alone = result(physics_before=None, physics_after=None, paired=None, rounds=[], verdict="imagined")
     assert "no physics to try" in build_report({}, inputs, alone)
 

@@ -1,0 +1,26 @@
+"""What `worldloop controls` says beside its rows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.commands.controls import control_rows, table_text
+from pipeline.config import load_config
+from pipeline.loop import build_loop
+
+
+@pytest.mark.parametrize(("progress", "told"), [("3.0", "progress and success"), ("0.0", "success")])
+def test_rl_in_physics_says_that_its_rewards_are_privileged(progress: str, told: str, tmp_path: Path) -> None:
+    cfg = load_config(["experiment=smoke", f"judge.rewards.progress={progress}"])
+    rows = {row.title: row.note for row in control_rows(cfg, tmp_path, build_loop(cfg, tmp_path))}
+    noted = {title: note for title, note in rows.items() if note}
+    assert set(noted) == {title for title in rows if title.startswith("RL in physics")} and len(noted) == 2
+    assert all(f"suite's true {told}, which are privileged" in note for note in noted.values())
+
+
+def test_the_table_shows_notes() -> None:
+    row = {"successes": 5, "episodes": 10, "low": 0.2, "high": 0.8, "paired": None}
+    loop, physics = table_text({"loop": row, "RL": {**row, "note": "by the suite"}}).splitlines()
+    assert physics.endswith("(by the suite)") and "suite" not in loop

@@ -1,0 +1,110 @@
+"""Data sets in LeRobot's own file layout to finetune on, for the judge, and as starts of episodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from actors.factory import build_judge, build_simulator, build_state_decoder, build_world, open_clips
+from actors.world_config import world_spec
+from envs.initial_states import DecisionPoints, InitialStates
+from envs.specs import CHUNK, IMAGE, STATE
+from envs.targets import ConfigError
+from pipeline.commands.finetune import build_finetune
+from pipeline.config import load_config
+from pipeline.graph.graph import Graph
+from pipeline.loop import build_loop
+from tests.envs.episodes.lerobot_sets import SETS, write_set
+
+
+def config(root: Path, kind: str, *words: str) -> Any:
+    """The smallest loop on one of the seven sets, written under `root`."""
+    write_set(root / "set", SETS[kind])
+    return load_config(
+        [
+            *("experiment=smoke", "track=disabled", f"runs={root}", "task=lerobot"),
+            *(f"task.data=[{root / 'set'}]", "task.size=[32,48]", "task.chunk=2", "task.horizon=4", *words),
+        ]
+    )
+
+
+def smoke(*sections: str) -> tuple[str, ...]:
+    return tuple(f"{section}.fit.{key}" for section in sections for key in ("steps=2", "batch=2"))
+
+
+@pytest.mark.parametrize("kind", ["single_arm", "many_files"])
+def test_finetune_on_a_set_of_lerobots(kind: str, tmp_path: Path) -> None:
+    cfg = config(
+        *(tmp_path, kind, f"finetune.data=[{tmp_path / 'set'}]"),
+        *smoke("finetune.simulator", "finetune.state"),
+    )
+    graph = build_finetune(cfg, tmp_path / "smoke")
+    done = graph.run()
+    assert set(done) == {"simulator", "state"}
+    robot = world_spec(graph.cfg).embodiment
+    about = SETS[kind]
+    assert (robot.robot, robot.fps, len(robot.cameras)) == (about.robot, about.fps, len(about.cameras))
+    trained = build_simulator(graph.cfg, graph.folder("simulator") / "weights.safetensors")
+    torch.manual_seed(cfg["seed"])
+    untrained = build_simulator(graph.cfg).state_dict()
+    tuned = load_file(graph.folder("simulator") / "weights.safetensors")
+    assert any(not torch.equal(untrained[name].to(value.dtype), value) for name, value in tuned.items())
+    decoder = build_state_decoder(graph.cfg, trained, graph.folder("state") / "weights.safetensors")
+    starts = InitialStates.of(open_clips(graph.cfg, [tmp_path / "set"]))
+    world = build_world(graph.cfg, trained, decoder, build_judge(graph.cfg), starts, 2)
+    assert world.rollout(2)["next", STATE].shape == (2, 2, robot.state_dim)
+
+
+@pytest.fixture(scope="module", params=["labelled", "pusht"])
+def judged(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Graph:
+    """The loop up to its judge, on a set that says success."""
+    cfg = config(
+        *(tmp_path_factory.mktemp("judged"), request.param),
+        *smoke("simulator_fit.first", "state_fit.first", "judge_fit.first"),
+    )
+    graph = build_loop(cfg, Path(cfg["runs"]) / "smoke")
+    graph.run(until=("judge-1", "state-1"))
+    return graph
+
+
+def test_the_judge_learns_from_next_success(judged: Graph) -> None:
+    manifests = judged.run(until="judge-1")
+    assert manifests["recordings"]["result"]["labelled"] == 4
+    assert manifests["recordings"]["result"]["successes"] == 3
+    result = manifests["judge-1"]["result"]
+    assert result["generated_frames"] > 0 and 0.0 <= result["threshold"] <= 1.0
+
+
+def test_imagined_episodes_begin_inside_recorded_ones(judged: Graph) -> None:
+    cfg = judged.cfg
+    weights = {name: judged.folder(f"{name}-1") / "weights.safetensors" for name in ("simulator", "state")}
+    simulator = build_simulator(cfg, weights["simulator"])
+    decoder = build_state_decoder(cfg, simulator, weights["state"])
+    judge = build_judge(cfg, judged.folder("judge-1") / "weights.safetensors")
+    store = open_clips(cfg, cfg["task"]["data"])
+    starts = DecisionPoints(store, store.split("train"))
+    chosen = [0, len(starts) - 1, len(starts) // 2]
+    world = build_world(cfg, simulator, decoder, judge, starts, 3)
+    world.base_env.schedule(chosen)
+    begun = world.reset()
+    rows = (store.start[starts.episode] + starts.frame)[chosen]
+    assert rows.unique().numel() == 3 and int(starts.frame[chosen].max()) > 0
+    assert torch.equal(begun[IMAGE], store.frames(rows))
+    assert torch.equal(begun[STATE], store.arrays["states"][rows])
+    begun[CHUNK] = world.action_spec.zero()[CHUNK]
+    after = world.step(begun)["next"]
+    assert after[IMAGE].shape == begun[IMAGE].shape
+    # What two steps of training draw is much like the moment that each episode went on from.
+    apart = (after[IMAGE].int()[:, None] - begun[IMAGE].int()[None]).abs().float().mean((2, 3, 4, 5))
+    assert apart.argmin(1).tolist() == [0, 1, 2]
+    assert bool(torch.isfinite(after["reward"]).all())
+
+
+def test_a_set_without_labels_teaches_no_judge(tmp_path: Path) -> None:
+    cfg = config(tmp_path, "so101", *smoke("simulator_fit.first"))
+    with pytest.raises(ConfigError, match=r"no training episode of the data says; record next\.success"):
+        build_loop(cfg, tmp_path / "smoke").run(until="judge-1")
