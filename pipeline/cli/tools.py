@@ -83,7 +83,7 @@ def inspect(words: Words) -> None:
 
     usage = "say from where to where: worldloop inspect SRC DST [frames=N] [size=[H,W]] [tool_offset=0.15]"
     paths, cut, own = _source_and_cut(words, usage)
-    style = PoseMapStyle(tool_offset=float(own.get("tool_offset", 0.15)))
+    style = PoseMapStyle(**{name: float(own[name]) for name in ("tool_offset",) if name in own})
     for path in draw(paths[0], paths[1], cut, style):
         print(path)
 

@@ -162,7 +162,7 @@ def test_muon_takes_matrices_and_adamw_the_rest() -> None:
 
 def test_unknown_optimisers_are_refused() -> None:
     with pytest.raises(ValueError, match=r"optimiser=sgd must be one of \['adamw', 'muon'\]"):
-        FitConfig(1, optimiser="sgd")
+        FitConfig(1, 32, 1e-3, optimiser="sgd")
 
 
 def test_batches_are_made_while_others_are_learned_from(tmp_path: Path) -> None:
@@ -179,7 +179,7 @@ def test_batches_are_made_while_others_are_learned_from(tmp_path: Path) -> None:
         return net.loss(data, generator)
 
     net, learned = Net(), list[int]()
-    stats = fit("toy", net, batch, loss, FitConfig(6, 8, bf16=False), tmp_path)
+    stats = fit("toy", net, batch, loss, FitConfig(6, 8, 1e-3, bf16=False), tmp_path)
     assert made == [0, 1, 2, 3, 4, 5] and len(learned) == 6
     total = stats["data_seconds"] + stats["compute_seconds"]
     assert stats["samples_per_second"] == pytest.approx(48 / total)
