@@ -14,6 +14,7 @@ from actors.factory import build_judge, build_physics, build_policy, build_simul
 from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
 from envs.files import write_text
+from envs.rng import Purpose, episode_seeds
 from envs.simulators.replay import replay
 from pipeline.evaluation import measurement
 from pipeline.evaluation.by_task import (
@@ -28,7 +29,6 @@ from pipeline.evaluation.judging import episode_success, judge_both, judge_frame
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import PHYSICS, WORLD, Cfg, load_world, open_store
-from pipeline.stages.seeds import Purpose, episode_seeds
 
 EPISODES = "episodes.json"  # of the stage measure
 _SIDE_BY_SIDE = 64  # imagined episodes
