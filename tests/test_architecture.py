@@ -112,6 +112,17 @@ def test_random_numbers_come_from_one_module() -> None:
     assert found == {"envs/rng.py"}
 
 
+def test_files_are_put_in_place_by_one_module() -> None:
+    for path in FILES:
+        if named(path) == "envs/files.py":
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+                owner = getattr(node.func.value, "id", "")
+                assert node.func.attr != "rename", f"{named(path)}:{node.lineno}"
+                assert (owner, node.func.attr) != ("os", "replace"), f"{named(path)}:{node.lineno}"
+
+
 def test_files_are_short_and_say_what_they_are() -> None:
     for path in FILES:
         text = path.read_text()

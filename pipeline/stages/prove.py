@@ -13,7 +13,7 @@ from torch import Tensor
 from actors.factory import build_judge, build_physics, build_policy, build_simulator, build_state_decoder
 from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
-from envs.files import write_text
+from envs.files import write_atomically, write_text
 from envs.rng import Purpose, episode_seeds
 from envs.simulators.replay import replay
 from pipeline.evaluation import measurement
@@ -79,7 +79,7 @@ def evaluate_physics(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     finally:
         env.close()
     kept = {"success": outcome.success, "progress": outcome.progress, "seeds": torch.tensor(seeds)}
-    torch.save(kept, folder / "outcomes.pt")
+    write_atomically(folder / "outcomes.pt", lambda path: torch.save(kept, path))
     return {
         "rate": outcome.rate,
         **rate_entry(outcome.success),
