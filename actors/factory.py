@@ -124,8 +124,8 @@ def build_world(
         batch,
         horizon or task["horizon"],
         ActionMode(task["mode"]),
-        section["shared_noise"],
-        section["bf16"],
+        shared_noise=section["shared_noise"],
+        bf16=section["bf16"],
     )
     transforms = world_transforms(
         world_spec(cfg),

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from envs.physics.pool import available_cores
+from envs.rng import seed_process
 from envs.targets import ConfigError
 
 
@@ -22,7 +23,7 @@ def prepare_process(seed: int, threads: int = 0) -> None:
     # Softmax tails leave gradients too small for normal floats, on which Intel CPUs are ten times slower;
     # threads started later inherit the setting.
     torch.set_flush_denormal(True)
-    torch.manual_seed(seed)
+    seed_process(seed)
     # Threads sum gradients of indexing in any order otherwise: the same seed would give other weights, the
     # sooner the busier the machine is. Where a GPU has no such kernel, torch warns and goes on.
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")

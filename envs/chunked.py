@@ -15,6 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from envs.rng import episode_stream
 from envs.specs import EPISODE, INSTRUCTION_UTF8, TEXT_BYTES, ActionMode, WorldSpec, text_to_bytes
 
 
@@ -58,7 +59,7 @@ class ChunkedEnv(EnvBase):
             )
         super().__init__(device=torch.device(device), batch_size=torch.Size([batch]))
         self.spec, self.horizon, self.mode = spec, horizon, mode
-        self._stream = torch.Generator().manual_seed(seed)
+        self._stream = episode_stream(seed)
         self._queue: deque[int] = deque()
         self._seeds = torch.zeros(batch, dtype=torch.int64)
         self._steps = torch.zeros(batch, dtype=torch.int64)
@@ -117,11 +118,11 @@ class ChunkedEnv(EnvBase):
         self._queue = deque(int(seed) for seed in seeds)
         if self._queue:
             digest = hashlib.sha256(repr(tuple(self._queue)).encode()).digest()
-            self._stream.manual_seed(int.from_bytes(digest[:6], "big"))
+            self._stream = episode_stream(int.from_bytes(digest[:6], "big"))
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
-            self._stream.manual_seed(seed)
+            self._stream = episode_stream(seed)
 
     def _reset_mask(self, tensordict: TensorDictBase | None) -> torch.Tensor:
         mask = None if tensordict is None else tensordict.get("_reset", None)

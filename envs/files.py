@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -65,6 +66,35 @@ def write_json(path: Path, value: Any) -> None:
         ValueError: for NaN and infinite numbers, which JSON does not know.
     """
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def new_neighbour(path: Path) -> Path:
+    """An empty folder beside `path` that no other process has; folders above are made. See `put`.
+
+    Raises:
+        OSError: if nothing can be written there.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+
+
+def put(part: Path, path: Path, stands: Callable[[], bool]) -> None:
+    """Rename a finished neighbour to `path`, where other processes may put theirs at the same time.
+
+    Whoever has files of an older folder there mapped keeps them until he lets go.
+
+    Args:
+        stands: whether what stands at `path` will do; then the neighbour is left as it is.
+    """
+    for _ in range(3):
+        try:
+            part.rename(path)
+            return
+        except OSError:
+            if stands():  # another process was faster
+                return
+            shutil.rmtree(path, ignore_errors=True)
+    part.rename(path)
 
 
 def remove(path: Path) -> None:

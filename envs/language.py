@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from envs.rng import constant_generator
 from envs.specs import TEXT_BYTES, text_to_bytes
 
 BUCKETS = 4096  # rows of the fixed random table that n-grams are hashed into
@@ -46,7 +47,7 @@ class TextEncoder(nn.Module):
     def __init__(self, out_features: int):
         super().__init__()
         self.out_features = out_features
-        draw = torch.Generator().manual_seed(_SEED)
+        draw = constant_generator(_SEED)
         self.register_buffer("table", torch.randn(BUCKETS, FEATURES, generator=draw), persistent=False)
         powers = [1]
         for _ in range(TEXT_BYTES + 2):

@@ -63,9 +63,10 @@ class WorldEnv(ChunkedEnv):
         starts: InitialStates,
         batch: int,
         horizon: int,
-        mode: ActionMode = ActionMode.RELATIVE,
-        shared_noise: bool = False,
-        bf16: bool = True,
+        mode: ActionMode,
+        *,
+        shared_noise: bool,
+        bf16: bool,
         seed: int = 0,
     ):
         spec, device = simulator.spec, simulator.device

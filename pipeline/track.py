@@ -1,4 +1,5 @@
-"""Live experiment tracking: what stages append to metrics.jsonl and media/ goes to one wandb run as it comes.
+"""Live experiment tracking: what stages append to metrics.jsonl and media/ goes to one wandb run as it comes,
+and so does what they learn in parts, by the part's folder (imitation-perception).
 
 metrics.jsonl is always written, by the stages themselves, in whatever process they run. A tracker only reads
 along, so it works for every placement, and a run without it costs nothing: wandb is not even imported.
@@ -17,6 +18,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from tqdm import tqdm
+
+from envs.files import write_json
 
 _PERIOD = 2.0  # seconds between looks at a stage's files
 _STATE = "wandb.json"  # in the run's folder: the run's id, and the last row and the videos already sent
@@ -130,6 +133,8 @@ class WandbTracker:
         """Send the rows and videos of a stage that were not sent yet; trouble with wandb stops no stage."""
         try:
             sent = self._send_rows(name, folder / "metrics.jsonl") + self._send_videos(name, folder / "media")
+            for path in sorted(folder.glob("*/metrics.jsonl")):  # of what a stage learns in parts
+                sent += self._send_rows(f"{name}-{path.parent.name}", path)
             if sent:
                 self._remember()
         except Exception as error:  # tracking must never cost a run
@@ -165,8 +170,7 @@ class WandbTracker:
         return len(new)
 
     def _remember(self) -> None:
-        state = {"id": self._run.id, "rows": self._rows, "videos": sorted(self._videos)}
-        self._file.write_text(json.dumps(state))
+        write_json(self._file, {"id": self._run.id, "rows": self._rows, "videos": sorted(self._videos)})
 
 
 def read_metrics(path: Path) -> list[dict[str, float]]:

@@ -15,14 +15,15 @@ def offered(group: str) -> list[str]:
     return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
 
 
-def section(choice: str, mode: str = "relative", **changes: Any) -> dict[str, Any]:
+def section(choice: str, mode: str = "relative", root: Path = CONFIGS, **changes: Any) -> dict[str, Any]:
     """A choice such as "policy/chunk_gaussian" as plain containers, with keys changed.
 
     Args:
         mode: stands for ${task.mode}; ${cameras} is all.
+        root: of the configs.
         changes: values for keys of the section; of nested sections, dictionaries of what differs there.
     """
-    text = (CONFIGS / f"{choice}.yaml").read_text().replace("${task.mode}", mode)
+    text = (root / f"{choice}.yaml").read_text().replace("${task.mode}", mode)
     text = text.replace("${cameras}", "all")
     return merged(yaml.safe_load(text), changes)
 

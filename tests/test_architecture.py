@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -103,6 +105,29 @@ def test_physics_workers_start_without_torch() -> None:
     for path in FILES:
         if within(path, TORCH_FREE) and not within(path, WITH_TORCH):
             assert "torch" not in imported(path), path
+
+
+def test_physics_workers_load_without_torch() -> None:
+    modules = "envs.rng, envs.physics.worker, envs.physics.tabletop.scenes.suite"
+    code = f"import sys, {modules}; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+def test_random_numbers_come_from_one_module() -> None:
+    makers = {"manual_seed", "default_rng", "SeedSequence", "RandomState", "Philox"}
+    found = {named(path) for path in FILES if makers & set(words(ast.parse(path.read_text())))}
+    assert found == {"envs/rng.py"}
+
+
+def test_files_are_put_in_place_by_one_module() -> None:
+    for path in FILES:
+        if named(path) == "envs/files.py":
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+                owner = getattr(node.func.value, "id", "")
+                assert node.func.attr != "rename", f"{named(path)}:{node.lineno}"
+                assert (owner, node.func.attr) != ("os", "replace"), f"{named(path)}:{node.lineno}"
 
 
 def test_files_are_short_and_say_what_they_are() -> None:

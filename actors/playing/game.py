@@ -14,6 +14,7 @@ from actors.playing.imagination import Imagined, ImaginedSide
 from envs.embodiment import Embodiment
 from envs.initial_states import InitialStates
 from envs.physics.suite import Array, Observation, TaskSuite, check_task, task_of
+from envs.rng import Stream, episode_rng
 
 Starts = Callable[[Observation, NDArray[np.uint8]], InitialStates]
 Driver = Callable[[], Array | None]  # () -> the next action [A], None when there is none
@@ -132,7 +133,7 @@ class Game:
             if self.suite is None:
                 raise Unplayable("the expert needs physics, which this task has not")
             shown = self.reset(self.seed)
-            expert = self.suite.expert(noise_level, np.random.default_rng([self.seed, 1]))
+            expert = self.suite.expert(noise_level, episode_rng(self.seed, Stream.BEHAVIOUR))
             self._driver = expert
         elif to == "recorded":
             if not 0 <= number < len(self.recorded):

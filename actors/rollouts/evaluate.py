@@ -12,6 +12,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from tqdm import tqdm
 
 from actors.policies.safe import SafePolicyWrapper
+from envs.rng import seed_process
 from envs.specs import JUDGE_STATUS, PROGRESS, SUCCESS, Status
 
 
@@ -58,7 +59,7 @@ def evaluate(
     steps = base.horizon // base.chunk
     actor = SafePolicyWrapper(policy, base.spec, base.mode)
     success, progress, judged = [], [], []
-    torch.manual_seed(sampling_seed)
+    seed_process(sampling_seed)
     mode = ExplorationType.RANDOM if stochastic else ExplorationType.DETERMINISTIC
     with set_exploration_type(mode):
         for begin in tqdm(

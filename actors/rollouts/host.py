@@ -35,6 +35,7 @@ from actors.policies.contract import (
 )
 from actors.policies.safe import SafePolicyWrapper
 from actors.rollouts.meter import Meter
+from envs.rng import seed_process
 from envs.specs import (
     CHUNK,
     EPISODE,
@@ -159,7 +160,7 @@ class Host:
         devices = [torch.cuda.current_device()] if device_of(self.policy).type == "cuda" else []
         # In one process with the learner, its random numbers are its own.
         with torch.random.fork_rng(devices=devices), torch.no_grad(), computing_threads(self.threads):
-            torch.manual_seed(job.sampling)
+            seed_process(job.sampling)
             if self._judging is not None:
                 self._judging.forget()
             self.base.schedule(job.seeds)

@@ -30,7 +30,8 @@ _REFERENCE_HEIGHT = 384  # the picture height for which radii and thickness are 
 
 @dataclass(frozen=True)
 class PoseMapStyle:
-    """How a pose map is drawn; the defaults reproduce the released GE-Sim 2.0 code at 384 x 512.
+    """How a pose map is drawn. The defaults are constants of a format: they reproduce the released GE-Sim 2.0
+    code at 384 x 512, which is what a pose map is where nobody says otherwise.
 
     Args:
         tool_offset: metres from wrist to fingertip along the wrist's z (GE-Sim 1: 0.23).

@@ -13,8 +13,8 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from torch import Tensor
 from envs.conditioning import PoseMapStyle, end_effector_poses, render_pose_map
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.formats.lerobot import LeRobotDataset
+from envs.files import new_neighbour, put
 from envs.geometry.cameras import follow_wrists
 from envs.geometry.kinematics import Kinematics
 from envs.manifest import check_part
@@ -84,7 +85,7 @@ def open_cached(folder: Path, spec: WorldSpec, style: PoseMapStyle, chosen: Path
         try:
             check_part(folder.resolve())
             _Builder(folder, spec, style).build(part, stamp)
-            _put(part, place, stamp)
+            put(part, place, partial(_holds, place, stamp))
         finally:
             shutil.rmtree(part, ignore_errors=True)
         return _load(folder, place)
@@ -129,25 +130,11 @@ def _holds(place: Path, stamp: str) -> bool:
 def _new_folder(place: Path) -> Path | None:
     """An empty folder beside `place`, None where nothing can be written."""
     try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        return Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
+        return new_neighbour(place)
     except OSError as error:
         if error.errno == errno.ENOSPC:
             raise
         return None
-
-
-def _put(part: Path, place: Path, stamp: str) -> None:
-    """Rename a finished cache into place; whoever has the older one mapped keeps it until he lets go."""
-    for _ in range(3):
-        try:
-            part.rename(place)
-            return
-        except OSError:
-            if _holds(place, stamp):  # another process was faster
-                return
-            shutil.rmtree(place, ignore_errors=True)
-    part.rename(place)
 
 
 def _load(folder: Path, place: Path) -> CachedSet:

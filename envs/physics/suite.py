@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.embodiment import Embodiment
+from envs.rng import Stream, episode_rng
 from envs.targets import ConfigError, build
 
 Array = NDArray[Any]
@@ -152,7 +153,7 @@ def task_of(tasks: Sequence[str], seed: int) -> str:
 
 def scene_of(scenes: Sequence[str], seed: int) -> str:
     """The scene of an episode, drawn by its seed whatever its task; "" if there are none to draw from."""
-    draw = np.random.default_rng([seed, 3])
+    draw = episode_rng(seed, Stream.SCENE)
     return scenes[int(draw.integers(len(scenes)))] if scenes else ""
 
 

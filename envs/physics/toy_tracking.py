@@ -15,6 +15,7 @@ from torchrl.envs import ToyVLAEnv
 
 from envs.chunked import ChunkedEnv
 from envs.embodiment import ActionKind, Camera, Embodiment
+from envs.rng import constant_generator
 from envs.specs import CHUNK, COMMAND, IMAGE, PROGRESS, STATE, SUCCESS, ActionMode, WorldSpec
 
 _SIZE = 16  # pixels a side
@@ -75,7 +76,7 @@ class ToyTrackingEnv(ChunkedEnv):
             seed=seed,
         )
         self._state = torch.zeros(batch, 2 * actions)
-        self.targets = torch.rand(starts, actions, generator=torch.Generator().manual_seed(targets)) - 0.5
+        self.targets = torch.rand(starts, actions, generator=constant_generator(targets)) - 0.5
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         mask = self._reset_mask(tensordict)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.physics.suite import Array, Observation, TaskSuite, build_suite, check_task, task_of
+from envs.rng import Stream, episode_rng
 from envs.targets import ConfigError
 
 
@@ -148,7 +149,7 @@ class Worker:
         suite = self.slots[0].suite
         for seed, noise_level in jobs:
             self._lay_out(suite, seed)
-            act = suite.expert(noise_level, np.random.default_rng([seed, 1]))
+            act = suite.expert(noise_level, episode_rng(seed, Stream.BEHAVIOUR))
             observed = suite.observe()
             track = Track(seed, observed.instruction, observed.intrinsic)
             track.add(suite, observed)

@@ -35,11 +35,11 @@ class Euler:
 
     Args:
         steps: of the solver.
-        shift: above 1 spends more steps near noise.
+        shift: 1 makes equal steps, more than 1 spends more of them near noise.
     """
 
-    steps: int = 4
-    shift: float = 1.0
+    steps: int
+    shift: float
 
     def __call__(self, velocity: Velocity, noise: Tensor) -> Tensor:
         """See Sampler."""
@@ -57,7 +57,7 @@ class Distilled:
     each time.
 
     Args:
-        sigmas: levels in falling order, below 1 but for the first.
+        sigmas: levels in falling order, below 1 but for the first; the default is the released student's.
     """
 
     sigmas: tuple[float, ...] = DISTILLED
@@ -82,10 +82,10 @@ class Distilled:
 @dataclass(frozen=True)
 class EDM:
     """The undistilled sampler: Euler steps in the variance-exploding frame of Karras et al. 2022, y = x +
-    sigma e.
+    sigma e. The defaults are those of the released GE-Sim 1, which a checkpoint's scheduler may change.
 
     Args:
-        steps: of the solver; GE-Sim 1 uses 15.
+        steps: of the solver.
         sigma_max, sigma_min: noise at the first and at the last step; the last step has no length, as
             released.
         rho: spacing of the levels.

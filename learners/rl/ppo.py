@@ -21,6 +21,7 @@ from torchrl.objectives.value import GAE
 
 from actors.policies.contract import action_key, device_of, input_keys, trained_part, with_text
 from envs.ranges import Count, Discount, Natural, NonNegative, Positive, Share
+from envs.rng import order_generator
 from envs.specs import LOG_PROB, WorldSpec
 from envs.targets import options
 from learners.rl.algorithm import sound, transitions
@@ -133,7 +134,7 @@ class PPO:
         """
         rollout = rollout.to(device_of(self.critic))
         optimiser = torch.optim.Adam(self.critic.parameters(), lr=self.config.critic_lr)
-        shuffle = torch.Generator().manual_seed(seed)
+        shuffle = order_generator(seed)
         valid, explained = rollout["valid"].flatten(), 0.0
         for _ in range(self.config.warmup_passes):
             self._advantages(rollout)

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from actors.policies.contract import device_of
-from envs.rng import step_generator
+from envs.rng import order_generator, step_generator
 from envs.specs import SUCCESS
 from learners.rl.algorithm import Algorithm, RLConfig, finite, first_episode, judged
 from learners.rl.recorded import TrueExperience
@@ -38,7 +38,7 @@ def update(
     batch = batch.to(device_of(algorithm.modules()))
     data, extra = trainee(algorithm.prepare, batch)
     figures |= extra
-    shuffle = torch.Generator().manual_seed(seed)
+    shuffle = order_generator(seed)
     known = None
     if true is not None and true.decisions is not None and config.recorded:
         known = trainee(true.decisions.sample, config.recorded, data, shuffle)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from actors.policies.contract import with_text
 from envs.episodes.clips import ClipStore
+from envs.rng import seed_process
 from envs.specs import ActionMode
 from learners.stages.imitation import Cloning
 from learners.stages.judge import frame_targets
@@ -100,7 +101,7 @@ def train_perception(
     if fresh and hasattr(policy, "normalise"):
         policy.normalise(frames.targets, frames.states)  # type: ignore[operator]
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(options.seed)
+        seed_process(options.seed)
         tasks = PerceptionTasks(policy, (store.spec.chunk, store.spec.action_dim))
     tasks.to(next(policy.parameters()).device)
     tasks.normalise(frames.targets)

@@ -9,7 +9,6 @@ memory, a file at a time.
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor, distribute_tensor
 
-from envs.files import atomic, write_text
+from envs.files import atomic, remove, write_text
 from envs.manifest import hashes
 from learners.training.optimisers import optimiser_state
 from learners.training.parallel import leads, whole, workers
@@ -76,7 +75,7 @@ class Checkpoints:
                 (part / _SUMS).write_text(json.dumps(hashes(part)))
             for path in older:
                 if path != final:
-                    shutil.rmtree(path)
+                    remove(path)  # a half-written one of this very step is gone already
         else:
             for held in tensors.values():
                 gathered(held)
@@ -106,7 +105,7 @@ class Checkpoints:
 def clear_checkpoints(folder: Path) -> None:
     """Remove all checkpoints in and under a folder, once what they led to is kept elsewhere."""
     for path in [*folder.rglob("checkpoint-*"), *folder.rglob(".checkpoint-*")]:
-        shutil.rmtree(path)
+        remove(path)
 
 
 def _check(path: Path) -> None:

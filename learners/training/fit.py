@@ -46,6 +46,8 @@ class TrainingDiverged(RuntimeError):
 class FitConfig:
     """Options of the training loop.
 
+    The config says the first three for every stage, and of the others those that are not as they are here.
+
     Args:
         steps: optimiser steps in all.
         batch: samples per step.
@@ -65,8 +67,8 @@ class FitConfig:
     """
 
     steps: Count
-    batch: Count = 32
-    lr: Positive = 1e-3
+    batch: Count
+    lr: Positive
     warmup: Natural = 50
     weight_decay: NonNegative = 1e-4
     ema: Decay = 0.995

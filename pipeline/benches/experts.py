@@ -16,9 +16,9 @@ from envs.episodes.video import write_video
 from envs.physics.pool import TaskPool, available_cores
 from envs.physics.suite import task_names
 from envs.physics.worker import Track
+from envs.rng import Purpose, episode_seeds
 from pipeline.evaluation.by_task import tasks_of_seeds
 from pipeline.evaluation.statistics import rate, rate_entry, rate_line
-from pipeline.stages.seeds import Purpose, episode_seeds
 
 LEAST = 0.9  # share of episodes in which an expert must succeed
 SHOWN = 3  # failures of a task that are saved as videos

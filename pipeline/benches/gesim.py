@@ -20,6 +20,7 @@ from tensordict import TensorDict
 
 from envs.embodiment import ActionKind, Arm, Camera, Embodiment, Robot
 from envs.precision import mixed_precision
+from envs.rng import constant_generator, seed_process
 from envs.simulators.gesim.engine import GESimulator
 from envs.specs import WorldSpec
 from pipeline.benches.gesim_floor import GOAL, floor
@@ -62,7 +63,7 @@ def build(spec: WorldSpec, net: dict[str, Any], vae: dict[str, Any]) -> GESimula
 def _inputs(world: GESimulator, batch: int, device: torch.device) -> tuple[TensorDict, TensorDict]:
     """Sessions that have begun, and the next chunk's future."""
     spec = world.spec
-    generator = torch.Generator().manual_seed(0)
+    generator = constant_generator(0)
     height, width = spec.size
 
     def pictures(*lead: int) -> torch.Tensor:
@@ -135,7 +136,7 @@ def gesim(cfg: Mapping[str, Any]) -> None:
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     big = device.type == "cuda"
-    torch.manual_seed(0)
+    seed_process(0)
     spec, sizes = (FULL, ({}, {})) if big else (SMALL, (SMALL_NET, SMALL_VAE))
     world = build(spec, *sizes).to(device).eval()
     if big:

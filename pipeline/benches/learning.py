@@ -9,14 +9,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from actors.fleets.fleet import LocalFleet
 from actors.policies.vla import ChunkPolicy
 from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
 from actors.rollouts.host import Host
 from envs.physics.toy_tracking import ToyTrackingEnv
+from envs.rng import seed_process
 from envs.targets import options
 from learners.rl.algorithm import RLConfig
 from learners.rl.grpo import GRPO
@@ -42,7 +41,7 @@ def build(seed: int, envs: int) -> tuple[ChunkPolicy, LocalFleet]:
     """A policy of TinyVLA's size and the task of TorchRL's toy recipe: two actions, chunks of four, 64 tokens
     per number, six decisions, two steps within 0.35.
     """
-    torch.manual_seed(seed)
+    seed_process(seed)
     env = ToyTrackingEnv(envs, seed=seed)
     head = {"_target_": "actors.policies.chunk_tokens.ChunkTokenHead", "bins": 64}
     policy = ChunkPolicy(env.spec, head, width=128, points=8, channels=16, cameras="all")

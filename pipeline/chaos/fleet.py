@@ -25,6 +25,7 @@ from typing import Any
 from tqdm import tqdm
 
 from actors.fleets.fleet import EpisodeLedger
+from envs.files import write_json
 from learners.training.checkpoint import Checkpoints
 
 LEARNER = "pipeline.chaos.learner"
@@ -117,7 +118,7 @@ def run_chaos(cfg: Mapping[str, Any], words: list[str], folder: Path) -> dict[st
                 raise
     report = _check(folder, before)
     report |= {"seconds": section["seconds"], "learner_kills": kills}
-    (folder / "chaos.json").write_text(json.dumps(report, indent=1))
+    write_json(folder / "chaos.json", report)
     return report
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +83,9 @@ def inspect(words: Words) -> None:
 
     usage = "say from where to where: worldloop inspect SRC DST [frames=N] [size=[H,W]] [tool_offset=0.15]"
     paths, cut, own = _source_and_cut(words, usage)
-    style = PoseMapStyle(tool_offset=float(own.get("tool_offset", 0.15)))
+    style = PoseMapStyle()
+    if "tool_offset" in own:
+        style = replace(style, tool_offset=float(own["tool_offset"]))
     for path in draw(paths[0], paths[1], cut, style):
         print(path)
 

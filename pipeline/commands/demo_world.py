@@ -10,13 +10,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import nn
 
 from actors.factory import build_judge, build_policy, build_pool, build_simulator, build_state_decoder
 from actors.rollouts.recipe import Recipe
 from actors.world_config import world_spec
 from envs.episodes import Episode, LeRobotWriter
+from envs.rng import seed_process
 from pipeline.graph.artefact import save_weights
 
 
@@ -27,7 +27,7 @@ def demo_recipe(cfg: Mapping[str, Any], folder: Path, episodes: int, starts: int
     parts = ("policy", "simulator", "decoder", "judge")
     data = folder / "dataset"
     if not (folder / "done").exists():
-        torch.manual_seed(0)
+        seed_process(0)
         pool, robot = build_pool(cfg), world_spec(cfg).embodiment
         try:
             tracks = pool.script([(seed, (seed % 4) / 3) for seed in range(starts)], cfg["task"]["chunk"])

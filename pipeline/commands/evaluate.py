@@ -8,12 +8,12 @@ from typing import Any
 
 from actors.factory import build_physics, build_policy
 from actors.rollouts.evaluate import evaluate
+from envs.rng import Purpose, episode_seeds
 from envs.targets import ConfigError
 from pipeline.evaluation.statistics import rate_entry, rate_line
 from pipeline.graph.graph import Graph
 from pipeline.loop import build_loop
 from pipeline.stages.given import load_world, open_store
-from pipeline.stages.seeds import Purpose, episode_seeds
 
 _SIDE_BY_SIDE = 64  # imagined episodes
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.physics.suite import build_suite, task_names
+from envs.rng import Stream, episode_rng
 from pipeline.config import composed
 from pipeline.evaluation.media import write_gif
 
@@ -71,7 +72,7 @@ def _episode(task: Mapping[str, Any], name: str) -> list[Picture]:
     """All views of an expert's episode side by side, over the words."""
     suite = build_suite(task["suite"])
     suite.reset(name, _SEED)
-    act, frames = suite.expert(0.0, np.random.default_rng([_SEED, 1])), []
+    act, frames = suite.expert(0.0, episode_rng(_SEED, Stream.BEHAVIOUR)), []
     for _ in range(task["horizon"]):
         frames.append(_frame(suite.picture(_GIF), suite.observe().instruction))
         if suite.observe().success:

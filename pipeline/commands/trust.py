@@ -20,6 +20,7 @@ from actors.factory import (
 from actors.policies.safe import SafePolicyWrapper
 from envs.files import write_text
 from envs.initial_states import DecisionPoints
+from envs.rng import order_generator, seed_process
 from envs.targets import ConfigError
 from pipeline.evaluation.branches import agreement, branch
 from pipeline.loop import build_loop, has_physics
@@ -55,7 +56,7 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
     points = DecisionPoints(store, held)
     whole = int(cfg["task"]["horizon"]) // int(cfg["task"]["chunk"])
     some = (points.frame // int(cfg["task"]["chunk"]) <= whole - depth).nonzero().flatten()
-    order = torch.randperm(len(some), generator=torch.Generator().manual_seed(cfg["seed"]))
+    order = torch.randperm(len(some), generator=order_generator(cfg["seed"]))
     which = some[order[:moments]]
     simulator = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
@@ -66,7 +67,7 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
     )
     physics = build_physics(cfg, min(_SIDE_BY_SIDE, len(which) * futures))
     policy = SafePolicyWrapper(build_policy(cfg, inputs.weights("policy")), physics.spec, physics.mode)
-    torch.manual_seed(cfg["seed"])
+    seed_process(cfg["seed"])
     try:
         rows = agreement(branch(world, physics, policy, judge, which, futures), cfg["seed"])
     finally:

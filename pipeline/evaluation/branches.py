@@ -21,6 +21,7 @@ from envs.episodes.clips import ClipStore
 from envs.initial_states import DecisionPoints
 from envs.judges.base import Judge
 from envs.physics.env import PhysicsEnv
+from envs.rng import resampling_generator
 from envs.specs import CHUNK, IMAGE, PROGRESS, SUCCESS, to_chunk
 
 _RESAMPLES = 400  # of the moments, for intervals
@@ -153,7 +154,7 @@ def agreement(branches: Branches, seed: int = 0) -> list[dict[str, list[float]]]
     simulator loses); "judged", that with the outcome (what judge and chance lose); "imagined", imagined
     progress with the outcome. Each [value, low, high], 95% by resampling moments.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = resampling_generator(seed)
     moments, out = len(branches.outcome), []
     draws = torch.randint(moments, (_RESAMPLES, moments), generator=generator)
     for imagined, seen in zip(branches.imagined, branches.seen, strict=True):

@@ -23,6 +23,7 @@ from envs.episodes.write_behind import WriteBehind
 from envs.files import write_text
 from envs.physics.suite import task_names
 from envs.physics.worker import Track
+from envs.rng import Purpose, episode_seeds, order_generator
 from envs.targets import ConfigError
 from pipeline.evaluation.by_task import by_task, tasks_of_episodes, tasks_of_seeds
 from pipeline.evaluation.media import film
@@ -30,7 +31,6 @@ from pipeline.evaluation.statistics import rate_entry
 from pipeline.graph.code_version import digest
 from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.given import DATASETS, PHYSICS, ROBOT, Cfg
-from pipeline.stages.seeds import Purpose, episode_seeds
 
 _SIDE_BY_SIDE = 64  # deployed episodes
 _FILMED = 5  # failures of the expert, at most
@@ -103,7 +103,7 @@ def scripted_jobs(cfg: Cfg) -> list[tuple[int, float, str]]:
     names = [name for name, share in section["mix"].items() for _ in range(round(100 * share))]
     if len(names) != 100:
         raise ConfigError(f"collect.mix={section['mix']} must be whole percents that add up to 1")
-    order = torch.randperm(100, generator=torch.Generator().manual_seed(0)).tolist()
+    order = torch.randperm(100, generator=order_generator(0)).tolist()
     low, high = section["noise_level"]
     turns, jobs = len(task_names(cfg["task"]["name"])), []
     for number, seed in enumerate(episode_seeds(cfg["seed"], Purpose.COLLECT, total)):

@@ -13,7 +13,8 @@ from torch import Tensor
 from actors.factory import build_judge, build_physics, build_policy, build_simulator, build_state_decoder
 from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
-from envs.files import write_text
+from envs.files import write_atomically, write_text
+from envs.rng import Purpose, episode_seeds
 from envs.simulators.replay import replay
 from pipeline.evaluation import measurement
 from pipeline.evaluation.by_task import (
@@ -28,7 +29,6 @@ from pipeline.evaluation.judging import episode_success, judge_both, judge_frame
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import PHYSICS, WORLD, Cfg, load_world, open_store
-from pipeline.stages.seeds import Purpose, episode_seeds
 
 EPISODES = "episodes.json"  # of the stage measure
 _SIDE_BY_SIDE = 64  # imagined episodes
@@ -79,7 +79,7 @@ def evaluate_physics(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     finally:
         env.close()
     kept = {"success": outcome.success, "progress": outcome.progress, "seeds": torch.tensor(seeds)}
-    torch.save(kept, folder / "outcomes.pt")
+    write_atomically(folder / "outcomes.pt", lambda path: torch.save(kept, path))
     return {
         "rate": outcome.rate,
         **rate_entry(outcome.success),

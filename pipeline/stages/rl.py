@@ -15,6 +15,7 @@ from actors.rollouts.recipe import Recipe
 from actors.world_config import rewards_of
 from envs.episodes.clips import ClipStore
 from envs.initial_states import decision_points
+from envs.rng import Purpose, episode_seeds
 from envs.specs import CHUNK
 from envs.targets import ConfigError
 from learners.rl.algorithm import Algorithm
@@ -38,7 +39,6 @@ from pipeline.stages.given import (
     rl_options,
     successful_episodes,
 )
-from pipeline.stages.seeds import Purpose, episode_seeds
 
 LEARNING = ("policy", "algorithm", "rl", "imitation", "microbatches")
 

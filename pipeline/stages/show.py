@@ -21,6 +21,7 @@ from envs.episodes.formats.lerobot_writer import LeRobotWriter
 from envs.files import write_text
 from envs.judges.base import Judge
 from envs.physics.suite import task_names
+from envs.rng import Purpose, episode_seeds
 from envs.simulators.base import Simulator
 from envs.simulators.replay import replay
 from pipeline.evaluation.disagreement import compared, curves, worst
@@ -32,7 +33,6 @@ from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.collect import run_recorded
 from pipeline.stages.given import EVERYTHING, WORLD, Cfg, open_store
 from pipeline.stages.prove import EPISODES
-from pipeline.stages.seeds import Purpose, episode_seeds
 
 WORST = "worst"  # the label of episodes chosen for their disagreement
 

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from actors.factory import build_judge, build_simulator, build_state_decoder
 from actors.process import prepare_process
 from envs.episodes.clips import ClipStore
+from envs.rng import order_generator
 from envs.simulators.base import Simulator
 from envs.targets import ConfigError, options
 from learners.stages.generated import generated_frames
@@ -115,7 +116,7 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
                 f"judge={cfg['judge']['_target_']} learns from success, which no training episode of the data"
                 " says; record next.success, or choose a judge that needs none (judge=...)"
             )
-        shuffled = torch.randperm(len(train), generator=torch.Generator().manual_seed(cfg["seed"]))
+        shuffled = torch.randperm(len(train), generator=order_generator(cfg["seed"]))
         pick = train[shuffled[: section["imagined"]]]
         world = build_simulator(cfg, inputs.weights("simulator"))
         generated = _as_imagined(cfg, world, store, pick)

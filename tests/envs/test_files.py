@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from envs.files import atomic, write_json, write_text
+from envs.files import atomic, new_neighbour, put, write_json, write_text
 
 
 def test_what_stood_there_stays_until_the_new_file_is_whole(tmp_path: Path) -> None:
@@ -36,3 +36,15 @@ def test_errors_name_the_file_and_the_fix(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(tmp_path / "a.json", {"loss": float("nan")})
     assert not (tmp_path / "a.json").exists()
+
+
+def test_the_first_of_several_that_make_the_same_folder_wins(tmp_path: Path) -> None:
+    path, parts = tmp_path / "deep" / "cache", []
+    for number in range(3):
+        parts.append(new_neighbour(tmp_path / "deep" / "cache"))
+        (parts[-1] / "stamp").write_text("new" if number else "old")
+    assert len(set(parts)) == 3
+    for part in parts:
+        put(part, path, lambda: (path / "stamp").read_text() == "new")
+    assert (path / "stamp").read_text() == "new"  # the old one had to go, the second new one was too late
+    assert [part.exists() for part in parts] == [False, False, True]

@@ -28,7 +28,7 @@ def inside(store: ClipStore, batch: int, judge: Fixed, horizon: int) -> Transfor
     simulator, decoder = build_engine("unet_small", store.spec)
     mode = ActionMode.ABSOLUTE if store.spec.embodiment.delta else ActionMode.RELATIVE
     starts = DecisionPoints(store, torch.arange(len(store)))
-    base = WorldEnv(simulator, starts, batch, horizon, mode, bf16=False)
+    base = WorldEnv(simulator, starts, batch, horizon, mode, shared_noise=False, bf16=False)
     return TransformedEnv(base, world_transforms(store.spec, decoder, judge, Rewards(1.0, 1.0)))
 
 

@@ -55,7 +55,7 @@ def world(name: str, batch: int, judge: Judge | None = None, horizon: int = 12) 
     first = first_of(spec, clip(spec, STARTS, simulator.memory_frames))
     starts = InitialStates(first, [f"do task {k}" for k in range(STARTS)])
     mode = ActionMode.ABSOLUTE if spec.embodiment.delta else ActionMode.RELATIVE
-    base = WorldEnv(simulator, starts, batch, horizon, mode, bf16=False)
+    base = WorldEnv(simulator, starts, batch, horizon, mode, shared_noise=False, bf16=False)
     return TransformedEnv(base, world_transforms(spec, decoder, judge or Fixed(0.1), Rewards(1.0, 1.0)))
 
 
@@ -160,4 +160,5 @@ def test_initial_states_of_other_views_are_refused() -> None:
     simulator, _ = build_engine("unet_small", spec)
     first = first_of(other, clip(other, 2, simulator.memory_frames))
     with pytest.raises(ValueError, match="train it on these views"):
-        WorldEnv(simulator, InitialStates(first, ["a", "b"]), 1, 8, ActionMode.ABSOLUTE)
+        starts = InitialStates(first, ["a", "b"])
+        WorldEnv(simulator, starts, 1, 8, ActionMode.ABSOLUTE, shared_noise=False, bf16=False)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
-from envs.targets import ConfigError
+from envs.targets import TARGET, ConfigError, _within, target
 from pipeline.checks import faults
 from pipeline.cli.words import prepared
-from pipeline.config import choices, groups, load_config
+from pipeline.config import CONFIGS, choices, groups, load_config
 from pipeline.loop import build_loop
 
 
@@ -182,3 +184,30 @@ def test_the_loop_without_rl_shares_what_comes_before(tmp_path: Path) -> None:
     shared = {name for name in without.nodes if without.key(name) == loop.key(name)}
     assert {"collect", "imitation", "deploy-1", "simulator-1", "clone-1", "evaluate-before"} <= shared
     assert "rl-1" not in without.nodes and not {"deploy-2", "evaluate-after"} & shared
+
+
+def doubled(kind: Any, section: Mapping[str, Any], key: str) -> Iterator[str]:
+    """Options of a section that its class has a default for, too; classes of other packages have theirs."""
+    parameters = inspect.signature(kind).parameters
+    if kind.__module__.split(".")[0] in ("envs", "actors", "learners", "pipeline"):
+        for name in section.keys() & parameters.keys():
+            if parameters[name].default is not inspect.Parameter.empty:
+                yield f"{key}.{name}: {section[name]} here, {parameters[name].default} in {kind.__name__}"
+    for name, inner in _within(kind).items():
+        if isinstance(section.get(name), Mapping):
+            yield from doubled(inner, section[name], f"{key}.{name}")
+    for name, value in section.items():
+        if isinstance(value, Mapping) and TARGET in value:
+            yield from doubled(target(value, key), value, f"{key}.{name}")
+
+
+@pytest.mark.parametrize(
+    "path", sorted(CONFIGS.glob("*/*.yaml")), ids=lambda path: f"{path.parent.name}/{path.stem}"
+)
+def test_an_option_has_one_default(path: Path) -> None:
+    section = yaml.safe_load(path.read_text())
+    section = section.get("suite") or section
+    if TARGET not in section:
+        return
+    kind = target(section, path.stem)
+    assert not list(doubled(getattr(kind, "config_type", kind), section, path.stem))

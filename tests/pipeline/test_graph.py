@@ -170,11 +170,10 @@ def test_the_import_closure_is_that_of_the_stage() -> None:
     collected = code_of("pipeline.stages.collect", {})
     assert "envs/episodes/clips.py" in collected and "envs/embodiment.py" in collected
     assert "learners/rl/ppo.py" not in collected and "pipeline/evaluation/report.py" not in collected
-    torch = code_of("pipeline.stages.seeds", {"policy": {"_target_": "torchrl.modules.vla.TinyVLA"}})
+    torch = code_of("envs.ranges", {"policy": {"_target_": "torchrl.modules.vla.TinyVLA"}})
     assert set(torch) == {
-        "pipeline/__init__.py",
-        "pipeline/stages/__init__.py",
-        "pipeline/stages/seeds.py",
+        "envs/__init__.py",
+        "envs/ranges.py",
     } | {"torchrl"}
 
 

@@ -23,13 +23,17 @@ LEARNED = ("imitation", "simulator-1", "state-1", "judge-1", "clone-1", "rl-1")
 
 @pytest.mark.slow
 def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
-    words = ("experiment=smoke", f"runs={tmp_path}", "track=disabled")
+    words = ("experiment=smoke", f"runs={tmp_path}", "track=offline")
     out = worldloop(tmp_path, "run", *words)
     assert out.status == 0, out.said[-3000:]
     run = tmp_path / "smoke"
     result = json.loads((run / "result.json").read_text())
     assert result["physics_before"]["episodes"] == 20 and len(result["rounds"]) == 2
-    assert "on-policy" in result["rollout"] and not (run / "wandb.json").exists()
+    assert "on-policy" in result["rollout"]
+    tracked = json.loads((run / "wandb.json").read_text())
+    assert {*LEARNED, "imitation-perception", "clone-1-perception"} <= tracked["rows"].keys()
+    shown = {f"videos/{path.name}" for path in run.glob("stages/videos-*/media/*.mp4")}
+    assert shown and shown <= set(tracked["videos"])
     assert "data:video/mp4" in (run / "report.html").read_text()
     table = worldloop(tmp_path, "compare", str(run), str(run)).said
     assert "| algorithm; seed | PPO; 0 | PPO; 0 |" in table
@@ -43,6 +47,8 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     noted = {title for title, row in rows.items() if row.get("note") == note}
     assert noted == {"RL in physics, equal episodes", "RL in physics, equal steps"}
     assert "equal steps" in (run / "report.html").read_text() and controls.said.count(note) == 2
+    later = json.loads((run / "wandb.json").read_text())["rows"]
+    assert {"rl-in-physics-equal-episodes", "filtered-bc"} <= later.keys() - tracked["rows"].keys()
 
 
 @pytest.mark.slow

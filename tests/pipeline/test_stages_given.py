@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from envs.rng import Purpose, episode_seeds
 from envs.targets import ConfigError
 from pipeline.config import load_config
 from pipeline.evaluation.by_task import tasks_of_seeds
 from pipeline.stages.collect import fingerprint, scripted_jobs, split_counts
-from pipeline.stages.seeds import Purpose, episode_seeds
 
 
 def test_splits_add_up_and_none_is_empty() -> None:

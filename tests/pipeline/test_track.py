@@ -9,9 +9,11 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipeline import track
+from pipeline.evaluation.media import paired_video
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, stage
 from pipeline.graph.view import ConfigView
@@ -60,6 +62,30 @@ def test_rows_appear_before_the_stage_ends(tmp_path: Path, monkeypatch: pytest.M
         graph.run(tracker=tracker)
         assert isinstance(tracker, WandbTracker) and tracker._run.id == state["id"]
     assert json.loads((tmp_path / "wandb.json").read_text()) == state
+
+
+@stage(reads=("name",))
+def filming(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """Learn in a part of the stage, and show two videos."""
+    (folder / "part").mkdir()
+    (folder / "part/metrics.jsonl").write_text('{"step": 3, "part/loss": 0.5}\n')
+    for number in range(2):
+        frames = [np.full((32, 48, 3), 40 * step, np.uint8) for step in range(4)]
+        paired_video(folder / f"media/before-{number}.mp4", frames, 10.0)
+    return {}
+
+
+def test_videos_and_parts_of_a_stage_are_tracked_once(tmp_path: Path) -> None:
+    graph = Graph(CFG, tmp_path / "stages")
+    graph.add("videos", filming)
+    for _ in range(2):
+        with tracking(CFG, tmp_path) as tracker:
+            graph.run(tracker=tracker)
+        state = json.loads((tmp_path / "wandb.json").read_text())
+        assert state["videos"] == ["videos/before-0.mp4", "videos/before-1.mp4"]
+        assert state["rows"] == {"videos-part": 3}
+        sent = [path for path in tmp_path.rglob("*.mp4") if "wandb" in path.parts]
+        assert len(sent) == 2 and all(path.stat().st_size > 0 for path in sent)
 
 
 def test_disabled_imports_nothing(tmp_path: Path) -> None:

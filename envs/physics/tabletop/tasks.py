@@ -18,6 +18,7 @@ from envs.physics.suite import check_noise_level
 from envs.physics.tabletop.bench import Goal
 from envs.physics.tabletop.experts import Drifting, FingertipExpert, PushExpert, WaypointWalk
 from envs.physics.tabletop.scene import ROBOT_FILE
+from envs.rng import Stream, episode_rng
 
 Array = NDArray[np.float64]
 BLOCK_COLOURS = {
@@ -56,7 +57,7 @@ class TabletopTask(Goal):
     def reset(self, seed: int) -> Start:
         """Lay out the start that a seed draws; the same seed gives the same, bit for bit."""
         mujoco.mj_resetData(self.model, self.data)
-        start = self.begin(self.model, self.data, np.random.default_rng(seed))
+        start = self.begin(self.model, self.data, episode_rng(seed, Stream.START))
         self.model.geom("table").rgba[:3] = start.table_rgb
         return start
 

@@ -111,7 +111,7 @@ class DiTSimulator(LatentWorld):
         spec: WorldSpec,
         memory_frames: Count,
         net: Annotated[dict[str, int], OptionsOf(Trunk)],
-        codec: dict[str, Count],
+        codec: Annotated[dict[str, int], OptionsOf(Autoencoder)],
         denoising: Annotated[dict[str, Any], OptionsOf(Denoising)],
     ):
         vector, tokenizer = ActionVector(spec.embodiment), Autoencoder(**codec)

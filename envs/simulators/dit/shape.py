@@ -14,6 +14,9 @@ _BASE_FPS = 24.0
 class DiTShape:
     """Size of the network; names follow the public configuration.
 
+    The defaults are constants of a format, the released GE-Sim 2.0; a checkpoint says what differs.
+    DiTSimulator names every size of its own (engine.py, Trunk).
+
     Args:
         in_channels: latent + pose map + ray map + memory mask; the padding mask is added inside.
         out_channels: latent channels.

@@ -138,6 +138,7 @@ class GESimulator(LatentWorld):
         if parity not in PARITY:
             raise ValueError(f"simulator.parity={parity!r} must be one of {list(PARITY)}")
         options, chosen = Training(**training), Sampling(**sampling)
+        prompt: Tensor | None
         if checkpoint:
             released = load_released(Path(checkpoint))
             net, codec, prompt = released.net, released.codec, released.prompt
@@ -145,7 +146,8 @@ class GESimulator(LatentWorld):
             _check(checkpoint, net.shape, spec)
         else:
             net, codec = _from_nothing(spec, **scratch)
-            prompt, sampler = torch.zeros(1, 1, net.shape.text_embed_dim), chosen.sampler(EDM(), True)
+            text = net.shape.text_embed_dim  # a prompt of zeros costs what a real one does, and says nothing
+            prompt, sampler = torch.zeros(1, 1, text) if text else None, chosen.sampler(EDM(), True)
         diffusion = Diffusion(sampler, Velocity(), 1.0, options.shift, options.foreground, options.augment)
         super().__init__(spec, memory_frames, net, codec, diffusion, prompt)
         self.parity, net.checkpointing = PARITY[parity], options.checkpointing

@@ -223,7 +223,7 @@ class StateExpert(FlowStateDecoder):
             pose_attention_head_dim=head_dim,
         )
         ahead = simulator.feature_shape[1] * simulator.ahead // (simulator.memory_frames + simulator.ahead)
-        super().__init__(simulator, StateDiT(shape), Euler(steps), TIME_SCALE, Clean(), read_last=ahead)
+        super().__init__(simulator, StateDiT(shape), Euler(steps, 1.0), TIME_SCALE, Clean(), read_last=ahead)
 
     def _cost(self, error: Tensor) -> Tensor:
         # A few that are far off should not hide that most could be nearer.

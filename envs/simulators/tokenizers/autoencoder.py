@@ -8,6 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from envs.ranges import Count
+
 STRIDE = 8
 
 
@@ -80,7 +82,7 @@ class Autoencoder(Codec):
     latent_mean: Tensor
     latent_std: Tensor
 
-    def __init__(self, channels: int = 16, width: int = 128):
+    def __init__(self, channels: Count, width: Count):
         super().__init__()
         self.channels = channels
         self.encoder = nn.Sequential(

@@ -62,7 +62,7 @@ def imagination(robot: Embodiment, judge: Judge | None = None) -> ImaginedSide:
     spec = world_spec(robot)
     simulator, decoder = build_engine("unet_small", spec)
     mode = ActionMode.ABSOLUTE if robot.delta else ActionMode.RELATIVE
-    base = WorldEnv(simulator, beginning(robot, spec), 1, 8, mode, bf16=False)
+    base = WorldEnv(simulator, beginning(robot, spec), 1, 8, mode, shared_noise=False, bf16=False)
     chain = world_transforms(spec, decoder, judge or Fixed(0.25), Rewards(1.0, 1.0))
     return ImaginedSide(TransformedEnv(base, chain))
 

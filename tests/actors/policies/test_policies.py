@@ -16,6 +16,7 @@ from actors.policies.contract import (
     disagreement,
     distribution,
     imitation_loss,
+    input_keys,
     inputs_for,
     trained_part,
     with_text,
@@ -31,6 +32,7 @@ from envs.specs import (
     INSTRUCTION_UTF8,
     INVALID_ACTION,
     LOG_PROB,
+    STATE,
     ActionMode,
     WorldSpec,
     bytes_to_text,
@@ -41,6 +43,7 @@ from tests.sections import offered, section
 
 SMALL: dict[str, dict[str, Any]] = {"chunk_gaussian": {"width": 32}, "chunk_tokens": {"width": 32}}
 POLICIES = [name for name in offered("policy") if name != "openpi"]  # that one needs a server
+MAIN_VIEW_ALONE = ("tiny_vla",)  # all others look at every view
 
 
 def policy_of(name: str, spec: WorldSpec, mode: str = "relative") -> TensorDictModuleBase:
@@ -76,26 +79,81 @@ def test_writes_chunks_of_the_robot_and_scores_them_as_written(name: str, robot:
     assert torch.equal(one, two)
 
 
+def said(policy: TensorDictModuleBase, observed: TensorDict, action: torch.Tensor) -> torch.Tensor:
+    """How likely a policy finds an action [B, ...] on these observations, [B]."""
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        seen = policy(inputs_for(observed, policy))
+        return distribution(trained_part(policy), seen).log_prob(action)
+
+
+def likeliest(policy: TensorDictModuleBase, observed: TensorDict) -> torch.Tensor:
+    """What a policy does, as it is scored: chunks or tokens."""
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        return policy(inputs_for(observed, policy))[action_key(policy)]  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("robot", [ARM_DELTAS, BIMANUAL_POSES], ids=lambda robot: robot.robot)
 @pytest.mark.parametrize("name", POLICIES)
-def test_every_view_word_and_state_matters(name: str) -> None:
-    spec = world_spec(ARM_DELTAS)
+def test_every_view_word_and_state_matters(name: str, robot: Embodiment) -> None:
+    spec = world_spec(robot)
     policy = policy_of(name, spec, "absolute")
     seen = observations(spec, 4)
-    key = action_key(policy)
+    action = likeliest(policy, seen)
+    score = said(policy, seen, action)
 
-    def score(changed: TensorDict) -> torch.Tensor:
-        with torch.no_grad():
-            return distribution(trained_part(policy), policy(inputs_for(changed, policy))).log_prob(action)
+    def matters(other: TensorDict) -> bool:
+        same = torch.equal(likeliest(policy, other), action) and torch.equal(
+            said(policy, other, action), score
+        )
+        return not same
 
-    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        action = policy(inputs_for(seen, policy))[key]
-        before = score(seen)
-        main = seen.clone()
-        main[IMAGE][:, spec.embodiment.main_view] = 255 - main[IMAGE][:, spec.embodiment.main_view]
-        words = seen.clone()
-        words[INSTRUCTION_UTF8] = words[INSTRUCTION_UTF8].roll(1, 0)
-        assert not torch.allclose(score(main), before)
-        assert not torch.allclose(score(words), before)
+    assert not matters(seen.clone())
+    for view in range(spec.views):
+        other = seen.clone()
+        other[IMAGE][:, view] = 255 - other[IMAGE][:, view]
+        looked_at = view == robot.main_view or name not in MAIN_VIEW_ALONE
+        assert matters(other) == looked_at, f"view {view}"
+    words = seen.clone()
+    words[INSTRUCTION_UTF8] = words[INSTRUCTION_UTF8].roll(1, 0)
+    assert matters(words)
+    for number in range(spec.state_dim):
+        moved = seen.clone()
+        moved[STATE][:, number] += 1.0
+        assert matters(moved), f"state {number}"
+
+
+@pytest.mark.parametrize("robot", EMBODIMENTS.values(), ids=list(EMBODIMENTS))
+@pytest.mark.parametrize("name", POLICIES)
+def test_acts_the_same_in_any_slot_of_any_batch(name: str, robot: Embodiment) -> None:
+    spec = world_spec(robot)
+    policy = policy_of(name, spec, "absolute")
+    seen = observations(spec, 4)
+    action = likeliest(policy, seen)
+    score = said(policy, seen, action)
+    assert torch.equal(likeliest(policy, seen.flip(0)).flip(0), action)
+    assert torch.equal(said(policy, seen.flip(0), action.flip(0)).flip(0), score)
+    others = seen.clone()
+    others[[0, 2, 3]] = observations(spec, 3, seed=1)
+    assert torch.equal(likeliest(policy, others)[1], action[1])
+    assert torch.equal(said(policy, others, action)[1], score[1])
+    # Other batch sizes may choose other kernels, which sum in another order.
+    assert torch.allclose(said(policy, seen[1:2], action[1:2]), score[1:2], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("robot", EMBODIMENTS.values(), ids=list(EMBODIMENTS))
+@pytest.mark.parametrize("name", POLICIES)
+def test_log_probabilities_reach_every_weight(name: str, robot: Embodiment) -> None:
+    spec = world_spec(robot)
+    policy = policy_of(name, spec, "absolute")
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            if not parameter.any():  # what begins at zero keeps gradients from what stands before it
+                parameter.normal_(std=0.05)
+    out = acted(policy, spec, ActionMode.ABSOLUTE)
+    scored = distribution(policy, out.select(*input_keys(policy), action_key(policy)))
+    scored.log_prob(out[action_key(policy)]).sum().backward()
+    unused = [key for key, p in policy.named_parameters() if p.grad is None or not bool(p.grad.any())]
+    assert not unused
 
 
 @pytest.mark.parametrize("name", POLICIES)

@@ -1,25 +1,63 @@
-"""What every judge that configs offer must do, for every robot."""
+"""What every judge that configs offer must do, for every robot; the example's judge among them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cv2
+import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from envs.embodiment import Embodiment
-from envs.judges import Judge
-from envs.specs import Status, WorldSpec
+from envs.judges import Judge, Judgement, RuleJudge
+from envs.specs import Status, WorldSpec, text_to_bytes
 from envs.targets import build
 from tests.embodiments import EMBODIMENTS, INSTRUCTIONS, world_spec
-from tests.sections import offered, section
+from tests.sections import CONFIGS, offered, section
+
+EXAMPLES = CONFIGS.parent / "examples/configs"
 
 
-@pytest.fixture(params=offered("judge"))
-def options(request: pytest.FixtureRequest) -> dict[str, object]:
-    """The options of a judge."""
-    options = section(f"judge/{request.param}")
-    options.pop("rewards", None)  # of the environment that asks the judge
-    return options
+@contextmanager
+def goal() -> Iterator[dict[str, Any]]:
+    """A grey goal picture."""
+    with TemporaryDirectory() as folder:
+        path = str(Path(folder) / "goal.png")
+        cv2.imwrite(path, np.full((40, 40, 3), 200, np.uint8))
+        yield {"picture": path}
+
+
+# What a judge needs that is not in its config, a file or a server: while the context lasts it is there, at
+# the options that the context gives. A judge that is not named here is built as its config says.
+SURROUNDINGS: dict[str, Callable[[], AbstractContextManager[dict[str, Any]]]] = {"goal_picture": goal}
+# What a judge does not look at, and says so; all others look at everything.
+IGNORES: dict[str, tuple[str, ...]] = {"goal_picture": ("instruction", "other views")}
+JUDGES = {name: CONFIGS for name in offered("judge")} | {
+    path.stem: EXAMPLES for path in (EXAMPLES / "judge").glob("*.yaml")
+}
+
+
+@pytest.fixture(scope="module", params=JUDGES)
+def name(request: pytest.FixtureRequest) -> str:
+    """Of a judge."""
+    return str(request.param)
+
+
+@pytest.fixture(scope="module")
+def options(name: str) -> Iterator[dict[str, Any]]:
+    """The options of a judge, with what it needs around it."""
+    with SURROUNDINGS.get(name, partial(nullcontext, {}))() as around:
+        options = section(f"judge/{name}", root=JUDGES[name], **around)
+        options.pop("rewards", None)  # of the environment that asks the judge
+        yield options
 
 
 @pytest.fixture(params=EMBODIMENTS.values(), ids=EMBODIMENTS)
@@ -30,7 +68,7 @@ def spec(request: pytest.FixtureRequest) -> WorldSpec:
 
 
 @pytest.fixture
-def judge(options: dict[str, object], spec: WorldSpec) -> Judge:
+def judge(options: dict[str, Any], spec: WorldSpec) -> Judge:
     """The judge with random weights."""
     torch.manual_seed(0)
     return build(options, "judge", spec=spec).eval()  # type: ignore[no-any-return]
@@ -52,11 +90,45 @@ def test_judgements_are_probabilities_in_every_frame(judge: Judge, spec: WorldSp
         assert 0 <= float(value.min()) <= float(value.max()) <= 1
 
 
+def same(one: Judgement, other: Judgement) -> bool:
+    return all(torch.equal(mine, theirs) for mine, theirs in zip(one, other, strict=True))
+
+
+def rows(judgement: Judgement, at: slice) -> Judgement:
+    return Judgement(*(value[at] for value in judgement))
+
+
 def test_a_judgement_does_not_depend_on_the_rest_of_the_batch(judge: Judge, spec: WorldSpec) -> None:
     frames, first, texts = clips(spec, 3, 4)
-    together, alone = judge.score(frames, first, texts), judge.score(frames[1:2], first[1:2], texts[1:2])
-    assert torch.allclose(together.success[1:2], alone.success, atol=1e-5)
-    assert torch.allclose(together.progress[1:2], alone.progress, atol=1e-5)
+    together = judge.score(frames, first, texts)
+    turned = judge.score(frames.flip(0), first.flip(0), texts[::-1])
+    assert same(Judgement(*(value.flip(0) for value in turned)), together)
+    frames, first = frames.clone(), first.clone()
+    frames[[0, 2]], first[[0, 2]] = 255 - frames[[0, 2]], 99
+    others = ["stop", texts[1], "put the small green cube that lies beside the drawer onto the plate"]
+    assert same(rows(judge.score(frames, first, others), slice(1, 2)), rows(together, slice(1, 2)))
+    alone = judge.score(frames[1:2], first[1:2], texts[1:2])
+    # Other batch sizes may choose other kernels, which sum in another order.
+    assert torch.allclose(alone.success, together.success[1:2], atol=1e-5)
+    assert torch.allclose(alone.progress, together.progress[1:2], atol=1e-5)
+
+
+def test_every_weight_is_learned_or_at_least_used(judge: Judge, spec: WorldSpec) -> None:
+    """What is trained gets a gradient from the loss; what is frozen changes the judgement when it changes."""
+    frames, first, texts = clips(spec, 6, 1)
+    trained = [(key, value) for key, value in judge.named_parameters() if value.requires_grad]
+    frozen = [(key, value) for key, value in judge.named_parameters() if not value.requires_grad]
+    if trained:
+        data = TensorDict({"frames": frames[:, 0], "first": first.flip(0), "text": text_to_bytes(texts)}, [6])
+        data["label"], data["progress"] = torch.tensor([0.0, 1.0] * 3), torch.linspace(0, 1, 6)
+        judge.loss(data, 0.5)[0].backward()
+        assert not [key for key, value in trained if value.grad is None or not bool(value.grad.any())]
+    before = judge.score(frames, first, texts)
+    for key, value in frozen:
+        kept = value.detach().clone()
+        value.copy_(kept + torch.randn(kept.shape, generator=torch.Generator().manual_seed(0)))
+        assert not same(judge.score(frames, first, texts), before), f"{key} is used for nothing"
+        value.copy_(kept)
 
 
 def test_what_is_submitted_is_fetched(judge: Judge, spec: WorldSpec) -> None:
@@ -64,22 +136,35 @@ def test_what_is_submitted_is_fetched(judge: Judge, spec: WorldSpec) -> None:
     assert torch.equal(judge.fetch(judge.submit(*given)).success, judge.score(*given).success)
 
 
-def test_first_frame_instruction_and_every_view_matter(judge: Judge, spec: WorldSpec) -> None:
+def test_first_frame_instruction_and_every_view_matter(name: str, judge: Judge, spec: WorldSpec) -> None:
     frames, first, texts = clips(spec, 2, 3)
-    scores = judge.score(frames, first, texts).success
-    assert not torch.equal(judge.score(frames, 255 - first, texts).success, scores)
-    assert not torch.equal(judge.score(frames, first, texts[::-1]).success, scores)
+    scores, ignored = judge.score(frames, first, texts), IGNORES.get(name, ())
+    assert not same(judge.score(frames, 255 - first, texts), scores)
+    assert same(judge.score(frames, first, texts[::-1]), scores) == ("instruction" in ignored)
     for view in range(spec.views):
         other = frames.clone()
         other[:, :, view] = 255 - other[:, :, view]
-        assert not torch.equal(judge.score(other, first, texts).success, scores)
+        unseen = "other views" in ignored and view != spec.embodiment.main_view
+        assert same(judge.score(other, first, texts), scores) == unseen
 
 
 def test_a_judge_of_nan_says_error(judge: Judge, spec: WorldSpec) -> None:
-    with torch.no_grad():
-        for parameter in judge.parameters():
-            parameter.fill_(torch.nan)
+    numbers = [*judge.parameters(), *(value for value in judge.buffers() if value is not judge.threshold)]
+    for value in numbers:
+        if value.is_floating_point():
+            value.detach().fill_(torch.nan)
     assert bool((judge.score(*clips(spec, 2, 3)).status == Status.ERROR.value).all())
+
+
+def test_the_rule_has_no_weights_and_judges_each_episode_by_itself() -> None:
+    judge = RuleJudge(hold=1)
+    assert not list(judge.parameters())
+    generator = torch.Generator().manual_seed(0)
+    progress = torch.rand(4, 5, generator=generator)
+    together = judge.judgement(progress > 0.7, progress)
+    for slot in range(4):
+        at = slice(slot, slot + 1)
+        assert same(judge.judgement(progress[at] > 0.7, progress[at]), rows(together, at))
 
 
 def test_streaks_run_across_chunks_and_break(judge: Judge) -> None:

@@ -1,11 +1,11 @@
 """Every engine that configs offer, for every robot: the same in any slot, resumable, learning, no idle
-weights.
+weights, under any conditioning that it can be given.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import product
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,29 +14,54 @@ import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 
+from envs.embodiment import Embodiment, Robot
 from envs.simulators import memory
 from envs.simulators.base import WORLD_OPTIONS, Simulator
 from envs.simulators.inputs import build_inputs
 from envs.simulators.state_experts.base import StateDecoder
 from envs.specs import WorldSpec
-from envs.targets import build
-from tests.embodiments import EMBODIMENTS, world_spec
+from envs.targets import ConfigError, build
+from tests.embodiments import BIMANUAL_JOINTS, BIMANUAL_POSES, EMBODIMENTS, world_spec
 from tests.envs.simulators.clips import clip, first_of, future_of
+from tests.sections import offered
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs/simulator"
-SMALL = sorted(path.stem for path in CONFIGS.glob("*_small.yaml"))
 BATCH = 3
+CHUNK = 5  # 1 + 4 k, as GE-Sim's autoencoder wants it
+# It generates nothing: a server does, whose engine is tested here; tests/actors/test_remote.py has the rest.
+SERVED = ("remote",)
+# Conditioned on pose and ray maps alone, as released: whoever cannot draw them is refused.
+MAPS_ALONE = ("gesim_tiny",)
+# What its kinematics are does not matter where pose maps are given.
+_KINEMATICS = Robot("robot.urdf", (("a",) * 7, ("b",) * 7), ("left", "right"))
+ROBOTS = EMBODIMENTS | {BIMANUAL_JOINTS.robot: replace(BIMANUAL_JOINTS, kinematics=_KINEMATICS)}
+
+
+def parents_of(name: str) -> list[str]:
+    """The configs of configs/simulator that one builds on."""
+    return [base for base in OmegaConf.load(CONFIGS / f"{name}.yaml").get("defaults", []) if base != "_self_"]
+
+
+def engines() -> list[str]:
+    """What configs/simulator offers: of an engine with a config that builds on another's, the smaller one."""
+    names = [name for name in offered("simulator") if name not in SERVED]
+    larger = {parent for name in names for parent in parents_of(name)}
+    return [name for name in names if name not in larger]
+
+
+ENGINES = engines()
+DRAWN = [name for name, robot in ROBOTS.items() if robot.calibrated and robot.commands_poses]
+SERVES = [(name, robot) for name in ENGINES for robot in (DRAWN if name in MAPS_ALONE else ROBOTS)]
 
 
 def section_of(name: str) -> dict[str, Any]:
     """A config of configs/simulator with the one it builds on."""
     own = OmegaConf.load(CONFIGS / f"{name}.yaml")
-    parents = [
-        OmegaConf.load(CONFIGS / f"{base}.yaml") for base in own.pop("defaults", []) if base != "_self_"
-    ]
-    out = OmegaConf.to_container(OmegaConf.merge(*parents, own))
-    assert isinstance(out, dict)
-    return {str(key): value for key, value in out.items()}
+    own.pop("defaults", None)
+    parents = [OmegaConf.load(CONFIGS / f"{base}.yaml") for base in parents_of(name)]
+    whole = OmegaConf.create({"simulator": OmegaConf.merge(*parents, own)})
+    out = OmegaConf.to_container(whole, resolve=True)
+    return {str(key): value for key, value in out["simulator"].items()}  # type: ignore[call-overload, index]
 
 
 def build_engine(name: str, spec: WorldSpec) -> tuple[Simulator, StateDecoder]:
@@ -54,10 +79,10 @@ def build_engine(name: str, spec: WorldSpec) -> tuple[Simulator, StateDecoder]:
     return simulator.eval(), decoder.eval()
 
 
-@pytest.fixture(scope="module", params=list(product(SMALL, sorted(EMBODIMENTS))), ids="-".join)
+@pytest.fixture(scope="module", params=SERVES, ids="-".join)
 def engine(request: pytest.FixtureRequest) -> Iterator[tuple[Simulator, StateDecoder]]:
     name, robot = request.param
-    yield build_engine(name, world_spec(EMBODIMENTS[robot]))
+    yield build_engine(name, world_spec(ROBOTS[robot], chunk=CHUNK))
 
 
 def run(simulator: Simulator, clips: TensorDict, seeds: torch.Tensor, chunks: int) -> torch.Tensor:
@@ -113,6 +138,44 @@ def test_a_partial_reset_leaves_the_others_alone(engine: tuple[Simulator, StateD
     assert torch.equal(frames[1], whole[1, : spec.chunk])
 
 
+def test_a_resumed_session_goes_on_as_the_one_that_went_there(engine: tuple[Simulator, StateDecoder]) -> None:
+    simulator, _ = engine
+    spec = simulator.spec
+    clips, seeds = clip(spec, BATCH, simulator.memory_frames, chunks=3), torch.tensor([4, 5, 6])
+    state = simulator.reset(first_of(spec, clips), seeds)
+    for number in range(2):
+        _, _, state = simulator.step(state, future_of(spec, clips, number))
+    length = torch.full_like(seeds, 1 + 2 * spec.chunk)
+    names = {"commands": "command", "states": "state"}
+    past = TensorDict(
+        {names.get(name, name): value.clone() for name, value in state["history"].items()},
+        state["history"].shape,
+    )
+    past["frames"][:, int(length[0]) :] = 77  # beyond the length anything may stand
+    if "intrinsic" in state.keys():
+        past["intrinsic"] = state["intrinsic"][:, None].expand(-1, past.shape[1], -1, -1, -1)
+    resumed = simulator.resume(past, length, seeds)
+    assert resumed["chunk_index"].tolist() == [0] * BATCH  # noise is counted from where imagination begins
+    resumed["chunk_index"] = state["chunk_index"].clone()
+    future = future_of(spec, clips, 2)
+    went, come = simulator.step(state, future), simulator.step(resumed, future)
+    assert torch.equal(come[0], went[0]) and torch.equal(come[1], went[1])
+    assert torch.equal(come[2]["length"], went[2]["length"])
+    for name, value in memory.newest(went[2]).items():
+        assert torch.equal(memory.newest(come[2])[name], value), name
+
+
+def test_a_session_resumed_from_one_frame_is_a_new_one(engine: tuple[Simulator, StateDecoder]) -> None:
+    simulator, _ = engine
+    spec, seeds = simulator.spec, torch.tensor([4, 5, 6])
+    clips = clip(spec, BATCH, simulator.memory_frames)
+    first, future = first_of(spec, clips), future_of(spec, clips)
+    begun = simulator.step(simulator.reset(first, seeds), future)
+    one = torch.ones(BATCH, dtype=torch.int64)
+    resumed = simulator.step(simulator.resume(first.unsqueeze(1), one, seeds, 40), future)
+    assert torch.equal(resumed[0], begun[0]) and torch.equal(resumed[1], begun[1])
+
+
 def test_the_loss_falls_and_every_weight_is_used(engine: tuple[Simulator, StateDecoder]) -> None:
     simulator, _ = engine
     clips = clip(simulator.spec, 8, simulator.memory_frames, chunks=2)
@@ -138,7 +201,8 @@ def test_the_loss_falls_and_every_weight_is_used(engine: tuple[Simulator, StateD
     simulator.eval()
     names = [name for name, p in simulator.named_parameters() if p.requires_grad]
     assert min(losses[-5:]) < 0.9 * losses[0], losses
-    assert all(touched), [name for name, seen in zip(names, touched, strict=True) if not seen]
+    unused = [name for name, seen in zip(names, touched, strict=True) if not seen]
+    assert not unused
     with torch.no_grad():
         for parameter, value in zip(trained, before, strict=True):
             parameter.copy_(value)
@@ -173,3 +237,42 @@ def test_a_state_expert_learns_from_frozen_features(engine: tuple[Simulator, Sta
     assert losses[-1] < 0.8 * losses[0], losses
     unused = [name for name, p in decoder.named_parameters() if p.grad is None]
     assert not unused
+
+
+MAPS = ("pose_map", "ray_map")
+
+
+@pytest.mark.parametrize(
+    "given", [(), ("pose_map",), ("ray_map",), MAPS], ids=lambda given: "+".join(given) or "none"
+)
+@pytest.mark.parametrize("name", [name for name in ENGINES if name not in MAPS_ALONE])
+def test_any_subset_of_conditioning_is_read_and_learned(name: str, given: tuple[str, ...]) -> None:
+    robot: Embodiment = BIMANUAL_POSES
+    spec = replace(world_spec(robot, chunk=CHUNK), **{kind: kind in given for kind in MAPS})
+    simulator, _ = build_engine(name, spec)
+    clips = clip(spec, 2, simulator.memory_frames)
+    assert ("pose_map" in clips["future"].keys()) == spec.pose_map
+    inputs = build_inputs(spec, clips, 0)
+    with torch.no_grad():
+        features = simulator.features(inputs)
+    turned = {"pose_map": ("future", "pose_map"), "ray_map": ("future", "c2w")}
+    for kind, key in turned.items():
+        if key in inputs.keys(True, True):
+            other = inputs.clone()
+            other[key] = inputs[key].flip(2)  # of the views
+            with torch.no_grad():
+                assert torch.equal(simulator.features(other), features) != (kind in given), kind
+    simulator.train()
+    loss, _ = simulator.loss(clips, torch.Generator().manual_seed(0))
+    loss.backward()
+    assert bool(loss.isfinite())
+    unread = [key for key, p in simulator.named_parameters() if p.requires_grad and p.grad is None]
+    assert not unread
+
+
+@pytest.mark.parametrize("lacking", MAPS)
+@pytest.mark.parametrize("name", MAPS_ALONE)
+def test_engines_conditioned_on_maps_alone_refuse_to_go_without(name: str, lacking: str) -> None:
+    spec = replace(world_spec(BIMANUAL_POSES, chunk=CHUNK), **{lacking: False})
+    with pytest.raises(ConfigError, match=r"needs calibrated cameras.*simulator\.pose_map=true"):
+        build_engine(name, spec)

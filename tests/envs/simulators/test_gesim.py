@@ -199,7 +199,7 @@ def test_rl_runs_inside_a_joint_world(tmp_path: Path) -> None:
         spec, hold=99, margin=0.0, discount=0.9, width=8, points=8, text=8, hidden=16, cameras="all"
     )
     starts = InitialStates(first_of(spec, clip(spec, 3, 4)), ["pour"] * 3)
-    base = WorldEnv(world, starts, 2, 10, ActionMode.RELATIVE, bf16=False)
+    base = WorldEnv(world, starts, 2, 10, ActionMode.RELATIVE, shared_noise=False, bf16=False)
     expert = GESimStateExpert(world, None).eval()
     transforms = world_transforms(
         spec, expert, judge, Rewards(1.0, 1.0), kinematics=Kinematics(two_arms(tmp_path))

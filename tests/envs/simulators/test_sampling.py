@@ -16,7 +16,7 @@ def test_every_sampler_finds_the_data_of_an_exact_flow() -> None:
     def velocity(z: torch.Tensor, level: float) -> torch.Tensor:
         return (z - data) / level  # that of a world with one possible future
 
-    assert torch.allclose(Euler(4)(velocity, noise), data, atol=1e-5)
+    assert torch.allclose(Euler(4, 1.0)(velocity, noise), data, atol=1e-5)
     assert torch.allclose(Distilled()(velocity, noise), data, atol=1e-5)
     assert (EDM(15)(velocity, noise) - data).abs().max() < 0.002 * noise.abs().max() + 1e-4
 

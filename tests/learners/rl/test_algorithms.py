@@ -270,19 +270,27 @@ class Stop(Exception):
     """Stands for a power failure."""
 
 
+@pytest.mark.parametrize(
+    ("name", "policy_name"),
+    [*((name, "chunk_gaussian") for name in offered("algorithm")), ("ppo", "chunk_tokens")],
+)
 def test_killed_and_resumed_rl_equals_the_uninterrupted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, policy_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def run(folder: Path) -> list[dict[str, Any]]:
+    def run(folder: Path) -> tuple[list[dict[str, Any]], dict[str, torch.Tensor]]:
         env = toy(4)
-        policy, replica = policy_of("chunk_tokens", env.spec), policy_of("chunk_tokens", env.spec)
-        fleet, algorithm = LocalFleet(Host(env, replica)), algorithm_of("ppo", policy, env.spec)
+        policy, replica = policy_of(policy_name, env.spec), policy_of(policy_name, env.spec)
+        algorithm = algorithm_of(name, policy, env.spec)
+        fleet = LocalFleet(Host(env, replica, algorithm.bootstraps))
         plan = settings(iterations=3, shards=2, checkpoint_every=1)
         stats = train_rl(fleet, policy, algorithm, plan, folder, starts=4)
-        assert stats["ledger"]["learned"] == stats["ledger"]["asked"]
-        return rows_of(folder)
+        fleet.close()
+        assert stats["ledger"]["learned"] == stats["ledger"]["asked"] == 24
+        return rows_of(folder), {
+            key: value.clone() for key, value in algorithm.modules().state_dict().items()
+        }
 
-    whole = run(tmp_path / "whole")
+    rows, weights = run(tmp_path / "whole")
     import learners.rl.loop as module
 
     original, calls = module.update, []
@@ -297,7 +305,11 @@ def test_killed_and_resumed_rl_equals_the_uninterrupted(
     with pytest.raises(Stop):
         run(tmp_path / "cut")
     monkeypatch.setattr(module, "update", original)
-    assert run(tmp_path / "cut") == whole
+    resumed_rows, resumed = run(tmp_path / "cut")
+    assert resumed_rows == rows and resumed.keys() == weights.keys()
+    assert [key for key, value in resumed.items() if not torch.equal(value, weights[key])] == []
+    before = algorithm_of(name, policy_of(policy_name, toy(4).spec), toy(4).spec).modules().state_dict()
+    assert any(not torch.equal(value, before[key]) for key, value in weights.items())  # it did learn
 
 
 @pytest.mark.gpu

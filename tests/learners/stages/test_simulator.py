@@ -50,7 +50,7 @@ def test_clips_are_single_at_first_and_the_newest_have_their_share(
     monkeypatch.setattr(store, "sample", watched)
     config = SimulatorFitConfig(0.5, 2, (1, 2), 0.25 if unrolled else 1.0, 0)
     simulator = simulator_of("unet_small", store.spec)
-    options = FitConfig(2, 8, bf16=False)
+    options = FitConfig(2, 8, 1e-3, bf16=False)
     train_simulator(simulator, store, torch.arange(6), config, options, tmp_path, newest=torch.tensor([5]))
     if unrolled:
         assert drawn == [(1, [*range(6)], 6), (1, [5], 2), (2, [*range(6)], 3), (2, [5], 1)]
@@ -71,7 +71,7 @@ def test_a_simulator_learns_and_keeps_its_units_when_it_goes_on(tiny_store: Stor
     assert any(not torch.equal(after[name], before[name]) for name in after)
     rows = [json.loads(line)["simulator/loss"] for line in (tmp_path / "first/metrics.jsonl").open()]
     assert sum(rows[-5:]) < 0.8 * sum(rows[:5])
-    short = FitConfig(1, 2, bf16=False)
+    short = FitConfig(1, 2, 1e-3, bf16=False)
     train_simulator(simulator, store, torch.arange(2), config, short, tmp_path / "next", fresh=False)
     assert all(torch.equal(value, after[name]) for name, value in simulator.named_buffers())
 
@@ -109,5 +109,5 @@ def test_simulators_without_a_codec_say_so(tiny_store: Stores, tmp_path: Path) -
     store = tiny_store(ARM_DELTAS)
     with pytest.raises(ValueError, match="UNetSimulator has no codec"):
         train_tokenizer(
-            simulator_of("unet_small", store.spec), store, torch.arange(2), FitConfig(1), tmp_path
+            simulator_of("unet_small", store.spec), store, torch.arange(2), FitConfig(1, 32, 1e-3), tmp_path
         )

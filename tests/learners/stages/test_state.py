@@ -47,12 +47,12 @@ def test_features_are_computed_once_unless_they_are_too_large(
         return features(inputs)
 
     monkeypatch.setattr(simulator, "features", counted)
-    every, options = torch.arange(len(store)), FitConfig(steps=100, batch=32, bf16=False)
+    every, options = torch.arange(len(store)), FitConfig(steps=100, batch=32, lr=1e-3, bf16=False)
     train_state(decoder_of("unet_small", simulator), simulator, store, every, options, tmp_path)
     assert sum(shown) == 1 + 200  # one to know its size; of the 3200 clips that were learned from
     monkeypatch.setattr("learners.stages.state._KEPT", 1000)  # bytes
     shown.clear()
-    options = FitConfig(steps=3, batch=32, bf16=False)
+    options = FitConfig(steps=3, batch=32, lr=1e-3, bf16=False)
     train_state(decoder_of("unet_small", simulator), simulator, store, every, options, tmp_path / "anew")
     assert sum(shown) == 1 + 3 * 32
 
@@ -66,7 +66,7 @@ def test_only_transformers_take_adapters(tiny_store: Stores, tmp_path: Path) -> 
             simulator,
             store,
             torch.arange(4),
-            FitConfig(1, 2, bf16=False),
+            FitConfig(1, 2, 1e-3, bf16=False),
             tmp_path,
             lora=2,
         )

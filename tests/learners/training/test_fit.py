@@ -112,6 +112,14 @@ def test_a_checkpoint_that_cannot_be_written_keeps_its_predecessor(
     assert checkpoints.load({"module": value}) == {"step": 1} and value["w"].tolist() == [1.0, 1.0]
 
 
+def test_what_a_killed_process_left_of_the_same_step_is_written_anew(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, {"module": {"w": torch.ones(2)}}, {"step": 1})
+    (tmp_path / ".checkpoint-000000002.part").mkdir()
+    checkpoints.save(2, {"module": {"w": torch.ones(2)}}, {"step": 2})
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint-000000002"]
+
+
 def test_strange_tensors_come_back_as_they_were(tmp_path: Path) -> None:
     conv = torch.randn(4, 3, 2, 2).to(memory_format=torch.channels_last)
     shared = torch.randn(5)
@@ -162,7 +170,7 @@ def test_muon_takes_matrices_and_adamw_the_rest() -> None:
 
 def test_unknown_optimisers_are_refused() -> None:
     with pytest.raises(ValueError, match=r"optimiser=sgd must be one of \['adamw', 'muon'\]"):
-        FitConfig(1, optimiser="sgd")
+        FitConfig(1, 32, 1e-3, optimiser="sgd")
 
 
 def test_batches_are_made_while_others_are_learned_from(tmp_path: Path) -> None:
@@ -179,7 +187,7 @@ def test_batches_are_made_while_others_are_learned_from(tmp_path: Path) -> None:
         return net.loss(data, generator)
 
     net, learned = Net(), list[int]()
-    stats = fit("toy", net, batch, loss, FitConfig(6, 8, bf16=False), tmp_path)
+    stats = fit("toy", net, batch, loss, FitConfig(6, 8, 1e-3, bf16=False), tmp_path)
     assert made == [0, 1, 2, 3, 4, 5] and len(learned) == 6
     total = stats["data_seconds"] + stats["compute_seconds"]
     assert stats["samples_per_second"] == pytest.approx(48 / total)

@@ -79,7 +79,7 @@ def test_an_interrupted_fit_goes_on_to_the_same_metrics_weights_and_result(
             learned.append(data)
             return module(data).square().mean(), {}
 
-        result = fit("x", module, batch, loss, FitConfig(steps=8, batch=4, bf16=False), folder)
+        result = fit("x", module, batch, loss, FitConfig(steps=8, batch=4, lr=1e-3, bf16=False), folder)
         rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
         return rows, module.weight.detach().clone(), result["loss"]
 

@@ -41,5 +41,5 @@ def test_only_transformers_take_adapters(tiny_store: Stores, tmp_path: Path) -> 
     world = simulator_of("unet_small", store.spec)
     with pytest.raises(ValueError, match="lora=2 adapts the projections of transformers"):
         train_simulator(
-            world, store, torch.arange(2), ADAPTERS, FitConfig(1, 2, bf16=False), tmp_path, fresh=False
+            world, store, torch.arange(2), ADAPTERS, FitConfig(1, 2, 1e-3, bf16=False), tmp_path, fresh=False
         )

@@ -171,4 +171,4 @@ def test_two_workers_follow_one_in_every_supervised_stage(
 
 def test_microbatches_that_cannot_be_shared_out_are_refused() -> None:
     with pytest.raises(ValueError, match="microbatches"):
-        FitConfig(1, 8, microbatches=3)
+        FitConfig(1, 8, 1e-3, microbatches=3)

@@ -25,6 +25,7 @@ from envs.physics.tabletop.scenes.catalogue import (
     add_container,
     add_mat,
 )
+from envs.rng import Stream, episode_rng
 
 Array = NDArray[np.float64]
 COLUMNS = (-0.165, 0.0, 0.165)  # m, their places across the table
@@ -62,7 +63,7 @@ def draw_layout(scene: Scene, companions: tuple[str, ...], seed: int) -> Layout:
         companions: objects of which one lies beside the scene's own.
         seed: of the episode.
     """
-    rng = np.random.default_rng([seed, 7])
+    rng = episode_rng(seed, Stream.LAYOUT)
     companion = str(rng.choice(companions))
     columns = rng.permutation(COLUMNS)
     x = rng.uniform(0.11, 0.20, 2)

@@ -21,6 +21,7 @@ from envs.physics.tabletop.scenes.tasks import TASKS, Request, SceneTask
 from envs.physics.tabletop.scenes.words import STYLES, instruction
 from envs.physics.tabletop.suite import TwoArmSuite
 from envs.ranges import NonNegative, Positive
+from envs.rng import Stream, episode_rng
 
 _NUMBERS = {name: number for number, name in enumerate(SCENES)}
 IN_DOMAIN, OUT_OF_DOMAIN = "in_domain", "out_of_domain"
@@ -88,7 +89,7 @@ class TabletopScenes(TwoArmSuite):
         check_task(task, self.tasks)
         scene = SCENES[scene_of(self.scenes, seed)]
         layout = draw_layout(scene, self._companions(scene), seed)
-        rng = np.random.default_rng([seed, 11])
+        rng = episode_rng(seed, Stream.REQUEST)
         style = str(rng.choice(self.phrasings))
         goals = TASKS[task].goals
         goal = goals[(int(rng.integers(2)) + self._swapped) % 2] if goals else ""
