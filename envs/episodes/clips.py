@@ -6,7 +6,6 @@ A batch is a function of (seed, step) alone, so a resumed run sees the batches i
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,29 +16,11 @@ from torch import Tensor
 
 from envs.conditioning import PoseMapStyle
 from envs.episodes.cache import CachedSet, open_cached
+from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.columns import Columns
 from envs.episodes.episode import EpisodeError
 from envs.episodes.splits import range_of
 from envs.specs import WorldSpec, memory_indices, text_to_bytes
-
-
-@dataclass(frozen=True)
-class ClipSpec:
-    """Shape of a training clip.
-
-    Args:
-        memory: sparse memory frames, evenly spread over the past and always with the first, M.
-        chunk: frames a chunk adds, K.
-        chunks: consecutive chunks per clip, L.
-        stride: frames between two frames of the clip.
-        history: consecutive commands and states up to now, H; 0 is as many as `memory`.
-    """
-
-    memory: int = 4
-    chunk: int = 8
-    chunks: int = 1
-    stride: int = 1
-    history: int = 0
 
 
 class ClipStore:

@@ -11,7 +11,8 @@ from annotated_types import MinLen
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.episodes.clips import ClipSpec, ClipStore
+from envs.episodes.clip_spec import ClipSpec
+from envs.episodes.clips import ClipStore
 from envs.ranges import Count, Natural, Share
 from envs.rng import step_generator
 from envs.simulators.base import Simulator

@@ -10,7 +10,8 @@ from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
-from envs.episodes.clips import ClipSpec, ClipStore
+from envs.episodes.clip_spec import ClipSpec
+from envs.episodes.clips import ClipStore
 from envs.precision import mixed_precision
 from envs.rng import step_generator
 from envs.simulators.base import Simulator

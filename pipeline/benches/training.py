@@ -17,7 +17,8 @@ from actors.factory import build_pool, build_simulator, build_state_decoder, ope
 from actors.process import prepare_process
 from actors.world_config import world_spec
 from envs.episodes import Episode, LeRobotWriter
-from envs.episodes.clips import ClipSpec, ClipStore
+from envs.episodes.clip_spec import ClipSpec
+from envs.episodes.clips import ClipStore
 from envs.rng import step_generator
 from envs.simulators.base import Simulator
 from envs.targets import ConfigError

@@ -9,7 +9,8 @@ import torch
 from torchrl.envs import TransformedEnv
 
 from envs.embodiment import Embodiment
-from envs.episodes.clips import ClipSpec, ClipStore
+from envs.episodes.clip_spec import ClipSpec
+from envs.episodes.clips import ClipStore
 from envs.initial_states import DecisionPoints, InitialStates, decision_points
 from envs.simulators import memory
 from envs.specs import CHUNK, IMAGE, STATE, ActionMode, Rewards

@@ -19,7 +19,8 @@ import torch
 from envs.conditioning import PoseMapStyle, end_effector_poses, render_pose_map
 from envs.embodiment import Embodiment
 from envs.episodes import Episode, EpisodeError, LeRobotDataset, LeRobotWriter
-from envs.episodes.clips import ClipSpec, ClipStore
+from envs.episodes.clip_spec import ClipSpec
+from envs.episodes.clips import ClipStore
 from envs.episodes.privileged import read_privileged
 from envs.episodes.splits import write_splits
 from envs.geometry.cameras import follow_wrists

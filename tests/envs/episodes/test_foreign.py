@@ -14,7 +14,8 @@ import torch
 from envs.conditioning import PoseMapStyle, end_effector_poses, render_pose_map
 from envs.embodiment import Embodiment
 from envs.episodes import EpisodeError, LeRobotDataset, LeRobotWriter
-from envs.episodes.clips import ClipSpec, ClipStore
+from envs.episodes.clip_spec import ClipSpec
+from envs.episodes.clips import ClipStore
 from envs.episodes.formats.bridge import BRIDGE
 from envs.episodes.formats.foreign import Cut, read_foreign
 from envs.episodes.formats.gesim import GENIE, GENIE_POSES, write_bundle

@@ -15,7 +15,8 @@ import torch
 
 from envs.embodiment import ActionKind, Arm, Embodiment
 from envs.episodes import EpisodeError, LeRobotDataset
-from envs.episodes.clips import ClipSpec, ClipStore
+from envs.episodes.clip_spec import ClipSpec
+from envs.episodes.clips import ClipStore
 from envs.specs import WorldSpec
 from tests.envs.episodes.lerobot_sets import LENGTHS, SETS, write_set
 

@@ -9,7 +9,8 @@ import pytest
 
 from envs.physics.suite import build_suite, scene_of
 from envs.physics.tabletop.scenes.behaviour import MANNERS
-from envs.physics.tabletop.scenes.catalogue import CONTAINERS, SCENES, TABLES, THINGS
+from envs.physics.tabletop.scenes.catalogue import CONTAINERS, TABLES, THINGS
+from envs.physics.tabletop.scenes.scene import SCENES
 from envs.physics.tabletop.scenes.suite import TabletopScenes
 from envs.physics.tabletop.scenes.tasks import DISTANCE, TASKS
 from envs.physics.tabletop.scenes.words import PHRASINGS, STYLES
@@ -44,7 +45,7 @@ def play(suite: TabletopScenes, task: str, seed: int, noise_level: float = 0.0) 
 
 # -- scenes and words ----------------------------------------------------------------------------------------
 def test_eighty_scenes_are_parted_into_fixed_lists() -> None:
-    section = task_section("tabletop")["suite"]
+    section = task_section("tabletop")["suite"]["domains"]
     known, kept = section["in_domain"], section["out_of_domain"]
     assert (len(THINGS), len(CONTAINERS), len(TABLES)) == (20, 2, 2)
     assert (len(known), len(kept)) == (64, 16) and set(known) | set(kept) == set(SCENES)
@@ -57,7 +58,7 @@ def test_eighty_scenes_are_parted_into_fixed_lists() -> None:
 
 
 def test_what_is_out_of_domain_is_nowhere_to_be_seen_in_domain(suite: TabletopScenes) -> None:
-    known = task_section("tabletop")["suite"]["in_domain"]
+    known = task_section("tabletop")["suite"]["domains"]["in_domain"]
     for seed in range(200):
         suite.reset("push", seed)
         layout = suite.request.layout
@@ -211,8 +212,11 @@ def test_more_noise_means_less_success() -> None:
         ({"scenes": ["red_cube-bowl-oka"]}, r"task\.suite\.scenes holds .*red_cube-bowl-oak"),
         ({"scenes": []}, r"task\.suite\.scenes is empty"),
         ({"phrasings": ["plane"]}, r"task\.suite\.phrasings holds 'plane'.*plain"),
-        ({"in_domain": ["red_cube-bowl-oak"]}, r"in_domain holds no other scene"),
-        ({"out_of_domain": ["red_cube-bowl-oak"]}, r"out_of_domain holds .*too"),
+        ({"domains": {"in_domain": ["red_cube-bowl-oak"]}}, r"domains\.in_domain holds no other scene"),
+        (
+            {"domains": {"a": ["red_cube-bowl-oak"], "b": ["red_cube-bowl-oak"]}},
+            r"domains\.b holds .*red_cube-bowl-oak.* stand in a, too",
+        ),
     ],
 )
 def test_unknown_scenes_and_phrasings_are_named_with_the_nearest(changes: dict[str, Any], said: str) -> None:

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from envs.embodiment import Embodiment
-from envs.episodes.clips import ClipSpec, ClipStore
+from envs.episodes.clip_spec import ClipSpec
+from envs.episodes.clips import ClipStore
 from envs.targets import options
 from learners.stages.simulator import SimulatorFitConfig, train_simulator, units
 from learners.stages.tokenizer import train_tokenizer

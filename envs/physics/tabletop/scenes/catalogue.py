@@ -6,7 +6,6 @@ kilograms.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -283,27 +282,3 @@ def _add_geom(
         contype=1,
         conaffinity=3,
     )
-
-
-@dataclass(frozen=True)
-class Scene:
-    """An object, the kind of container beside it, and the table."""
-
-    thing: str
-    container: str
-    table: str
-
-    @property
-    def name(self) -> str:
-        """Such as red_cube-bowl-oak."""
-        return f"{self.thing}-{self.container}-{self.table}"
-
-
-def _all_scenes() -> Iterator[Scene]:
-    for thing in THINGS:
-        for container in CONTAINERS:
-            for table in TABLES:
-                yield Scene(thing, container, table)
-
-
-SCENES = {scene.name: scene for scene in _all_scenes()}

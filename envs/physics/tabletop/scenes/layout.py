@@ -21,10 +21,10 @@ from envs.physics.tabletop.scenes.catalogue import (
     MAT_HEIGHT,
     TABLES,
     THINGS,
-    Scene,
     add_container,
     add_mat,
 )
+from envs.physics.tabletop.scenes.scene import Scene
 from envs.rng import Stream, episode_rng
 
 Array = NDArray[np.float64]

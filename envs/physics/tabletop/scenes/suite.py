@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from types import MappingProxyType
 
 import numpy as np
@@ -14,9 +15,10 @@ from envs.physics.tabletop.scenes.behaviour import (
     fingertips,
     flanges,
 )
-from envs.physics.tabletop.scenes.catalogue import SCENES, THINGS, Scene
+from envs.physics.tabletop.scenes.catalogue import THINGS
 from envs.physics.tabletop.scenes.layout import draw_layout, lay_out
 from envs.physics.tabletop.scenes.plans import plan
+from envs.physics.tabletop.scenes.scene import SCENES, Scene
 from envs.physics.tabletop.scenes.tasks import TASKS, Request, SceneTask
 from envs.physics.tabletop.scenes.words import STYLES, instruction
 from envs.physics.tabletop.suite import TwoArmSuite
@@ -24,7 +26,6 @@ from envs.ranges import NonNegative, Positive
 from envs.rng import Stream, episode_rng
 
 _NUMBERS = {name: number for number, name in enumerate(SCENES)}
-IN_DOMAIN, OUT_OF_DOMAIN = "in_domain", "out_of_domain"
 
 
 class TabletopScenes(TwoArmSuite):
@@ -32,14 +33,13 @@ class TabletopScenes(TwoArmSuite):
     containers and two mats.
 
     Where things lie depends on scene and seed alone, so each task can be asked for at the same first frame.
-    Beside a scene's own object lies one of `in_domain`, whose scene with the same container and table is in
-    that list, too: what is out of domain is seen there alone.
+    Beside a scene's own object lies one whose scene with the same container and table is in the first domain:
+    what is out of it is seen there alone.
 
     Args:
         actions: see TwoArmSuite, as of `control_hz`, `hold`, `size` and `cameras`.
-        in_domain: names of scenes to learn from.
-        out_of_domain: names of scenes kept apart.
-        scenes: in_domain, out_of_domain, or names of scenes; the seed draws one of them.
+        domains: names of scenes by domain: first those to learn from, then those kept apart.
+        scenes: name of a domain, or names of scenes; the seed draws one of them.
         phrasings: names of words.STYLES; the seed draws one of them.
         swapped: ask for the other object, and the other goal, at the same first frames.
 
@@ -48,7 +48,7 @@ class TabletopScenes(TwoArmSuite):
     """
 
     tasks = tuple(TASKS)
-    offers = MappingProxyType({"scenes": (IN_DOMAIN, OUT_OF_DOMAIN, *SCENES), "phrasings": STYLES})
+    offers = MappingProxyType({"scenes": tuple(SCENES), "phrasings": STYLES})
 
     def __init__(
         self,
@@ -57,30 +57,28 @@ class TabletopScenes(TwoArmSuite):
         hold: NonNegative,
         size: tuple[int, int],
         cameras: tuple[str, ...],
-        in_domain: tuple[str, ...],
-        out_of_domain: tuple[str, ...],
+        domains: dict[str, tuple[str, ...]],
         scenes: str | tuple[str, ...],
         phrasings: tuple[str, ...],
         swapped: bool,
     ):
         super().__init__(actions, control_hz, hold, size, cameras)
-        lists = {IN_DOMAIN: in_domain, OUT_OF_DOMAIN: out_of_domain}
-        for key, names in lists.items():
-            check_names(f"task.suite.{key}", names, SCENES)
-        if both := sorted({*in_domain} & {*out_of_domain}):
-            raise SuiteError(
-                f"task.suite.out_of_domain holds {both}, which stand in task.suite.in_domain, too"
-            )
+        for key, names in domains.items():
+            check_names(f"task.suite.domains.{key}", names, SCENES)
+        for one, other in itertools.combinations(domains, 2):
+            if both := sorted({*domains[one]} & {*domains[other]}):
+                raise SuiteError(f"task.suite.domains.{other} holds {both}, which stand in {one}, too")
         given = (scenes,) if isinstance(scenes, str) else scenes
-        check_names("task.suite.scenes", given, [*lists, *SCENES])
+        check_names("task.suite.scenes", given, [*domains, *SCENES])
         check_names("task.suite.phrasings", phrasings, STYLES)
-        self.scenes = tuple(name for one in given for name in lists.get(one, (one,)))
+        self.scenes = tuple(name for one in given for name in domains.get(one, (one,)))
         self.phrasings, self._swapped = phrasings, swapped
-        self._known = {SCENES[name] for name in in_domain}
+        first = next(iter(domains), "")
+        self._known = {SCENES[name] for name in domains.get(first, ())}
         for name in self.scenes:
             if not self._companions(SCENES[name]):
                 raise SuiteError(
-                    f"task.suite.in_domain holds no other scene with container and table of {name}, so"
+                    f"task.suite.domains.{first} holds no other scene with container and table of {name}, so"
                     " nothing can lie beside its object; add one"
                 )
 
@@ -103,7 +101,7 @@ class TabletopScenes(TwoArmSuite):
         self._bench.begin(model, data, self._goal, flanges(layout.hands))
 
     def privileged(self) -> dict[str, Array]:
-        """True poses, see TwoArmSuite, of what the words name first; the scene's place in catalogue.SCENES;
+        """True poses, see TwoArmSuite, of what the words name first; the scene's place in scene.SCENES;
         and of scripted episodes noise_level and the place of their manner in behaviour.MANNERS, -1 for
         neither.
         """
