@@ -43,12 +43,12 @@ def recall(state: TensorDict, count: int) -> TensorDict:
     """`count` remembered frames and what belongs to them, [B, M, ...], evenly spread, the first included."""
     history = state["history"]
     known = history.select(*(name for name in _MEMORY if name in history.keys()))
-    return known[_rows(state), memory_indices(state["length"], count)]
+    return _pick(known, memory_indices(state["length"], count))
 
 
 def build_inputs(state: TensorDict, remembered: TensorDict, future: TensorDict) -> TensorDict:
     """The inputs of Simulator.predict for the next chunk of every session."""
-    now = state["history"].select("commands", "states")[_rows(state).squeeze(1), state["length"] - 1]
+    now = _pick(state["history"].select("commands", "states"), state["length"] - 1)
     inputs = TensorDict(
         {
             "memory": remembered,
@@ -100,12 +100,12 @@ def recent(state: TensorDict, count: int) -> TensorDict:
     """
     length = state["length"]
     at = (length[:, None] - count + torch.arange(count, device=length.device)).clamp(min=0)
-    return state["history"].select("commands", "states")[_rows(state), at]
+    return _pick(state["history"].select("commands", "states"), at)
 
 
 def newest(state: TensorDict) -> TensorDict:
     """The last row of each session's history, [B]."""
-    return state["history"][_rows(state).squeeze(1), state["length"] - 1]
+    return _pick(state["history"], state["length"] - 1)
 
 
 def stack(states: Sequence[TensorDict]) -> TensorDict:
@@ -128,6 +128,21 @@ def replace(state: TensorDict, mask: Tensor, begun: TensorDict) -> TensorDict:
     for name in state["history"].keys():
         state["history", name][slots, known] = begun["history", name][:, : len(known)]
     return state
+
+
+def _pick(history: TensorDict, at: Tensor) -> TensorDict:
+    """Rows `at` [B] or [B, M] of a history [B, N]; a row is copied as one piece, where indexing by two
+    tensors copies pictures byte by byte.
+    """
+    begin = history.shape[1] * torch.arange(len(at), device=at.device)
+    rows = (begin.reshape(-1, *[1] * (at.ndim - 1)) + at).flatten()
+    return TensorDict(
+        {
+            name: value.flatten(0, 1).index_select(0, rows).unflatten(0, at.shape)
+            for name, value in history.items()
+        },
+        at.shape,
+    )
 
 
 def _rows(state: TensorDict) -> Tensor:
