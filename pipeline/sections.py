@@ -200,6 +200,7 @@ class Top:
 
     name: Name
     seed: Seed
+    threads: Count
     runs: Name
     cameras: Literal["all", "main"] | Annotated[Sequence[str], MinLen(1)]
     microbatches: Count

@@ -44,7 +44,7 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     number = inputs.settings["number"]
     store = open_store(cfg, inputs)
     mine = store.select([f"policy-{number}"])[: cfg["measure"]["starts"]]
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     policy = build_policy(cfg, inputs.weights("policy"))
     truth = episode_success(store, mine)
     world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(mine)), mine)
@@ -70,6 +70,7 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 def evaluate_physics(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Deterministic success in physics on the evaluation seeds."""
     section = cfg["evaluate"]
+    prepare_process(cfg["seed"], cfg["threads"])
     policy = build_policy(cfg, inputs.weights("policy"))
     env = build_physics(cfg, section["envs"])
     began = time.perf_counter()
@@ -94,6 +95,7 @@ def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Deterministic success in the last imagined world, of the policies in the roles before and after, from
     the starts of held-out episodes first.
     """
+    prepare_process(cfg["seed"], cfg["threads"])
     store = open_store(cfg, inputs)
     held = store.split("held_out")
     others = torch.arange(len(store))
@@ -132,7 +134,7 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Rollout error, state error, speed and the judge's tables on held-out episodes of every source; and
     episodes.json, how far imagination and truth disagree in each of them (see disagreement.py).
     """
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     simulator = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
     judge = build_judge(cfg, inputs.weights("judge"))

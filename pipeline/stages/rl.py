@@ -51,7 +51,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     demonstrations alone).
     """
     number, deployed = inputs.settings["number"], inputs.settings["deployed"]
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     store = open_store(cfg, inputs)
     policy = build_policy(cfg, inputs.weights("policy"))
     settings = rl_options(cfg, iterations=inputs.settings["iterations"], seed=cfg["seed"] * 100 + number)
@@ -130,7 +130,7 @@ def rl_in_physics(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, An
 
     Settings: iterations.
     """
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     iterations = inputs.settings["iterations"]
     policy = build_policy(cfg, inputs.weights("policy"))
     settings = rl_options(cfg, iterations=iterations, anchor=0.0, seed=cfg["seed"] * 100)

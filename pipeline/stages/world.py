@@ -35,14 +35,14 @@ from pipeline.stages.given import (
     open_store,
 )
 
-SIMULATOR = ("seed", *TASK, "simulator", "microbatches")
+SIMULATOR = ("seed", "threads", *TASK, "simulator", "microbatches")
 
 
 @stage(reads=(*SIMULATOR, "tokenizer_fit"), place=Place.LEARNERS)
 def tokenizer(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The video autoencoder of a simulator that works on latents."""
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg)
     fit = fit_options(cfg, cfg["tokenizer_fit"], "tokenizer_fit")
     stats = train_tokenizer(model, store, learning_episodes(store), fit, folder)
@@ -62,7 +62,7 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     how = options(SimulatorFitConfig, section, f"simulator_fit.{phase}")
     store = open_store(cfg, inputs)
     episodes = learning_episodes(store)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg, inputs.weights("warm"))
     stats = (
         train_simulator(
@@ -85,7 +85,7 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     phase = inputs.settings["phase"]
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, model, inputs.weights("warm"))
     section = cfg["state_fit"][phase]
@@ -106,7 +106,7 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     phase = inputs.settings["phase"]
     section = cfg["judge_fit"][phase]
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model: Any = build_judge(cfg, inputs.weights("warm"))
     stats: dict[str, Any] = {}
     if learns(model):
