@@ -18,6 +18,7 @@ from envs.episodes.formats.foreign import read_foreign
 from envs.episodes.formats.gesim import write_bundle
 from envs.episodes.formats.recordings import Cut
 from envs.geometry.kinematics import Kinematics
+from pipeline.graph.owner import held_files, owning
 
 
 def read_any(source: Path, cut: Cut | None = None) -> Iterator[Episode]:
@@ -37,9 +38,16 @@ def convert(source: Path, target: Path, cut: Cut) -> int:
 
     Raises:
         EpisodeError: if the source is damaged or unknown, or the target is not empty.
+        RunInUse: if another process converts into the same folder.
     """
-    if target.exists() and any(target.iterdir()):
-        raise EpisodeError(f"{target} is not empty; choose a new folder")
+    with owning(target, f"convert {source} {target}", "choose another folder", passing=True):
+        if set(target.iterdir()) - held_files(target):
+            raise EpisodeError(f"{target} is not empty; choose a new folder")
+        return _write(source, target, cut)
+
+
+def _write(source: Path, target: Path, cut: Cut) -> int:
+    """What `convert` does to a folder that it owns."""
     back = (source / "meta/info.json").exists()
     count = 0
     writer: LeRobotWriter | None = None

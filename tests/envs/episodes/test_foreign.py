@@ -22,6 +22,7 @@ from envs.episodes.formats.gesim import GENIE, GENIE_POSES, write_bundle
 from envs.episodes.video import write_video
 from envs.specs import WorldSpec
 from pipeline.commands.convert import convert, inspect
+from pipeline.graph.owner import RunInUse, owning
 from tests.moving_square import moving_square
 
 
@@ -48,6 +49,7 @@ def test_a_bundle_comes_back_as_it_was(shared: Path, tmp_path: Path) -> None:
     size = (384, 512)
     cut = Cut(size=size)
     assert convert(shared / "data/gesim_v2", tmp_path / "lerobot", cut) == 1
+    assert {path.name for path in (tmp_path / "lerobot").iterdir()} == {"data", "meta", "videos"}
     (there,) = LeRobotDataset(tmp_path / "lerobot")
     (source,) = read_foreign(shared / "data/gesim_v2", cut)
     for name in ("c2w", "intrinsic", "commands", "poses", "states", "present"):
@@ -62,6 +64,15 @@ def test_a_bundle_comes_back_as_it_was(shared: Path, tmp_path: Path) -> None:
     assert joints[:, 17:].all()
     with pytest.raises(EpisodeError, match="not empty"):
         convert(tmp_path / "lerobot", tmp_path / "bundles", Cut())
+
+
+def test_two_conversions_into_one_folder_are_one_too_many(shared: Path, tmp_path: Path) -> None:
+    with (
+        owning(tmp_path, "convert there here"),
+        pytest.raises(RunInUse, match=r"convert there here.*another folder"),
+    ):
+        convert(shared / "data/gesim_v1", tmp_path, Cut(frames=4))
+    assert not (tmp_path / "meta").exists()
 
 
 def test_a_bundle_has_one_robot(shared: Path, tmp_path: Path) -> None:
