@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import torch
 from tqdm import tqdm
 
 from actors.factory import build_physics, build_policy, build_pool, open_clips
+from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
 from actors.world_config import world_spec
 from envs.episodes.clips import ClipStore
@@ -21,6 +23,7 @@ from envs.episodes.formats.lerobot_writer import LeRobotWriter
 from envs.episodes.splits import write_splits
 from envs.episodes.write_behind import WriteBehind
 from envs.files import write_text
+from envs.manifest import check_whole, keep_whole
 from envs.physics.suite import task_names
 from envs.physics.worker import Track
 from envs.rng import Purpose, episode_seeds, order_generator
@@ -42,13 +45,17 @@ def collect(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Scripted episodes into a LeRobot data set, in the order of its splits; goes on after the last shard."""
     section = cfg["collect"]
     task, robot, jobs = cfg["task"], world_spec(cfg).embodiment, scripted_jobs(cfg)
+    check_whole(folder)
     writer = LeRobotWriter(folder / "dataset", robot)
+    sealed = partial(_seal_shards, folder, writer)
+    if writer.shards:
+        sealed()  # one that was whole when the last try was cut off
     pool = build_pool(cfg)
     done = len(LeRobotDataset(writer.root)) if writer.shards else 0
     try:
         with (
             tqdm(total=len(jobs), initial=done, desc="collect", unit="ep", dynamic_ncols=True) as bar,
-            WriteBehind(writer) as behind,
+            WriteBehind(writer, sealed) as behind,
         ):
             for begin in range(done, len(jobs), section["shard"]):
                 mine = jobs[begin : begin + section["shard"]]
@@ -71,6 +78,11 @@ def collect(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         "successes": sum(bool(row["success"]) for row in store.episodes),
         "expert_failures": _failures(cfg, store, folder),
     }
+
+
+def _seal_shards(folder: Path, writer: LeRobotWriter) -> None:
+    """Remember what finished shards are, so that one that is spoiled before the stage ends is found."""
+    keep_whole(folder, writer.shard_files())
 
 
 def _failures(cfg: Cfg, store: ClipStore, folder: Path) -> list[str]:
@@ -120,6 +132,7 @@ def deploy(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     Settings: number of the round, episodes.
     """
     number, episodes = inputs.settings["number"], inputs.settings["episodes"]
+    prepare_process(cfg["seed"], cfg["threads"])
     policy, robot = build_policy(cfg, inputs.weights("policy")), world_spec(cfg).embodiment
     seeds = episode_seeds(cfg["seed"], Purpose.DEPLOY, episodes, offset=100_000 * number)
     data = folder / "dataset"

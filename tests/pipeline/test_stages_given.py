@@ -7,11 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from envs.manifest import DamagedArtefact, write_manifest
 from envs.rng import Purpose, episode_seeds
 from envs.targets import ConfigError
 from pipeline.config import load_config
 from pipeline.evaluation.by_task import tasks_of_seeds
-from pipeline.stages.collect import fingerprint, scripted_jobs, split_counts
+from pipeline.graph.stage import Inputs
+from pipeline.stages.collect import collect, fingerprint, scripted_jobs, split_counts
 
 
 def test_splits_add_up_and_none_is_empty() -> None:
@@ -25,6 +27,27 @@ def test_splits_add_up_and_none_is_empty() -> None:
         "held_out": 1,
         "calibration": 1,
     }
+
+
+def test_a_shard_that_is_spoiled_before_the_stage_ends_is_found(tmp_path: Path) -> None:
+    cfg = load_config(["experiment=soak", "collect.episodes={train: 1, held_out: 1, calibration: 1}"])
+    cfg["collect"]["shard"], cfg["launch"]["workers"] = 2, 1
+    view = collect.view("collect", cfg, {})
+    collect.run(view, tmp_path, Inputs())  # what a run would seal now
+    (video, *_) = sorted((tmp_path / "dataset").rglob("*.mp4"))
+    content = bytearray(video.read_bytes())
+    content[len(content) // 2] ^= 1
+    video.write_bytes(content)
+    for go_on in (
+        lambda: write_manifest(tmp_path, {"stage": "collect", "result": {}}),
+        lambda: collect.run(view, tmp_path, Inputs()),
+    ):
+        with pytest.raises(DamagedArtefact, match=video.name):
+            go_on()
+    content[len(content) // 2] ^= 1
+    video.write_bytes(content)
+    sealed = write_manifest(tmp_path, {"stage": "collect", "result": {}})["files"]
+    assert video.relative_to(tmp_path).as_posix() in sealed
 
 
 def test_any_prefix_of_the_scripted_episodes_is_mixed() -> None:
