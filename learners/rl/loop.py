@@ -157,10 +157,14 @@ def train_rl(
             episodes += int(done.sum() + (~done[:, -1]).sum())
             ledger.settle(
                 len(batch),
-                {"judge": int(figures["dropped_by_judge"]), "NaN actions": int(figures["dropped_nan"])},
+                {
+                    "judge": int(figures["dropped_by_judge"]),
+                    "NaN actions": int(figures["dropped_nan"]),
+                    "physics": int(figures["dropped_by_physics"]),
+                },
             )
             if feed is not None:
-                feed.check_losses("judges that gave no verdict, or a policy that says NaN")
+                feed.check_losses("judges that gave no verdict, a policy that says NaN, physics that crashes")
             figures |= supply | {"time/rollout": collected - began, "time/update": updated - collected}
             if feed is not None:
                 figures["time/actors_idle_share"] = max(

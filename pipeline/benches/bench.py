@@ -22,7 +22,7 @@ BENCHES: dict[str, tuple[str, tuple[str, ...]]] = {
     "overfit": ("pipeline.benches.training", ("simulator=dit_small", "task=lerobot")),
     "pretrained": ("pipeline.benches.training", ("experiment=smoke", "simulator=dit_small")),
 }
-# Options of benchmarks that are no part of a config, and what they are unless the command line says otherwise.
+# Options of benchmarks that are no part of a config, and what they are unless the command line says more.
 OWN: dict[str, dict[str, float]] = {"serving": {"seconds": 180.0}}
 
 

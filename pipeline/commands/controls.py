@@ -117,16 +117,16 @@ def control_rows(cfg: Cfg, root: Path, loop: Graph) -> list[Row]:
 
 def control_table(loop: Graph, rows: list[Row]) -> dict[str, Any]:
     """Rows of controls.json by title, the policy before first."""
-    before = outcomes(loop.folder("evaluate-before"))
-    start = rate_entry(before)
+    before = loop.folder("evaluate-before")
+    start = rate_entry(outcomes(before)[1][0])
     table: dict[str, Any] = {"before": {**start, "physics_episodes": 0, "paired": None}}
     for row in rows:
-        success = outcomes(row.graph.folder(row.node))
-        entry = rate_entry(success)
+        after = row.graph.folder(row.node)
+        entry = rate_entry(outcomes(after)[1][0])
         table[row.title] = {
             **entry,
             "gain": 100 * (rate(entry) - rate(start)),
-            "paired": mcnemar(before, success),
+            "paired": mcnemar(*outcomes(before, after)[1]),
             "physics_episodes": sum(row.graph.result(name)["episodes"] for name in row.learned),
             **({"note": row.note} if row.note else {}),
         }

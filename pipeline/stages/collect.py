@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Iterator, Mapping
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from actors.world_config import world_spec
 from envs.episodes.clips import ClipStore
 from envs.episodes.episode import Episode
 from envs.episodes.formats.lerobot import LeRobotDataset
+from envs.episodes.formats.lerobot_columns import SEED
 from envs.episodes.formats.lerobot_writer import LeRobotWriter
 from envs.episodes.splits import write_splits
 from envs.episodes.write_behind import WriteBehind
@@ -51,7 +53,7 @@ def collect(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     if writer.shards:
         sealed()  # one that was whole when the last try was cut off
     pool = build_pool(cfg)
-    done = len(LeRobotDataset(writer.root)) if writer.shards else 0
+    done = _next_job(writer, jobs)
     try:
         with (
             tqdm(total=len(jobs), initial=done, desc="collect", unit="ep", dynamic_ncols=True) as bar,
@@ -60,24 +62,38 @@ def collect(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
             for begin in range(done, len(jobs), section["shard"]):
                 mine = jobs[begin : begin + section["shard"]]
                 tracks = pool.script([(seed, level) for seed, level, _ in mine], task["chunk"])
-                behind.write(
-                    [
-                        Episode.from_track(track, source, robot)
-                        for track, (_, _, source) in zip(tracks, mine, strict=True)
-                    ]
-                )
+                sources = {seed: source for seed, _, source in mine}
+                behind.write([Episode.from_track(track, sources[track.seed], robot) for track in tracks])
                 bar.update(len(mine))
     finally:
         pool.close()
-    write_splits(writer.root, {name: section["episodes"][name] for name in SPLITS})
+    made, planned = _recorded_seeds(writer), iter(jobs)
+    splits = {name: list(islice(planned, section["episodes"][name])) for name in SPLITS}
+    write_splits(
+        writer.root, {name: sum(seed in made for seed, _, _ in part) for name, part in splits.items()}
+    )
     store = open_clips(cfg, [writer.root])
     return {
         "episodes": len(store),
+        "dropped": len(jobs) - len(store),
         "held_out": len(store.split("held_out")),
         "frames": int(store.length.sum()),
         "successes": sum(bool(row["success"]) for row in store.episodes),
         "expert_failures": _failures(cfg, store, folder),
     }
+
+
+def _recorded_seeds(writer: LeRobotWriter) -> list[int]:
+    """Seeds of the episodes that are written, in their order."""
+    if not writer.shards:
+        return []
+    return list(dict.fromkeys(LeRobotDataset(writer.root).column(SEED).flatten().tolist()))
+
+
+def _next_job(writer: LeRobotWriter, jobs: list[tuple[int, float, str]]) -> int:
+    """Where to go on: after the last job that left an episode; some before may have been dropped."""
+    made = _recorded_seeds(writer)
+    return 1 + [seed for seed, _, _ in jobs].index(made[-1]) if made else 0
 
 
 def _seal_shards(folder: Path, writer: LeRobotWriter) -> None:
@@ -137,19 +153,21 @@ def deploy(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     seeds = episode_seeds(cfg["seed"], Purpose.DEPLOY, episodes, offset=100_000 * number)
     data = folder / "dataset"
     shutil.rmtree(data, ignore_errors=True)  # a deployment is short; half of one is begun anew
-    won: list[bool] = []
+    won, played = list[bool](), list[int]()
     with WriteBehind(LeRobotWriter(data, robot)) as behind:
         for tracks in run_recorded(cfg, policy, seeds):
             behind.write([Episode.from_track(track, f"policy-{number}", robot) for track in tracks])
             won += [bool(track.rows["success"][-1]) for track in tracks]
-    counts = split_counts(episodes, cfg["rounds"]["splits"])
+            played += [track.seed for track in tracks]
+    counts = split_counts(len(won), cfg["rounds"]["splits"])
     write_splits(data, counts)
     success = torch.tensor(won)
     return {
         "episodes": len(success),
+        "dropped": episodes - len(success),
         "held_out": counts["held_out"],
         "true_stochastic": rate_entry(success),
-        "tasks": by_task(tasks_of_seeds(cfg, seeds), rate_entry, success),
+        "tasks": by_task(tasks_of_seeds(cfg, played), rate_entry, success),
         "success": float(success.float().mean()),
     }
 
@@ -162,7 +180,7 @@ def split_counts(episodes: int, shares: Mapping[str, float]) -> dict[str, int]:
 
 def run_recorded(cfg: Cfg, policy: Any, seeds: list[int], stochastic: bool = True) -> Iterator[list[Track]]:
     """Recorded episodes of a policy in physics, in the order of the seeds, as many at once as run side by
-    side.
+    side; those in which physics crashes again and again are missing.
     """
     env = build_physics(cfg, batch=min(_SIDE_BY_SIDE, len(seeds)), record=True)
     try:
@@ -177,7 +195,7 @@ def run_recorded(cfg: Cfg, policy: Any, seeds: list[int], stochastic: bool = Tru
                 sampling_seed=cfg["seed"] * 1000 + begin,
             )
             tracks = {track.seed: track for track in env.pop_tracks()}
-            yield [tracks[seed] for seed in part]
+            yield [tracks[seed] for seed in part if seed in tracks]
     finally:
         env.close()
 

@@ -53,8 +53,8 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     tasks = tasks_of_episodes(cfg, store, mine)
     result = {
         "round": number,
-        **_gap(truth, outcome.success, outcome.judged),
-        "tasks": by_task(tasks, _gap, truth, outcome.success, outcome.judged),
+        **_gap(truth, outcome.success, outcome.counted),
+        "tasks": by_task(tasks, _gap, truth, outcome.success, outcome.counted),
     }
     held = store.split("held_out")
     held = held[torch.isin(held, store.select(["policy-*"]))]
@@ -79,13 +79,18 @@ def evaluate_physics(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         outcome = evaluate(env, policy, seeds, label="physics")
     finally:
         env.close()
-    kept = {"success": outcome.success, "progress": outcome.progress, "seeds": torch.tensor(seeds)}
+    kept = {
+        "success": outcome.success,
+        "counted": outcome.counted,
+        "progress": outcome.progress,
+        "seeds": torch.tensor(seeds),
+    }
     write_atomically(folder / "outcomes.pt", lambda path: torch.save(kept, path))
     return {
         "rate": outcome.rate,
-        **rate_entry(outcome.success),
-        "tasks": by_task(tasks_of_seeds(cfg, seeds), rate_entry, outcome.success),
-        "progress": float(outcome.progress.mean()),
+        **_counted(outcome.success, outcome.counted),
+        "tasks": by_task(tasks_of_seeds(cfg, seeds), _counted, outcome.success, outcome.counted),
+        "progress": float(outcome.progress[outcome.counted].mean()),
         "evaluation_seconds": time.perf_counter() - began,
     }
 
@@ -107,21 +112,21 @@ def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         policy = build_policy(cfg, inputs.weights(label))
         outcome = evaluate(world, policy, list(range(len(starts))), label=f"imagined {label}")
         out[label] = {
-            **_imagined(outcome.success, outcome.judged),
-            "tasks": by_task(tasks, _imagined, outcome.success, outcome.judged),
-            "scenes": by_scene(tasks, scenes, _imagined, outcome.success, outcome.judged),
+            **_counted(outcome.success, outcome.counted),
+            "tasks": by_task(tasks, _counted, outcome.success, outcome.counted),
+            "scenes": by_scene(tasks, scenes, _counted, outcome.success, outcome.counted),
         }
     return out
 
 
-def _imagined(success: Tensor, judged: Tensor) -> dict[str, Any]:
-    """A rate entry of what the judge gave a judgement on, and how many it dropped."""
-    return {**rate_entry(success[judged]), "dropped": int((~judged).sum())}
+def _counted(success: Tensor, counted: Tensor) -> dict[str, Any]:
+    """A rate entry of the episodes that count, and how many were dropped."""
+    return {**rate_entry(success[counted]), "dropped": int((~counted).sum())}
 
 
-def _gap(truth: Tensor, success: Tensor, judged: Tensor) -> dict[str, Any]:
+def _gap(truth: Tensor, success: Tensor, counted: Tensor) -> dict[str, Any]:
     """True and imagined rates of the same starts, and how far they lie apart."""
-    imagined = success[judged]
+    imagined = success[counted]
     return {
         "true": rate_entry(truth),
         "imagined": rate_entry(imagined),
