@@ -50,6 +50,23 @@ def test_a_shard_that_is_spoiled_before_the_stage_ends_is_found(tmp_path: Path) 
     assert video.relative_to(tmp_path).as_posix() in sealed
 
 
+def test_an_episode_that_crashes_physics_is_left_out_of_its_split(tmp_path: Path) -> None:
+    cfg = load_config(["experiment=soak", "launch.workers=2"])
+    cfg["task"] |= {"suite": {"_target_": "tests.envs.physics.sections.Counting", "fault": "exit"}}
+    cfg["task"] |= {"name": "count", "size": [4, 4], "horizon": 4, "mode": "absolute"}
+    cfg["collect"] |= {"shard": 2, "mix": {"expert": 0.93, "random": 0.07}}  # it is the random ones that crash
+    cfg["collect"]["episodes"] = {"train": 2, "held_out": 2, "calibration": 2}
+    sources = [source for _, _, source in scripted_jobs(cfg)]
+    assert sources.count("random") == 1
+    for _ in range(2):  # the second goes on after the last episode, so there is nothing to do
+        said = collect.run(collect.view("collect", cfg, {}), tmp_path, Inputs())
+        assert (said["episodes"], said["dropped"], said["held_out"]) == (
+            5,
+            1,
+            2 - sources[2:4].count("random"),
+        )
+
+
 def test_any_prefix_of_the_scripted_episodes_is_mixed() -> None:
     cfg = load_config(["experiment=smoke"])
     jobs = scripted_jobs(cfg)
