@@ -54,7 +54,10 @@ def test_an_episode_that_crashes_physics_is_left_out_of_its_split(tmp_path: Path
     cfg = load_config(["experiment=soak", "launch.workers=2"])
     cfg["task"] |= {"suite": {"_target_": "tests.envs.physics.sections.Counting", "fault": "exit"}}
     cfg["task"] |= {"name": "count", "size": [4, 4], "horizon": 4, "mode": "absolute"}
-    cfg["collect"] |= {"shard": 2, "mix": {"expert": 0.93, "random": 0.07}}  # it is the random ones that crash
+    cfg["collect"] |= {
+        "shard": 2,
+        "mix": {"expert": 0.93, "random": 0.07},
+    }  # it is the random ones that crash
     cfg["collect"]["episodes"] = {"train": 2, "held_out": 2, "calibration": 2}
     sources = [source for _, _, source in scripted_jobs(cfg)]
     assert sources.count("random") == 1

@@ -66,6 +66,25 @@ def test_a_bundle_comes_back_as_it_was(shared: Path, tmp_path: Path) -> None:
         convert(tmp_path / "lerobot", tmp_path / "bundles", Cut())
 
 
+def test_a_conversion_goes_on_where_it_broke_off(shared: Path, tmp_path: Path) -> None:
+    source, target, cut = tmp_path / "clips", tmp_path / "lerobot", Cut(frames=4, size=(32, 32))
+    shutil.copytree(shared / "data/bridge", source)
+    numbers = source / "000000003.npz"
+    content = numbers.read_bytes()
+    numbers.write_bytes(content[:100])
+    with pytest.raises(EpisodeError, match=numbers.name):
+        convert(source, target, cut)
+    numbers.write_bytes(content)
+    with pytest.raises(EpisodeError, match="half of another conversion"):
+        convert(source, target, Cut(frames=5))
+    made = {path: path.stat().st_mtime_ns for path in target.rglob("file-*.*")}
+    assert convert(source, target, cut) == 5 and not list(target.glob(".*"))
+    assert made and all(path.stat().st_mtime_ns == then for path, then in made.items())
+    convert(source, tmp_path / "at once", cut)
+    for one, other in zip(LeRobotDataset(target), LeRobotDataset(tmp_path / "at once"), strict=True):
+        assert np.array_equal(one.frames, other.frames) and np.array_equal(one.commands, other.commands)
+
+
 def test_two_conversions_into_one_folder_are_one_too_many(shared: Path, tmp_path: Path) -> None:
     with (
         owning(tmp_path, "convert there here"),
