@@ -37,6 +37,7 @@ _SECTIONS = {
     "chaos": sections.ChaosSection,
     "evaluate": sections.EvaluateSection,
     "measure": sections.MeasureSection,
+    "study": sections.StudySection,
     "track": sections.TrackSection,
     "serve": ServeConfig,
     "judge.rewards": Rewards,

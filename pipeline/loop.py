@@ -68,6 +68,19 @@ def of_round(values: Sequence[T], number: int) -> T:
     return values[min(number, len(values)) - 1]
 
 
+def deployed_episodes(cfg: Cfg) -> int:
+    """Physics episodes of all deployments; the last one is of what the last round has learned."""
+    return sum(of_round(cfg["rounds"]["deploy"], n) for n in range(1, last_round(cfg) + 2))
+
+
+def imagined_iterations(cfg: Cfg) -> int:
+    """Iterations of RL whose episodes, if they were whole, would take as many steps as all rounds imagine."""
+    iterations = sum(of_round(cfg["rounds"]["iterations"], n) for n in range(1, last_round(cfg) + 1))
+    whole = cfg["task"]["horizon"] // cfg["task"]["chunk"]
+    share = min(1.0, (cfg["rl"]["chunks"] or whole) / whole)  # of a whole episode, has an imagined one
+    return max(1, round(iterations * share))
+
+
 def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
     data: list[str] = [graph.add("collect", collect.collect)]
     first = policy = best = graph.add("imitation", imitation.imitation, {"data": data})

@@ -159,6 +159,30 @@ class MeasureSection:
 
 
 @dataclass(frozen=True)
+class StudySection:
+    """Section study; methods and measures are checked when a study is planned."""
+
+    rows: Annotated[Sequence[Name], MinLen(1)]
+    columns: Annotated[Sequence[Name], MinLen(1)]
+    seeds: Annotated[Sequence[Seed], MinLen(1)]
+    against: Sequence[Name]
+    only: Sequence[Name]
+    minutes: NonNegative | None
+    methods: Mapping[str, Mapping[str, Any]]
+    measures: Mapping[str, Choice]
+
+
+@dataclass(frozen=True)
+class RowSection:
+    """A section of study.methods."""
+
+    title: Name
+    changes: Sequence[Name]
+    seeds: Count | None
+    policy: Choice
+
+
+@dataclass(frozen=True)
 class TrackSection:
     """Section track."""
 

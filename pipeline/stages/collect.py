@@ -70,6 +70,7 @@ def collect(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         "frames": int(store.length.sum()),
         "successes": sum(bool(row["success"]) for row in store.episodes),
         "expert_failures": _failures(cfg, store, folder),
+        "physics_episodes": {"scripted": len(store)},
     }
 
 
@@ -138,6 +139,7 @@ def deploy(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         "true_stochastic": rate_entry(success),
         "tasks": by_task(tasks_of_seeds(cfg, seeds), rate_entry, success),
         "success": float(success.float().mean()),
+        "physics_episodes": {"own": len(success)},
     }
 
 

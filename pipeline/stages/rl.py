@@ -152,4 +152,4 @@ def rl_in_physics(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, An
         fleet.close()
     save_weights(policy, folder)
     stats.pop("last")
-    return dict(stats)
+    return {**stats, "physics_episodes": {"own": stats["episodes"]}}
