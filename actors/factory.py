@@ -97,11 +97,19 @@ def build_physics(
         raise ConfigError(str(error)) from error
 
 
-def build_pool(cfg: Mapping[str, Any]) -> TaskPool:
-    """Worker processes that run scripted episodes of the task, one slot each."""
+def build_pool(
+    cfg: Mapping[str, Any], changes: Mapping[str, Any] | None = None, horizon: int | None = None
+) -> TaskPool:
+    """Worker processes that run scripted episodes of the task, one slot each.
+
+    Args:
+        changes: see build_physics.
+        horizon: actions of an episode, the task's by default; 0 only lays it out.
+    """
     task, workers = cfg["task"], cfg["launch"]["workers"] or available_cores()
+    actions = task["horizon"] if horizon is None else horizon
     try:
-        return TaskPool(task["suite"], task["name"], workers, task["horizon"], workers)
+        return TaskPool({**task["suite"], **(changes or {})}, task["name"], workers, actions, workers)
     except (SuiteError, EmbodimentError) as error:
         raise ConfigError(str(error)) from error
 

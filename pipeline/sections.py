@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from annotated_types import Ge, MinLen, MultipleOf
+from annotated_types import Ge, Gt, Lt, MinLen, MultipleOf
 
 from envs.ranges import Count, Discount, Natural, NonNegative, Positive, Seed, Share
 
@@ -93,6 +93,16 @@ class RoundsSection:
 
 
 @dataclass(frozen=True)
+class ExtraStartsSection:
+    """Section extra_starts."""
+
+    variants: Sequence[Name]
+    episodes: Count
+    data: Sequence[str] | str
+    share: Annotated[float, Gt(0), Lt(1)]
+
+
+@dataclass(frozen=True)
 class CloneSection:
     """Section clone."""
 
@@ -160,7 +170,7 @@ class MeasureSection:
 
 @dataclass(frozen=True)
 class StudySection:
-    """Section study; methods and measures are checked when a study is planned."""
+    """Section study."""
 
     rows: Annotated[Sequence[Name], MinLen(1)]
     columns: Annotated[Sequence[Name], MinLen(1)]
@@ -178,7 +188,7 @@ class RowSection:
 
     title: Name
     changes: Sequence[Name]
-    seeds: Count | None
+    seeds: Natural
     policy: Choice
 
 

@@ -81,17 +81,17 @@ class Success(Column):
 
     Args:
         title: see Column.
-        variant: one of task.variants; None for the task as it is.
+        variant: one of task.variants; "" for the task as it is.
     """
 
-    def __init__(self, title: str, variant: str | None = None):
+    def __init__(self, title: str, variant: str = ""):
         super().__init__(title)
         self.variant = variant
 
     def add(self, cfg: Cfg, made: Made) -> str:
         """See Column.add."""
         graph, inputs = made.graph, {"policy": made.policy}
-        if self.variant is None:
+        if not self.variant:
             for name, node in graph.nodes.items():  # the loop proves its own first and last policy
                 if node.stage is prove.evaluate_physics and node.inputs == inputs:
                     return name

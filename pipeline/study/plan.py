@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.world_config import check_world
-from envs.targets import ConfigError, build, nearest, options
+from envs.targets import ConfigError, build, options
 from pipeline.cli.words import root_of, without_given
 from pipeline.config import load_config
 from pipeline.loop import has_physics
@@ -115,15 +115,6 @@ def plan_study(words: Sequence[str]) -> Study:
     section = cfg["study"]
     if not has_physics(cfg):
         raise ConfigError("a study measures in physics, which this task has not (task.suite is empty)")
-    for key, known in (
-        ("rows", section["methods"]),
-        ("columns", section["measures"]),
-        ("only", section["rows"]),
-        ("against", section["rows"]),
-    ):
-        for name in section[key]:
-            if name not in known:
-                raise ConfigError(f"study.{key} holds {name!r}, which is unknown{nearest(name, known)}")
     columns = {
         name: build(section["measures"][name], f"study.measures.{name}") for name in section["columns"]
     }
@@ -137,7 +128,7 @@ def plan_study(words: Sequence[str]) -> Study:
         _row(name, sections[name], {**configs[name], "seed": seed}, root, columns)
         for number, seed in enumerate(section["seeds"])
         for name, row in sections.items()
-        if row.seeds is None or number < row.seeds
+        if not row.seeds or number < row.seeds
     ]
     return Study(cfg, root, rows, columns, section["only"] or section["rows"], section["against"])
 

@@ -22,7 +22,8 @@ ROWS = ("imitation", "filtered_bc", "ppo", "physics_episodes")
 SMALL = (
     *("experiment=soak", "track=disabled", "task=tabletop", "task.name=[push,pull]", "task.horizon=20"),
     *("task.suite.cameras=[head]", "study.columns=[success,out_of_domain]", f"study.rows=[{','.join(ROWS)}]"),
-    *("evaluate.episodes=4", "evaluate.envs=4"),
+    *("evaluate.episodes=4", "evaluate.envs=4", "extra_starts.variants=[out_of_domain]"),
+    "extra_starts.episodes=4",
 )
 
 
@@ -48,7 +49,8 @@ def test_a_study_runs_what_is_missing_and_says_what_is_not_run(tmp_path: Path) -
     assert_cells_are_what_the_evaluations_left(words[1:], table_of(root))
     spent = {row["row"]: row["physics_episodes"] for row in table_of(root)["rows"]}
     assert spent["imitation"] == {"scripted": 12}
-    assert spent["ppo"] == spent["filtered_bc"] == spent["physics_episodes"] == {"scripted": 12, "own": 8}
+    assert spent["filtered_bc"] == spent["physics_episodes"] == {"scripted": 12, "own": 8}
+    assert spent["ppo"] == {"scripted": 12, "own": 8, "first frames": 4}
 
     again = worldloop(tmp_path / "logs", *words)
     assert again.status == 0 and "took" not in again.said
@@ -104,7 +106,7 @@ def test_rows_over_seeds_share_evaluation_episodes_and_only_as_many_seeds_as_ask
     [
         (["seed=1"], "say study.seeds=[1]"),
         (["study.rows=[imitation,pp]"], "study.rows holds 'pp'"),
-        (["study.only=[grpo]"], "study.only holds 'grpo', which is unknown"),
+        (["study.only=[grpo]"], "study.only holds 'grpo', which study.rows has not"),
         (["study.minutes=-1"], "study.minutes=-1 should be greater than or equal to 0"),
         (["study.methods.ppo.changes=['rl.epoch=2']"], "study.methods.ppo.changes=['rl.epoch=2']: rl.epoch"),
         (
