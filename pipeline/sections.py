@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from annotated_types import Ge, MinLen, MultipleOf
+from annotated_types import Ge, Gt, Lt, MinLen, MultipleOf
 
 from envs.ranges import Count, Discount, Natural, NonNegative, Positive, Seed, Share
 
@@ -93,6 +93,16 @@ class RoundsSection:
 
 
 @dataclass(frozen=True)
+class ExtraStartsSection:
+    """Section extra_starts."""
+
+    variants: Sequence[Name]
+    episodes: Count
+    data: Sequence[str] | str
+    share: Annotated[float, Gt(0), Lt(1)]
+
+
+@dataclass(frozen=True)
 class CloneSection:
     """Section clone."""
 
@@ -156,6 +166,30 @@ class MeasureSection:
     worst: Natural
     starts: Count
     speed_chunks: Count
+
+
+@dataclass(frozen=True)
+class StudySection:
+    """Section study."""
+
+    rows: Annotated[Sequence[Name], MinLen(1)]
+    columns: Annotated[Sequence[Name], MinLen(1)]
+    seeds: Annotated[Sequence[Seed], MinLen(1)]
+    against: Sequence[Name]
+    only: Sequence[Name]
+    minutes: NonNegative | None
+    methods: Mapping[str, Mapping[str, Any]]
+    measures: Mapping[str, Choice]
+
+
+@dataclass(frozen=True)
+class RowSection:
+    """A section of study.methods."""
+
+    title: Name
+    changes: Sequence[Name]
+    seeds: Natural
+    policy: Choice
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,8 @@ def train_rl(
     Args:
         fleet: hosts of config.envs / config.shards episodes each; the policy's trained tensors are published
             to it. Of several workers only the leading one has one.
-        starts: number of start frames in imagination; in physics, the seeds that may be used.
+        starts: number of start frames in imagination, or their numbers, some more often than others; in
+            physics, the seeds that may be used.
         folder: receives checkpoints, metrics.jsonl and learned.jsonl, the jobs that were learned from; a
             checkpoint found there is resumed.
         true: what RLConfig.recorded and RLConfig.anchor speak of.

@@ -18,7 +18,7 @@ from pipeline.cli.words import Words
 COMMANDS: dict[str, Callable[[Words], None]] = {
     command.__name__: command
     for command in (
-        *(runs.run, runs.rl, runs.stage, runs.stages, runs.evaluate, runs.trust, runs.controls),
+        *(runs.run, runs.rl, runs.stage, runs.stages, runs.evaluate, runs.trust, runs.controls, runs.study),
         *(runs.compare, runs.finetune, tools.serve, tools.play, tools.convert, tools.inspect, tools.bench),
         *(tools.verify, tools.submit, tools.chaos, tools.tasks, tools.config, tools.doctor, tools.completion),
     )

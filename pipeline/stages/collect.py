@@ -80,6 +80,7 @@ def collect(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         "frames": int(store.length.sum()),
         "successes": sum(bool(row["success"]) for row in store.episodes),
         "expert_failures": _failures(cfg, store, folder),
+        "physics_episodes": {"scripted": len(store)},
     }
 
 
@@ -141,6 +142,37 @@ def scripted_jobs(cfg: Cfg) -> list[tuple[int, float, str]]:
     return jobs
 
 
+@stage(reads=(*ROBOT, "extra_starts.episodes", "task.variants.{variant}"))
+def first_frames(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """How episodes of a variant of the task begin, as a data set of single frames: physics lays them out and
+    is asked for no step.
+
+    Settings: variant, its name in task.variants.
+    """
+    seeds = episode_seeds(cfg["seed"], Purpose.STARTS, cfg["extra_starts"]["episodes"])
+    changes, robot = cfg["task"]["variants"][inputs.settings["variant"]], world_spec(cfg).embodiment
+    data = folder / "dataset"
+    shutil.rmtree(data, ignore_errors=True)
+    pool = build_pool(cfg, changes, horizon=0)
+    try:
+        tracks = pool.script([(seed, 0.0) for seed in seeds], cfg["task"]["chunk"])
+    finally:
+        pool.close()
+    LeRobotWriter(data, robot).write([Episode.from_track(track, "start", robot) for track in tracks])
+    return {"starts": len(open_clips(cfg, [data])), "physics_episodes": {"first frames": len(seeds)}}
+
+
+@stage(reads=(*ROBOT, "extra_starts.data"))
+def recorded_starts(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """Recorded data sets whose episodes' first frames are starts; nothing is copied.
+
+    Settings: fingerprint of the data sets.
+    """
+    paths = [Path(path).resolve() for path in cfg["extra_starts"]["data"]]
+    write_text(folder / DATASETS, json.dumps([str(path) for path in paths]))
+    return {"starts": len(open_clips(cfg, paths))}
+
+
 @stage(reads=(*PHYSICS, "rounds.splits"))
 def deploy(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Episodes of the current stochastic policy in physics, recorded whole.
@@ -169,6 +201,7 @@ def deploy(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         "true_stochastic": rate_entry(success),
         "tasks": by_task(tasks_of_seeds(cfg, played), rate_entry, success),
         "success": float(success.float().mean()),
+        "physics_episodes": {"own": len(success)},
     }
 
 
@@ -224,8 +257,11 @@ def recordings(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     }
 
 
-def fingerprint(paths: list[str]) -> str:
+def fingerprint(paths: list[str], key: str = "task.data") -> str:
     """Changes when recorded data sets do: a hash of their info.json.
+
+    Args:
+        key: of the config, that names them.
 
     Raises:
         ConfigError: for a folder that is no LeRobot v3.0 data set.
@@ -235,7 +271,7 @@ def fingerprint(paths: list[str]) -> str:
         info = Path(path) / "meta" / "info.json"
         if not info.is_file():
             raise ConfigError(
-                f"task.data: {info} is missing; name folders of LeRobot v3.0 data sets (`worldloop convert`"
+                f"{key}: {info} is missing; name folders of LeRobot v3.0 data sets (`worldloop convert`"
                 " makes them of other recordings)"
             )
         texts.append(info.read_text())

@@ -35,7 +35,8 @@ PHYSICS = (*POLICY, "judge.rewards")
 # What a report shows.
 EVERYTHING = (
     *("name", "seed", "threads", "microbatches", "task", "simulator", "judge", "policy", "algorithm", "rl"),
-    *("rounds", "collect", "imitation", "clone", "tokenizer_fit", "simulator_fit", "state_fit", "judge_fit"),
+    *("rounds", "collect", "imitation", "extra_starts", "clone", "tokenizer_fit", "simulator_fit"),
+    *("state_fit", "judge_fit"),
     *("evaluate", "measure"),
 )
 

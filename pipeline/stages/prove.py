@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -69,10 +70,24 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 @stage(reads=(*PHYSICS, "evaluate"), place=Place.EVALUATOR)
 def evaluate_physics(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Deterministic success in physics on the evaluation seeds."""
+    return _true_success(cfg, folder, inputs, {})
+
+
+@stage(reads=(*PHYSICS, "evaluate", "task.variants.{variant}"), place=Place.EVALUATOR)
+def evaluate_variant(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """The same on the same seeds in a variant of the task: other scenes, other words.
+
+    Settings: variant, its name in task.variants.
+    """
+    return _true_success(cfg, folder, inputs, cfg["task"]["variants"][inputs.settings["variant"]])
+
+
+def _true_success(cfg: Cfg, folder: Path, inputs: Inputs, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Deterministic success in physics, the suite's options changed; outcomes.pt has that of each seed."""
     section = cfg["evaluate"]
     prepare_process(cfg["seed"], cfg["threads"])
     policy = build_policy(cfg, inputs.weights("policy"))
-    env = build_physics(cfg, section["envs"])
+    env = build_physics(cfg, section["envs"], changes=changes)
     began = time.perf_counter()
     try:
         seeds = episode_seeds(cfg["seed"], Purpose.EVALUATE, section["episodes"])

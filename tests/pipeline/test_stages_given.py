@@ -99,10 +99,10 @@ def test_seeds_of_purposes_and_experiments_never_meet() -> None:
     drawn = [
         set(episode_seeds(seed, purpose, 1000))
         for seed in (0, 1)
-        for purpose in (Purpose.COLLECT, Purpose.DEPLOY, Purpose.PRACTICE)
+        for purpose in (Purpose.COLLECT, Purpose.DEPLOY, Purpose.PRACTICE, Purpose.STARTS)
     ]
     evaluation = set(episode_seeds(0, Purpose.EVALUATE, 1000))
-    assert len(set().union(*drawn, evaluation)) == 7000
+    assert len(set().union(*drawn, evaluation)) == 9000
     assert evaluation == set(episode_seeds(1, Purpose.EVALUATE, 1000))
 
 
