@@ -37,6 +37,8 @@ _SECTIONS = {
     "chaos": sections.ChaosSection,
     "evaluate": sections.EvaluateSection,
     "measure": sections.MeasureSection,
+    "imagined": sections.ImaginedSection,
+    "policy_value": sections.PolicyValueSection,
     "track": sections.TrackSection,
     "serve": ServeConfig,
     "judge.rewards": Rewards,
@@ -99,6 +101,10 @@ def _alone(cfg: Cfg) -> Iterator[str]:
         for name, changes in variants.items():
             if isinstance(changes, Mapping):
                 yield from section_faults({**suite, **changes}, f"task.variants.{name}")
+    others = _at(cfg, "policy_value.others")
+    for name, section in others.items() if isinstance(others, Mapping) else ():
+        if isinstance(section, Mapping):
+            yield from section_faults(section, f"policy_value.others.{name}", ("weights",))
     world = {name: value for name, value in cfg["simulator"].items() if name in WORLD_OPTIONS}
     yield from _of(sections.WorldSection, world, "simulator")
 

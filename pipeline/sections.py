@@ -159,6 +159,29 @@ class MeasureSection:
 
 
 @dataclass(frozen=True)
+class ImaginedSection:
+    """Section imagined."""
+
+    simulator: Name | None
+    state: Name | None
+    judge: Name | None
+    data: Sequence[str]
+
+
+@dataclass(frozen=True)
+class PolicyValueSection:
+    """Section policy_value."""
+
+    policies: Sequence[Name]
+    others: Mapping[Name, Choice] | None
+    noise: Sequence[Positive]
+    experts: Sequence[Share]
+    starts: Annotated[int, Ge(2)]
+    repeats: Count
+    stochastic: bool
+
+
+@dataclass(frozen=True)
 class TrackSection:
     """Section track."""
 

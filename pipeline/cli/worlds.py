@@ -1,0 +1,18 @@
+"""Commands that say how far an imagined world can be trusted; their options are sections of the config."""
+
+from __future__ import annotations
+
+from pipeline.cli.words import Words, prepared
+
+
+def policy_value(words: Words) -> None:
+    """values of policies in an imagined world beside their true ones: worldloop policy-value experiment=...
+    [policy_value.policies=[rl-1,rl-2]] [policy_value.starts=32] [imagined.simulator=<stage|folder>]
+    """
+    cfg, root = prepared(words)
+    from pipeline.commands.worlds.policy_value import policy_value as estimate
+    from pipeline.graph.owner import owning
+
+    with owning(root, "policy-value"):
+        print(estimate(cfg, root))
+    print(f"{root}/policy-value.html, {root}/policy-value.json")
