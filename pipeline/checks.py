@@ -39,6 +39,9 @@ _SECTIONS = {
     "measure": sections.MeasureSection,
     "imagined": sections.ImaginedSection,
     "policy_value": sections.PolicyValueSection,
+    "fidelity": sections.FidelitySection,
+    "fidelity.long": sections.LongSection,
+    "sweep": sections.SweepSection,
     "track": sections.TrackSection,
     "serve": ServeConfig,
     "judge.rewards": Rewards,
@@ -56,6 +59,8 @@ _TARGETS = {
     "policy": (),
     "algorithm": (),
     "task.suite": (),
+    "fidelity.frames_extractor": (),
+    "fidelity.clips_extractor": (),
 }
 _TOP = {key.partition(".")[0] for key in (*_SECTIONS, *_FITS, *_SIMULATOR_FITS, *_TARGETS, "rl", "launch")}
 

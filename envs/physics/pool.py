@@ -101,7 +101,7 @@ class _Remote:
         """The episodes that were asked for, in words; "" if none were."""
         name, arguments = self._request or ("", ())
         seeds: list[int] = []
-        if name == "script":
+        if name in ("script", "segment"):
             seeds = [seed for seed, _ in arguments[0]]
         elif name == "reset":
             seeds = list(arguments[0].values())
@@ -214,16 +214,24 @@ class TaskPool:
 
     def script(self, jobs: list[tuple[int, float]], chunk: int) -> list[Track]:
         """Scripted episodes for (seed, noise_level) pairs, in the order of `jobs`; see Worker.script."""
+        return self._deal("script", jobs, chunk)
+
+    def segment(self, jobs: list[tuple[int, NDArray[Any]]]) -> list[tuple[NDArray[np.uint8] | None, Any]]:
+        """Labels and pictures of repeated episodes, in the order of `jobs`; see Worker.segment."""
+        return self._deal("segment", jobs)
+
+    def _deal(self, name: str, jobs: list[Any], *extra: Any) -> list[Any]:
+        """What a method of Worker that takes a list of jobs gives, each job by whoever is free."""
         if self._inline is not None:
-            return self._inline.script(jobs, chunk)
+            return list(getattr(self._inline, name)(jobs, *extra))
         waiting = deque(enumerate(jobs))
         busy: dict[Connection, tuple[_Remote, int]] = {}
-        tracks: dict[int, Track] = {}
+        made: dict[int, Any] = {}
 
         def give(remote: _Remote) -> None:
             if waiting:
                 number, job = waiting.popleft()
-                remote.send("script", [job], chunk)
+                remote.send(name, [job], *extra)
                 busy[remote.pipe] = remote, number
 
         for remote in self._remotes:
@@ -232,9 +240,9 @@ class TaskPool:
             for pipe in wait(list(busy)):
                 assert isinstance(pipe, Connection)
                 remote, number = busy.pop(pipe)
-                (tracks[number],) = remote.answer()
+                (made[number],) = remote.answer()
                 give(remote)
-        return [tracks[number] for number in range(len(jobs))]
+        return [made[number] for number in range(len(jobs))]
 
     def picture(self, seed: int, size: tuple[int, int]) -> NDArray[np.uint8]:
         """Pictures for people of an episode's start, uint8 [V, 3, H, W]."""

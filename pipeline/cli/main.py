@@ -21,6 +21,7 @@ COMMANDS: dict[str, Callable[[Words], None]] = {
         *(runs.run, runs.rl, runs.stage, runs.stages, runs.evaluate, runs.trust, runs.controls),
         *(
             worlds.policy_value,
+            worlds.fidelity,
             runs.compare,
             runs.finetune,
             tools.serve,

@@ -16,3 +16,16 @@ def policy_value(words: Words) -> None:
     with owning(root, "policy-value"):
         print(estimate(cfg, root))
     print(f"{root}/policy-value.html, {root}/policy-value.json")
+
+
+def fidelity(words: Words) -> None:
+    """generated against true video under recorded actions, long rollouts, and options at inference: worldloop
+    fidelity experiment=... [fidelity.masks=FILE] [fidelity.grid={simulator.<option>:[1,2]}]
+    """
+    cfg, root = prepared(words)
+    from pipeline.commands.worlds.fidelity import fidelity as measure
+    from pipeline.graph.owner import owning
+
+    with owning(root, "fidelity"):
+        print(measure(cfg, root))
+    print(f"{root}/fidelity.html, {root}/fidelity.json")

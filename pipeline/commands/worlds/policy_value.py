@@ -98,7 +98,7 @@ def policy_value(cfg: Mapping[str, Any], root: Path) -> str:
             if physics:
                 physics.close()
     result = {
-        **about_world(cfg, subject),
+        **subject.about(),
         "starts": {task: len(episodes) for task, episodes in starts.items()},
         "repeats": section["repeats"],
         "cells": [cell.row() for cell in cells],
@@ -153,16 +153,6 @@ def identity_of(candidate: Candidate, section: Mapping[str, Any], spread: Tensor
     weights = "" if candidate.weights is None else mark(candidate.weights)
     unit = [round(value, 6) for value in spread.tolist()] if candidate.noise else []
     return {**about, "weights": weights, "stochastic": section["stochastic"], "spread": unit}
-
-
-def about_world(cfg: Mapping[str, Any], subject: Subject) -> dict[str, Any]:
-    """What was looked at, for people: name, classes of simulator and judge, and the weights' files."""
-    return {
-        "name": cfg["name"],
-        "simulator": str(cfg["simulator"]["_target_"]).rpartition(".")[2],
-        "judge": str(cfg["judge"]["_target_"]).rpartition(".")[2],
-        "weights": {role: str(path) for role, path in subject.weights.items()},
-    }
 
 
 def notes(

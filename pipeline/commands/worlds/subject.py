@@ -102,6 +102,15 @@ class Subject:
         """The judge."""
         return _with_weights(build_judge(self.cfg), self.weights["judge"]).eval()
 
+    def about(self) -> dict[str, Any]:
+        """What is looked at, for people: name, classes of simulator and judge, and the weights' files."""
+        return {
+            "name": self.cfg["name"],
+            "simulator": str(self.cfg["simulator"]["_target_"]).rpartition(".")[2],
+            "judge": str(self.cfg["judge"]["_target_"]).rpartition(".")[2],
+            "weights": {role: str(path) for role, path in self.weights.items()},
+        }
+
     def identity(self, *roles: str) -> dict[str, Any]:
         """What tells this world from others, as far as some of its parts go: sections and weights."""
         sections = {"simulator": "simulator", "state": "simulator", "judge": "judge"}

@@ -77,7 +77,7 @@ def test_without_physics_values_are_estimated_alone(
     ]
     assert all("true" not in cell for cell in result["cells"])
     assert "Fewer held-out starts than policy_value.starts=32" in said
-    other = "policy_value.others={mine: {_target_: actors.policies.chunk_gaussian.ChunkGaussian, nope: 1}}"
+    other = "policy_value.others={mine: {_target_: actors.policies.vla.ChunkPolicy, nope: 1}}"
     with pytest.raises(ConfigError, match=r"policy_value\.others\.mine\.nope is not an option"):
         load_config([*words, other])
     nobody = load_config([*words, "policy_value.policies=[nobody]"])
