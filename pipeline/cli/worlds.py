@@ -29,3 +29,16 @@ def fidelity(words: Words) -> None:
     with owning(root, "fidelity"):
         print(measure(cfg, root))
     print(f"{root}/fidelity.html, {root}/fidelity.json")
+
+
+def sweep(words: Words) -> None:
+    """move one number of the action at a time and draw what is imagined: worldloop sweep experiment=...
+    [sweep.episode=0] [sweep.levels=[-2,2]]
+    """
+    cfg, root = prepared(words)
+    from pipeline.commands.worlds.sweep import sweep as draw
+    from pipeline.graph.owner import owning
+
+    with owning(root, "sweep"):
+        for path in draw(cfg, root):
+            print(path)

@@ -45,6 +45,8 @@ def fidelity(cfg: Cfg, root: Path) -> str:
     settled = [with_settings(cfg, settings) for settings in combinations(tried)] if tried else []
     extractors = build_extractors(section)
     subject = Subject.of(cfg, root)
+    for other in settled:  # options that change what the weights are of are refused here
+        subject.simulator(other)
     store = subject.store()
     episodes = chosen(subject, store, section["episodes"])
     simulator = subject.simulator()
