@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from actors.factory import build_judge, build_policy, build_pool, build_simulator, build_state_decoder
 from actors.process import prepare_process
 from actors.world_config import world_spec
@@ -20,6 +22,10 @@ def untrained_world(cfg: Mapping[str, Any], root: Path) -> list[str]:
     """
     prepare_process(cfg["seed"])
     simulator = build_simulator(cfg)
+    with torch.no_grad():
+        for parameter in simulator.parameters():
+            if not parameter.any():  # what begins at zero, so that training starts gently, would show nothing
+                parameter.normal_(std=0.05)
     parts = {
         "simulator": simulator,
         "state": build_state_decoder(cfg, simulator),

@@ -194,16 +194,16 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
 
 def test_a_right_world_is_measured_as_right(store: ClipStore) -> None:
     labels = torch.ones(20, store.whole(torch.arange(20))[0].shape[1], 3, 32, 32, dtype=torch.uint8)
-    loop = OpenLoop(store, torch.arange(20), False, labels, (PyramidFrames(), PyramidClips()), clip=4)
+    loop = OpenLoop(store, torch.arange(8), False, labels[:8], (PyramidFrames(), PyramidClips()), clip=4)
     right = loop.measure(Drawing(store.spec, "right")).result(store.spec.embodiment.views, {})
     wrong = loop.measure(Drawing(store.spec, "grey")).result(store.spec.embodiment.views, {})
-    assert right["episodes"] == 20 and len(right["by_frame"]["mse"]) == 12 and len(right["views"]) == 3
+    assert right["episodes"] == 8 and len(right["by_frame"]["mse"]) == 12 and len(right["views"]) == 3
     assert right["overall"]["psnr"] > 25 > wrong["overall"]["psnr"]  # recordings are encoded with loss
     assert right["overall"]["arm_mse"] == pytest.approx(right["overall"]["mse"])
     for one, other in zip(right["frechet"], wrong["frechet"], strict=True):
         assert one["extractor"] == other["extractor"] and one["value"] < other["value"] / 10
-    assert {one["samples"] for one in right["frechet"]} == {20 * 12 * 3, 20 * 3 * 3}
-    still = held_still(store, torch.arange(20), loop.distance)
+    assert {one["samples"] for one in right["frechet"]} == {8 * 12 * 3, 8 * 3 * 3}
+    still = held_still(store, torch.arange(8), loop.distance)
     assert still["mse"][-1] > 5 * right["by_frame"]["mse"][-1]
 
 
