@@ -39,6 +39,11 @@ _SECTIONS = {
     "evaluate": sections.EvaluateSection,
     "measure": sections.MeasureSection,
     "study": sections.StudySection,
+    "imagined": sections.ImaginedSection,
+    "policy_value": sections.PolicyValueSection,
+    "fidelity": sections.FidelitySection,
+    "fidelity.long": sections.LongSection,
+    "sweep": sections.SweepSection,
     "track": sections.TrackSection,
     "serve": ServeConfig,
     "judge.rewards": Rewards,
@@ -56,6 +61,8 @@ _TARGETS = {
     "policy": (),
     "algorithm": (),
     "task.suite": (),
+    "fidelity.frames_extractor": (),
+    "fidelity.clips_extractor": (),
 }
 _TOP = {key.partition(".")[0] for key in (*_SECTIONS, *_FITS, *_SIMULATOR_FITS, *_TARGETS, "rl", "launch")}
 
@@ -102,6 +109,10 @@ def _alone(cfg: Cfg) -> Iterator[str]:
             if isinstance(changes, Mapping):
                 yield from section_faults({**suite, **changes}, f"task.variants.{name}")
     yield from _study(cfg["study"])
+    others = _at(cfg, "policy_value.others")
+    for name, section in others.items() if isinstance(others, Mapping) else ():
+        if isinstance(section, Mapping):
+            yield from section_faults(section, f"policy_value.others.{name}", ("weights",))
     world = {name: value for name, value in cfg["simulator"].items() if name in WORLD_OPTIONS}
     yield from _of(sections.WorldSection, world, "simulator")
 

@@ -193,6 +193,61 @@ class RowSection:
 
 
 @dataclass(frozen=True)
+class ImaginedSection:
+    """Section imagined."""
+
+    simulator: Name | None
+    state: Name | None
+    judge: Name | None
+    data: Sequence[str]
+
+
+@dataclass(frozen=True)
+class PolicyValueSection:
+    """Section policy_value."""
+
+    policies: Sequence[Name]
+    others: Mapping[Name, Choice] | None
+    noise: Sequence[Positive]
+    experts: Sequence[Share]
+    starts: Annotated[int, Ge(2)]
+    repeats: Count
+    stochastic: bool
+
+
+@dataclass(frozen=True)
+class LongSection:
+    """Section fidelity.long."""
+
+    frames: Natural
+    episodes: Count
+    noise_level: Share
+
+
+@dataclass(frozen=True)
+class FidelitySection:
+    """Section fidelity."""
+
+    episodes: Count
+    masks: Name | None
+    clip: Annotated[int, Ge(2)]
+    frames_extractor: Choice
+    clips_extractor: Choice
+    long: Mapping[str, Any]
+    grid: Mapping[Name, Annotated[Sequence[Any], MinLen(1)]] | None
+
+
+@dataclass(frozen=True)
+class SweepSection:
+    """Section sweep."""
+
+    episode: Natural
+    levels: Annotated[Sequence[float], MinLen(1)]
+    chunks: Count
+    pictures: Annotated[int, Ge(2)]
+
+
+@dataclass(frozen=True)
 class TrackSection:
     """Section track."""
 

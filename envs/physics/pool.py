@@ -97,16 +97,28 @@ class TaskPool:
             PoolError: if too many are given up.
         """
         self._begun += len(jobs)
+        return self._deal("script", jobs, chunk)
+
+    def segment(self, jobs: list[tuple[int, NDArray[Any]]]) -> list[tuple[NDArray[np.uint8] | None, Any]]:
+        """Labels and pictures of repeated episodes, in the order of `jobs`; see Worker.segment.
+
+        Raises:
+            PoolError: if an episode crashes physics again and again.
+        """
+        return self._deal("segment", jobs)
+
+    def _deal(self, name: str, jobs: list[Any], *extra: Any) -> list[Any]:
+        """What a method of Worker that takes a list of jobs gives, each job by whoever is free."""
         if self._inline is not None:
-            return self._inline.script(jobs, chunk)
+            return list(getattr(self._inline, name)(jobs, *extra))
         waiting = deque(enumerate(jobs))
         busy: dict[Connection, tuple[WorkerProcess, int]] = {}
-        tracks: dict[int, Track] = {}
+        made: dict[int, Any] = {}
 
         def give(remote: WorkerProcess) -> None:
             if waiting:
                 number, job = waiting.popleft()
-                remote.send("script", [job], chunk)
+                remote.send(name, [job], *extra)
                 busy[remote.pipe] = remote, number
 
         for remote in self._remotes:
@@ -115,11 +127,11 @@ class TaskPool:
             for pipe in wait(list(busy)):
                 assert isinstance(pipe, Connection)
                 remote, number = busy.pop(pipe)
-                for track in remote.answer():
-                    tracks[number] = track
+                for one in remote.answer():
+                    made[number] = one
                 self._check_losses()
                 give(remote)
-        return [tracks[number] for number in sorted(tracks)]
+        return [made[number] for number in sorted(made)]
 
     def picture(self, seed: int, size: tuple[int, int]) -> NDArray[np.uint8]:
         """Pictures for people of an episode's start, uint8 [V, 3, H, W]."""
