@@ -35,7 +35,7 @@ PHYSICS = (*POLICY, "judge.rewards")
 # What a report shows.
 EVERYTHING = (
     *("name", "seed", "microbatches", "task", "simulator", "judge", "policy", "algorithm", "rl", "rounds"),
-    *("collect", "imitation", "clone", "tokenizer_fit", "simulator_fit", "state_fit", "judge_fit"),
+    *("collect", "imitation", "clone", "tokenizer_fit", "simulator_fit", "distill", "state_fit", "judge_fit"),
     *("evaluate", "measure"),
 )
 
