@@ -3,7 +3,8 @@ no regression, no flow loss beside it, and memory that stays clean.
 
 The student makes a chunk, noise is mixed in, and the teacher and a critic say what they would make of it: the
 one in a world like the data, the other in one like the student's. The student moves along their difference.
-The critic is a copy of the teacher that learns to denoise what the student makes, several times as often.
+The critic is a copy of the teacher that learns to denoise what the student makes, several times as often. It
+does not know at which of its steps the student made it: what is matched is the mixture of them.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 
-from envs.ranges import Decay, NonNegative, Positive
+from envs.ranges import Count, Decay, NonNegative, Positive
 from envs.simulators.stepwise import Stepwise
 from learners.stages.distill.method import Generated, Method, Turn, spread
 from learners.training.fit import FitConfig
@@ -43,7 +44,7 @@ class DMD2(Method):
         teacher: Stepwise[Any],
         student: Stepwise[Any],
         config: FitConfig,
-        critic_updates: int,
+        critic_updates: Count,
         shift: Positive,
         critic_shift: Positive,
         critic_lr: Positive,
