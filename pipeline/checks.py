@@ -20,6 +20,7 @@ from learners.rl.algorithm import RLConfig
 from learners.stages.simulator import SimulatorFitConfig
 from learners.training.fit import FitConfig
 from pipeline import sections
+from pipeline.acting import acting
 
 Cfg = Mapping[str, Any]
 
@@ -35,6 +36,7 @@ _SECTIONS = {
     "state_fit.first": sections.StateFitSection,
     "state_fit.refresh": sections.StateFitSection,
     "finetune": sections.FinetuneSection,
+    "distill": sections.DistillSection,
     "chaos": sections.ChaosSection,
     "evaluate": sections.EvaluateSection,
     "measure": sections.MeasureSection,
@@ -54,10 +56,14 @@ _FITS = (
     *(f"{stage}.{phase}.fit" for stage in ("state_fit", "judge_fit") for phase in ("first", "refresh")),
     "finetune.state.fit",
 )
-_SIMULATOR_FITS = ("simulator_fit.first", "simulator_fit.refresh", "finetune.simulator")
+_SIMULATOR_FITS = (
+    *(f"{stage}.{phase}" for stage in ("simulator_fit", "distill") for phase in ("first", "refresh")),
+    "finetune.simulator",
+)
 _TARGETS = {
     "simulator": WORLD_OPTIONS,
     "judge": ("rewards",),
+    "distill.method": (),
     "policy": (),
     "algorithm": (),
     "task.suite": (),
@@ -195,6 +201,10 @@ def _together(cfg: Cfg) -> Iterator[str]:
             f"rl.envs / rl.shards = {rl['envs'] // rl['shards']} must be a multiple of"
             f" algorithm.group={cfg['algorithm']['group']}, or groups would be torn apart"
         )
+    try:
+        acting(cfg)
+    except ConfigError as error:
+        yield str(error)
     parts, learners = cfg["microbatches"], launch.get("learners", 1)
     if parts % learners:
         yield (

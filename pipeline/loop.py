@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pipeline.acting import acting
 from pipeline.graph.graph import Graph
 from pipeline.graph.workers import learners_of
 from pipeline.stages import collect, imitation, keep, prove, rl, show, world
@@ -21,15 +22,19 @@ T = TypeVar("T")
 
 @dataclass
 class World:
-    """Names of the stages that make the imagined world; "" before there is one."""
+    """Names of the stages that make the imagined world; "" before there is one.
 
+    Policies act in `simulator`, which is `teacher`, or its few-step student.
+    """
+
+    teacher: str = ""
     simulator: str = ""
     state: str = ""
     judge: str = ""
 
     def roles(self) -> dict[str, str]:
         """Inputs of whatever runs in it."""
-        return dict(vars(self))
+        return {"simulator": self.simulator, "state": self.state, "judge": self.judge}
 
 
 def build_loop(cfg: Cfg, root: Path, with_rl: bool = True) -> Graph:
@@ -45,7 +50,7 @@ def build_loop(cfg: Cfg, root: Path, with_rl: bool = True) -> Graph:
         ConfigError: for what can be seen to fail before anything starts.
     """
     learners_of(cfg)
-    graph = Graph(cfg, root / "stages")
+    graph = Graph(acting(cfg), root / "stages")
     if has_physics(cfg):
         _physics_loop(graph, cfg, with_rl)
     else:
@@ -149,14 +154,19 @@ def _data_loop(graph: Graph, cfg: Cfg) -> None:
 
 def _refresh(graph: Graph, cfg: Cfg, data: list[str], before: World, number: int) -> World:
     """The stages that train the imagined world on all data so far, from its predecessor if there is one."""
-    phase, warm = ("refresh", before.simulator) if before.simulator else ("first", "")
+    phase, warm = ("refresh", before.teacher) if before.teacher else ("first", "")
+    learning = graph.under(cfg)  # with the simulator as it is, not as it is acted in
     if not warm and "codec" in cfg["simulator"]:
-        warm = graph.add("tokenizer", world.tokenizer, {"data": data})
-    simulator = graph.add(f"simulator-{number}", world.simulator, {"data": data, "warm": warm}, phase=phase)
+        warm = learning.add("tokenizer", world.tokenizer, {"data": data})
+    roles = {"data": data, "warm": warm}
+    simulator = teacher = learning.add(f"simulator-{number}", world.simulator, roles, phase=phase)
+    if cfg["distill"]["steps"]:
+        roles = {"data": data, "simulator": teacher, "warm": before.simulator}
+        simulator = learning.add(f"student-{number}", world.student, roles, phase=phase)
     inputs = {"data": data, "simulator": simulator}
     state = graph.add(f"state-{number}", world.state, {**inputs, "warm": before.state}, phase=phase)
     judge = graph.add(f"judge-{number}", world.judge, {**inputs, "warm": before.judge}, phase=phase)
-    return World(simulator, state, judge)
+    return World(teacher, simulator, state, judge)
 
 
 def _learn(

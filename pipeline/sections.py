@@ -138,6 +138,16 @@ class FinetuneSection:
 
 
 @dataclass(frozen=True)
+class DistillSection:
+    """Section distill."""
+
+    steps: Natural
+    method: Choice
+    first: Mapping[str, Any]
+    refresh: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
 class ChaosSection:
     """Section chaos."""
 

@@ -163,7 +163,7 @@ def finetune(words: Words) -> None:
     graph = build_finetune(cfg, root)
     with owning(root, "finetune"), tracking(cfg, root / "finetune") as tracker:
         graph.run(tracker=tracker)
-    print(f"weights in {graph.folder('simulator')} and {graph.folder('state')}")
+    print(f"weights in {' and '.join(str(graph.folder(name)) for name in graph.nodes)}")
 
 
 def _run_until(name: str, words: Words) -> Path:

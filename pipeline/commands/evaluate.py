@@ -31,6 +31,7 @@ def evaluate_policy(cfg: Mapping[str, Any], root: Path, weights: str = "", world
         ConfigError: for unknown weights and worlds.
     """
     graph = build_loop(cfg, root)
+    cfg = graph.cfg  # of the world that is acted in
     if world not in _WORLDS:
         raise ConfigError(f"world={world!r} must be one of {sorted(_WORLDS)}")
     folder = graph.folder(weights) if weights in graph.nodes else Path(weights)

@@ -47,6 +47,7 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
             "this task is known from recordings alone, and nobody can try other actions in those"
         )
     graph = build_loop(cfg, root)
+    cfg = graph.cfg  # of the world that is acted in
     if f"gap-{number}" not in graph.nodes:
         raise ConfigError(f"round={number}: the rounds of this run are 1 to {cfg['rounds']['count']}")
     inputs = graph.inputs(f"gap-{number}")

@@ -32,12 +32,14 @@ class Node:
         inputs: names of the nodes that it builds on, by role.
         settings: what tells it from other nodes of the same stage.
         identity: what its key is made of.
+        cfg: the resolved config that it is run with.
     """
 
     stage: Stage
     inputs: Mapping[str, str | tuple[str, ...]]
     settings: Mapping[str, Any]
     identity: Identity
+    cfg: Mapping[str, Any]
 
     @property
     def parents(self) -> tuple[str, ...]:
@@ -91,8 +93,14 @@ class Graph:
             roles={role: list(_names(names)) for role, names in roles.items()},
             code=code_of(stage.run.__module__, read),
         )
-        self.nodes[name] = Node(stage, roles, settings, identity)
+        self.nodes[name] = Node(stage, roles, settings, identity, self.cfg)
         return name
+
+    def under(self, cfg: Mapping[str, Any]) -> Graph:
+        """The same graph, to which stages of another config can be added."""
+        other = Graph(cfg, self.root)
+        other.nodes = self.nodes
+        return other
 
     def key(self, name: str) -> str:
         """Hash of the config sections that the node reads, its settings, its parents' keys and its code."""
@@ -114,7 +122,7 @@ class Graph:
     def view(self, name: str) -> ConfigView:
         """The part of the config that a node may read."""
         node = self.nodes[name]
-        return node.stage.view(name, self.cfg, node.settings)
+        return node.stage.view(name, node.cfg, node.settings)
 
     def finished(self, name: str) -> bool:
         """Whether the node's artefact is there."""
@@ -173,8 +181,8 @@ class Graph:
         tqdm.write(f"=== {name}{' (resumed)' if resumed else ''} -> {folder}")
         node = self.nodes[name]
         with WorkClock(folder) as clock, tracker.follow(name, folder):
-            result = run_stage(node.stage, name, self.cfg, folder, self.inputs(name))
-        read = sections(self.cfg, node.stage.reads_of(node.settings))
+            result = run_stage(node.stage, name, node.cfg, folder, self.inputs(name))
+        read = sections(node.cfg, node.stage.reads_of(node.settings))
         manifest = finish(folder, node.identity, read, clock.seconds, result)
         clear_checkpoints(folder)
         tqdm.write(f"    {name} took {clock.seconds:.0f} s {_brief(manifest['result'])}")

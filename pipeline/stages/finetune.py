@@ -1,4 +1,4 @@
-"""Stages of `worldloop finetune`: a simulator and its state expert on recordings."""
+"""Stages of `worldloop finetune`: a simulator, its student and its state expert on recordings."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from learners.stages.state import train_state
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import TASK, Cfg, fit_options
+from pipeline.stages.world import distil
 
 _READS = ("seed", "threads", *TASK, "simulator", "microbatches")
 
@@ -35,6 +36,16 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     stats = train_simulator(model, store, torch.arange(len(store)), how, fit, folder, fresh=fresh)
     save_weights(model, folder)
     return dict(stats)
+
+
+@stage(reads=(*_READS, "distill.steps", "distill.method", "distill.first"), place=Place.LEARNERS)
+def student(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """The few-step student of that simulator, as section distill says.
+
+    Settings: fingerprint of the data.
+    """
+    store = open_clips(cfg, cfg["task"]["data"])
+    return distil(cfg, folder, inputs, "distill.first", store, torch.arange(len(store)))
 
 
 @stage(reads=(*_READS, "finetune.state"), place=Place.LEARNERS)

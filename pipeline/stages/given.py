@@ -35,7 +35,7 @@ PHYSICS = (*POLICY, "judge.rewards")
 # What a report shows.
 EVERYTHING = (
     *("name", "seed", "threads", "microbatches", "task", "simulator", "judge", "policy", "algorithm", "rl"),
-    *("rounds", "collect", "imitation", "extra_starts", "clone", "tokenizer_fit", "simulator_fit"),
+    *("rounds", "collect", "imitation", "extra_starts", "clone", "tokenizer_fit", "simulator_fit", "distill"),
     *("state_fit", "judge_fit"),
     *("evaluate", "measure"),
 )

@@ -16,11 +16,13 @@ from envs.episodes.clips import ClipStore
 from envs.rng import order_generator
 from envs.simulators.base import Simulator
 from envs.targets import ConfigError, options
+from learners.stages.distill.stage import train_student
 from learners.stages.generated import generated_frames
 from learners.stages.judge import calibrate, judge_recordings, train_judge
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
 from learners.stages.tokenizer import train_tokenizer
+from pipeline.acting import acting
 from pipeline.evaluation.judging import episode_success, labelled
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
@@ -75,6 +77,46 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     )
     save_weights(model, folder)
     return {**stats, "parameters": sum(p.numel() for p in model.parameters())}
+
+
+@stage(reads=(*SIMULATOR, "distill.steps", "distill.method", "distill.{phase}"), place=Place.LEARNERS)
+def student(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """The few-step student of the role `simulator`, going on from the role `warm`, the student before, if
+    there is one. Later stages meet it by the config of `acting`.
+
+    Settings: phase, first or refresh.
+    """
+    phase = inputs.settings["phase"]
+    store = open_store(cfg, inputs)
+    episodes = learning_episodes(store)
+    newest = newest_episodes(store, episodes)
+    return distil(cfg, folder, inputs, f"distill.{phase}", store, episodes, newest)
+
+
+def distil(
+    cfg: Cfg,
+    folder: Path,
+    inputs: Inputs,
+    key: str,
+    store: ClipStore,
+    episodes: Tensor,
+    newest: Tensor | None = None,
+) -> dict[str, Any]:
+    """A student trained on some episodes as the section at `key`, such as distill.first, says."""
+    section = dict(cfg["distill"][key.rpartition(".")[2]])
+    fit = fit_options(cfg, section.pop("fit"), f"{key}.fit")
+    how = options(SimulatorFitConfig, section, key)
+    prepare_process(cfg["seed"])
+    teacher = build_simulator(cfg, inputs.weights("simulator"))
+    weights = inputs.weights("warm") or inputs.weights("simulator")
+    model = build_simulator(acting(cfg), weights)
+    method = dict(cfg["distill"]["method"])
+    try:
+        stats = train_student(teacher, model, method, store, episodes, how, fit, folder, newest)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    save_weights(model, folder)
+    return {**stats, "evaluations": cfg["distill"]["steps"]}
 
 
 @stage(reads=(*SIMULATOR, "state_fit.{phase}"), place=Place.LEARNERS)
