@@ -74,14 +74,14 @@ def evaluate(words: Words) -> None:
     """success of a policy: worldloop evaluate policy=<stage|folder> world=physics|imagined experiment=...;
     one that needs no weights is a choice of configs/policy: policy=openpi policy.url=ws://...
     """
-    from pipeline.config import choices
+    from pipeline.config import offered
 
     own, rest = {"weights": "", "world": "physics"}, []
     for word in words:
         key, _, value = word.partition("=")
         if key == "world":
             own["world"] = value
-        elif key == "policy" and value not in choices("policy"):
+        elif key == "policy" and not offered("policy", value, words):
             own["weights"] = value
         else:
             rest.append(word)

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from envs.episodes.clips import ClipStore
 from envs.perceptual import PerceptualDistance
@@ -46,7 +47,8 @@ class OpenLoop:
         """Roll it out over all episodes."""
         out = Measured()
         sides = {e.name: (Moments(e), Moments(e)) for e in self.extractors}
-        for begin in range(0, len(self.episodes), _SIDE_BY_SIDE):
+        parts = range(0, len(self.episodes), _SIDE_BY_SIDE)
+        for begin in tqdm(parts, desc="rolled out", unit="batch", dynamic_ncols=True, leave=False):
             some = slice(begin, begin + _SIDE_BY_SIDE)
             made = replay(simulator, self.store, self.episodes[some], bf16=self.bf16)
             true = self.store.frames(made.rows)
@@ -142,6 +144,9 @@ def _mean(values: list[float]) -> float | None:
 
 def held_still(store: ClipStore, episodes: Tensor, distance: PerceptualDistance) -> dict[str, Any]:
     """Errors by frame of a world that shows each episode's first frame for ever: what is to be beaten."""
-    rows, valid = store.whole(episodes)
-    first = store.frames(store.start[episodes])[:, None].expand(-1, rows.shape[1], -1, -1, -1, -1)
-    return by_frame(frame_errors(first, store.frames(rows), distance), valid)
+    out = Measured()
+    for some in episodes.split(_SIDE_BY_SIDE):
+        rows, valid = store.whole(some)
+        first = store.frames(store.start[some])[:, None].expand(-1, rows.shape[1], -1, -1, -1, -1)
+        out.add(frame_errors(first, store.frames(rows), distance), valid)
+    return by_frame(out.errors, out.valid)
