@@ -109,9 +109,9 @@ class Success(Column):
 
     def read(self, cfg: Cfg, folder: Path) -> Measured:
         """See Column.read."""
-        seeds = outcomes(folder, "seeds").tolist()
+        seeds, (success,) = outcomes(folder)
         keys = zip(tasks_of_seeds(cfg, seeds), seeds, strict=True)
-        return Measured.of_success(dict(zip(keys, outcomes(folder).tolist(), strict=True)))
+        return Measured.of_success(dict(zip(keys, success.tolist(), strict=True)))
 
     def text(self, cell: Mapping[str, Any]) -> str:
         """See Column.text."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from actors.policies.recorded import Commands, RecordedActions
 from actors.rollouts.evaluate import Outcome, evaluate
 from envs.files import atomic
 from envs.physics.env import PhysicsEnv
-from envs.physics.pool import TaskPool
+from envs.physics.pool import PoolError, TaskPool
 from envs.physics.worker import Track
 from pipeline.evaluation.value.candidates import Candidate
 from pipeline.graph.code_version import digest
@@ -90,13 +90,19 @@ class Physics:
             self._close_env()
             self._env = build_physics(self.cfg, width)
         policy, stochastic = candidate.build(self.cfg, self.spread), self.cfg["policy_value"]["stochastic"]
-        return {"success": evaluate(self._env, policy, seeds, stochastic, f"true {candidate.name}").success}
+        outcome = evaluate(self._env, policy, seeds, stochastic, f"true {candidate.name}")
+        _check_all(
+            candidate, seeds, [seed for seed, told in zip(seeds, outcome.counted, strict=True) if told]
+        )
+        return {"success": outcome.success}
 
     def _scripted(self, candidate: Candidate, seeds: list[int]) -> Tensors:
         self._pool = self._pool or build_pool(self.cfg)
         assert candidate.expert is not None
         jobs = [(seed, candidate.expert) for seed in seeds]
-        return scripted_outcomes(self._pool.script(jobs, self.cfg["task"]["chunk"]))
+        tracks = self._pool.script(jobs, self.cfg["task"]["chunk"])
+        _check_all(candidate, seeds, [track.seed for track in tracks])
+        return scripted_outcomes(tracks)
 
     def close(self) -> None:
         """End the worker processes."""
@@ -107,6 +113,20 @@ class Physics:
     def _close_env(self) -> None:
         if self._env is not None:
             self._env.close()
+
+
+def _check_all(candidate: Candidate, seeds: Sequence[int], told: Sequence[int]) -> None:
+    """Refuse a value of which some episodes are unknown, for the imagined ones would stand beside others.
+
+    Raises:
+        PoolError: if physics crashed in one.
+    """
+    if crashed := sorted(set(seeds) - set(told)):
+        raise PoolError(
+            f"physics crashes again and again in the episodes of the seeds {crashed[:4]} under"
+            f" {candidate.name}, so its true value on these starts is unknown; leave it out"
+            " (policy_value.policies), or mend the suite"
+        )
 
 
 def scripted_outcomes(tracks: list[Track]) -> Tensors:
@@ -170,4 +190,4 @@ class Imagination:
             f"imagined {candidate.name}",
             sampling_seed=repeat,
         )
-        return {"success": outcome.success, "judged": outcome.judged}
+        return {"success": outcome.success, "judged": outcome.counted}
