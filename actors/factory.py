@@ -25,6 +25,7 @@ from envs.physics.pool import TaskPool, available_cores
 from envs.physics.suite import SuiteError
 from envs.simulators.base import WORLD_OPTIONS, Simulator
 from envs.simulators.state_experts.base import StateDecoder
+from envs.simulators.tokens.text_world import TextWorld
 from envs.specs import ActionMode
 from envs.targets import ConfigError, build
 from envs.transforms import world_transforms
@@ -60,6 +61,12 @@ def build_judge(cfg: Mapping[str, Any], weights: Path | None = None) -> Judge:
     section = {name: value for name, value in cfg["judge"].items() if name != "rewards"}
     judge: Judge = build(section, "judge", spec=world_spec(cfg))
     return load(judge, weights).to(device_of(cfg))
+
+
+def build_text_world(cfg: Mapping[str, Any], weights: Path | None = None) -> TextWorld:
+    """The text world of a judge that asks for one, judge.text_world; see tokens/text_world.py."""
+    world: TextWorld = build(cfg["judge"]["text_world"], "judge.text_world", spec=world_spec(cfg))
+    return load(world, weights).to(device_of(cfg))
 
 
 def build_policy(cfg: Mapping[str, Any], weights: Path | None = None) -> TensorDictModuleBase:

@@ -101,7 +101,8 @@ class ClipBatches:
         config, store = self.config, self.store
         chunks = 1 if step < config.single_chunk_fraction * self.options.steps else config.unroll
         stride = config.strides[int(torch.randint(len(config.strides), (1,), generator=generator))]
-        spec = ClipSpec(self.simulator.memory_frames, self.simulator.spec.chunk, chunks, stride)
+        memory, chunk = self.simulator.memory_frames, self.simulator.spec.chunk
+        spec = ClipSpec(memory, chunk, chunks, stride, recent=self.simulator.recent_memory)
         count = max(1, self.options.part // chunks)
         newest = self.newest
         recent = round(count * config.recent_fraction) if newest is not None and len(newest) else 0

@@ -36,7 +36,7 @@ PHYSICS = (*POLICY, "judge.rewards")
 EVERYTHING = (
     *("name", "seed", "threads", "microbatches", "task", "simulator", "judge", "policy", "algorithm", "rl"),
     *("rounds", "collect", "imitation", "extra_starts", "clone", "tokenizer_fit", "simulator_fit", "distill"),
-    *("state_fit", "judge_fit"),
+    *("state_fit", "text_world_fit", "judge_fit"),
     *("evaluate", "measure"),
 )
 
