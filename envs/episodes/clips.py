@@ -20,7 +20,7 @@ from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.columns import Columns
 from envs.episodes.episode import EpisodeError
 from envs.episodes.splits import range_of
-from envs.specs import WorldSpec, memory_indices, text_to_bytes
+from envs.specs import WorldSpec, memory_indices, recent_indices, text_to_bytes
 
 
 class ClipStore:
@@ -243,7 +243,8 @@ class ClipStore:
         rows = base[:, None] + torch.minimum(ahead, last[:, None])
         # frames before each chunk, in strides
         past = begin[:, None] // spec.stride + spec.chunk * torch.arange(spec.chunks)
-        index = memory_indices(past + 1, spec.memory)  # [B, L, M], in strides from `begin % stride`
+        chosen = recent_indices if spec.recent else memory_indices
+        index = chosen(past + 1, spec.memory)  # [B, L, M], in strides from `begin % stride`
         at = (begin % spec.stride)[:, None, None] + index * spec.stride
         memory = base[:, None, None] + torch.minimum(at, last[:, None, None])
         recent = begin[:, None] - spec.stride * torch.arange((spec.history or spec.memory) - 1, -1, -1)
