@@ -62,7 +62,7 @@ class Clean:
         drift: variance that a frame adds, where the latents' own is 1.
     """
 
-    def __init__(self, drift: Positive):
+    def __init__(self, drift: Positive = 0.1):
         self.drift = drift
 
     def base(self, z: Tensor, level: Tensor) -> Tensor | None:

@@ -36,7 +36,8 @@ class Sigmoid:
 
     def level(self, time: Tensor) -> Tensor:
         """Level s, like `time` in 0..1; the share of the signal's variance falls along the sigmoid."""
-        low, high = (torch.sigmoid(torch.tensor(x / self.temperature)) for x in (self.start, self.end))
+        ends = torch.tensor([self.start, self.end], dtype=time.dtype, device=time.device)
+        low, high = torch.sigmoid(ends / self.temperature)
         at = torch.sigmoid((time * (self.end - self.start) + self.start) / self.temperature)
         signal = ((high - at) / (high - low)).clamp(0, 1)
         noise = (1 - signal).sqrt()
