@@ -77,6 +77,7 @@ class ForcingSimulator(Simulator):
     """
 
     recent_memory = True
+    hidden = ("attn", "ff")
 
     def __init__(
         self,

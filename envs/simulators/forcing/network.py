@@ -99,9 +99,8 @@ class TimeBlock(Block):
         self, x: Tensor, rope: tuple[Tensor, Tensor], known: Known | None
     ) -> tuple[Tensor, Known | None]:
         rows, attn = x.transpose(1, 2).flatten(0, 1), self.attn
-        q = rotate(attn.norm_q(attn._heads(attn.to_q(rows))), rope)
         k, v = attn.keys_of(rows)
-        k = rotate(k, rope)
+        q, k = rotate(attn.queries_of(rows), rope), rotate(k, rope)
         if known is not None:
             k, v = torch.cat([known[0], k], 2), torch.cat([known[1], v], 2)
         now, total = q.shape[2], k.shape[2]
