@@ -74,6 +74,7 @@ def test_mistakes_name_the_fix() -> None:
         (("controls", "experiment=smoke", "name=never-run"), "worldloop run"),
         (("compare", "/nowhere"), "result.json is not there"),
         (("stage",), "worldloop stages"),
+        (("bench", "serving", "seconds=soon"), "seconds=soon: say a number above 0"),
     ):
         wrong = worldloop(*words)
         assert wrong.returncode == 1 and said in wrong.stderr and "Traceback" not in wrong.stderr, wrong
