@@ -19,6 +19,7 @@ BENCHES: dict[str, tuple[str, tuple[str, ...]]] = {
     "learning": ("pipeline.benches.learning", ()),
     "serving": ("pipeline.benches.serving", ("experiment=smoke",)),
     "gesim": ("pipeline.benches.gesim", ()),
+    "size": ("pipeline.benches.size", ()),
     "overfit": ("pipeline.benches.training", ("simulator=dit_small", "task=lerobot")),
     "pretrained": ("pipeline.benches.training", ("experiment=smoke", "simulator=dit_small")),
 }

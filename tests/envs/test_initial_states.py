@@ -70,15 +70,17 @@ def test_extra_starts_get_about_their_share(inside: int, extra: int) -> None:
         assert sum(number >= inside for number in pool) / len(pool) == pytest.approx(share, abs=0.12)
 
 
+@pytest.mark.parametrize("newest", [False, True], ids=["spread", "newest"])
 @ROBOTS
-def test_sessions_remember_what_clips_show(tiny_store: Stores, robot: Embodiment) -> None:
+def test_sessions_remember_what_clips_show(tiny_store: Stores, robot: Embodiment, newest: bool) -> None:
     store = tiny_store(robot)
     starts = DecisionPoints(store, torch.arange(len(store)))
     which = torch.tensor([0, len(starts) - 1, len(starts) // 2])
     past, length = starts.past(which)
     state = memory.new_sessions(past, length, which, starts.longest)
-    remembered = memory.recall(state, 3)
-    clip = store.clips(starts.episode[which], starts.frame[which], ClipSpec(3, store.spec.chunk))
+    remembered = memory.recall(state, 3, newest)
+    spec = ClipSpec(3, store.spec.chunk, recent=newest)
+    clip = store.clips(starts.episode[which], starts.frame[which], spec)
     for name in remembered.keys():
         assert torch.equal(remembered[name], clip["memory", name][:, 0]), name
     now = memory.newest(state)
