@@ -20,7 +20,8 @@ def untrained_world(cfg: Mapping[str, Any], root: Path) -> list[str]:
     """Weights of simulator, state expert, judge and policy of a config; words by which `imagined` names the
     first three.
     """
-    prepare_process(cfg["seed"], threads=1)  # two that wait for each other on a busy core cost many times as much
+    # two threads that wait for each other on a busy core cost many times as much
+    prepare_process(cfg["seed"], threads=1)
     simulator = build_simulator(cfg)
     with torch.no_grad():
         for parameter in simulator.parameters():
