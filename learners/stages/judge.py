@@ -15,7 +15,6 @@ from torch import Tensor
 from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge
 from envs.judges.labels import progress_to_success, success_labels
-from envs.judges.learned import LearnedJudge
 from envs.precision import mixed_precision
 from learners.stages.pictures import augment
 from learners.stages.simulator import owners
@@ -70,7 +69,7 @@ class JudgeData:
         self.share = float(self.labels[rows].mean().clamp(0.02, 0.98))
 
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
-        """A batch [count] for LearnedJudge.loss, with uint8 frames."""
+        """A batch [count] for Judge.loss, with uint8 frames."""
         each = [count // len(self.pools)] * len(self.pools)
         each[0] += count - sum(each)
         drawn = [pool.draw(size, generator) for pool, size in zip(self.pools, each, strict=True)]
@@ -145,7 +144,7 @@ def frame_targets(store: ClipStore, hold: int, discount: float) -> tuple[Tensor,
 
 
 def train_judge(
-    judge: LearnedJudge,
+    judge: Judge,
     store: ClipStore,
     episodes: Tensor,
     options: FitConfig,

@@ -24,10 +24,16 @@ from tests.moving_square import SIZE, moving_square
 Stores = Callable[[Embodiment], ClipStore]
 
 
-@pytest.mark.parametrize("robot", EMBODIMENTS.values(), ids=EMBODIMENTS)
-def test_a_judge_learns_who_succeeded(robot: Embodiment, tiny_store: Stores, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("robot", "name"),
+    [*((robot, "learned") for robot in EMBODIMENTS.values()), (ARM_DELTAS, "proxy")],
+    ids=[*EMBODIMENTS, "proxy"],
+)
+def test_a_judge_learns_who_succeeded(
+    robot: Embodiment, name: str, tiny_store: Stores, tmp_path: Path
+) -> None:
     store = tiny_store(robot)
-    judge = judge_of(store.spec)
+    judge = judge_of(store.spec, name=name)
     options = FitConfig(steps=60, batch=32, lr=3e-3, warmup=5, ema=0.9, bf16=False)
     train_judge(judge, store, store.split("train"), options, tmp_path)
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").open()]
