@@ -1,4 +1,4 @@
-"""Judges whose frames get a logit of success and one of progress, fitted to recorded success and time alone."""
+"""Judges whose frames get logits of success and of progress, fitted to recorded success and time alone."""
 
 from __future__ import annotations
 

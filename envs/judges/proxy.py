@@ -1,8 +1,8 @@
-"""A reward from a network of its own that sees a picture and nothing else, as DiWA has it (RoboScape-R compares
-its own reward with such a "proxy").
+"""A reward from a network of its own that sees a picture and nothing else, as DiWA has it (RoboScape-R
+compares its own reward with such a "proxy").
 
-It is not told what the task is, nor how the episode began, so it can only know the task and the scenes that it
-was fitted to.
+It is not told what the task is, nor how the episode began, so it can only know the task and the scenes that
+it was fitted to.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from envs.judges.base import Judge, Judgement
+from envs.simulators.features import pooled
 from envs.specs import FEATURES, FRAMES, IMAGE, JUDGE_STATUS, PROGRESS, SUCCESS, Rewards, Status
 
 
@@ -38,7 +39,9 @@ class JudgeReward(Transform):
         self._first = torch.zeros(0, dtype=torch.uint8)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        clips = (next_tensordict[FRAMES], self._first, self.parent.base_env.instructions)
+        clips = [next_tensordict[FRAMES], self._first, self.parent.base_env.instructions]
+        if self.judge.reads_features:
+            clips.append(pooled(next_tensordict[FEATURES])[:, None])
         if self.later:
             if not self._tickets:
                 self._opening = self._progress
@@ -92,7 +95,10 @@ class JudgeReward(Transform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         mask = tensordict.get("_reset", None)
         image, world = tensordict_reset[IMAGE], self.parent.base_env
-        progress = self.judge.score(image.unsqueeze(1), world.opening, world.instructions).progress
+        shown = [image.unsqueeze(1), world.opening, world.instructions]
+        if self.judge.reads_features:
+            shown.append(world.features_now()[:, None])
+        progress = self.judge.score(*shown).progress
         if mask is None or self._run.shape[0] != progress.shape[0]:
             self._run = torch.zeros(progress.shape[0], dtype=torch.int64, device=progress.device)
             self._progress, self._first = progress, world.opening.clone()

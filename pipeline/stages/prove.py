@@ -61,8 +61,9 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     if len(held):
         made = replay(world.base_env.simulator, store, held, bf16=cfg["simulator"]["bf16"])
         judge = build_judge(cfg, inputs.weights("judge"))
-        scores = judge_frames(judge, made.frames, store, held)
+        scores = judge_frames(judge, made.frames, store, held, made.features)
         result["replayed"] = judge_table(judge, scores, made.valid, store, held)
+        result["judged_by"] = judge.facts()
     return result
 
 
@@ -137,12 +138,13 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
     judge = build_judge(cfg, inputs.weights("judge"))
     store = open_store(cfg, inputs)
+    bf16 = cfg["simulator"]["bf16"]
     result: dict[str, Any] = {"rollout": {}, "judge": {}}
     rows: list[dict[str, Any]] = []
     for name, episodes in measurement.groups(store, store.split("held_out")).items():
-        made = replay(simulator, store, episodes, decoder, bf16=cfg["simulator"]["bf16"])
+        made = replay(simulator, store, episodes, decoder, bf16=bf16)
         result["rollout"][name] = measurement.rollout_error(store, episodes, made)
-        views = judge_both(judge, store, episodes, made)
+        views = judge_both(judge, simulator, store, episodes, made, bf16)
         tables = {
             video: judge_table(judge, scores, made.valid, store, episodes)
             for video, scores in views._asdict().items()

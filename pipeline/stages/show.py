@@ -70,8 +70,9 @@ class Studio:
         """
         if not len(episodes):
             return
-        made = replay(self.simulator, store, episodes, bf16=self.cfg["simulator"]["bf16"])
-        views = judge_both(self.judge, store, episodes, made)
+        bf16 = self.cfg["simulator"]["bf16"]
+        made = replay(self.simulator, store, episodes, bf16=bf16)
+        views = judge_both(self.judge, self.simulator, store, episodes, made, bf16)
         rows = compared(self.cfg, self.judge, store, episodes, made, views)
         for n, row in enumerate(rows):
             path = self.folder / "media" / f"{label}-{row['seed']}-{row['episode']}.mp4"

@@ -13,10 +13,12 @@ from tqdm import tqdm
 from actors.factory import build_judge, build_simulator, build_state_decoder
 from actors.process import prepare_process
 from envs.episodes.clips import ClipStore
+from envs.judges.base import Judge
 from envs.rng import order_generator
 from envs.simulators.base import Simulator
+from envs.simulators.features import features_of_episodes
 from envs.targets import ConfigError, options
-from learners.stages.generated import generated_frames
+from learners.stages.generated import generated_frames, recorded_features
 from learners.stages.judge import calibrate, judge_recordings, train_judge
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
@@ -107,8 +109,9 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     section = cfg["judge_fit"][phase]
     store = open_store(cfg, inputs)
     prepare_process(cfg["seed"])
-    model: Any = build_judge(cfg, inputs.weights("warm"))
+    model, world = build_judge(cfg, inputs.weights("warm")), build_simulator(cfg, inputs.weights("simulator"))
     stats: dict[str, Any] = {}
+    bf16 = cfg["simulator"]["bf16"]
     if learns(model):
         train = labelled(store, store.split("train"))
         if not len(train):
@@ -118,14 +121,14 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
             )
         shuffled = torch.randperm(len(train), generator=order_generator(cfg["seed"]))
         pick = train[shuffled[: section["imagined"]]]
-        world = build_simulator(cfg, inputs.weights("simulator"))
         generated = _as_imagined(cfg, world, store, pick)
+        recorded = recorded_features(world, store, train, bf16) if model.reads_features else None
         fit = fit_options(cfg, section["fit"], f"judge_fit.{phase}.fit")
-        stats = dict(train_judge(model, store, train, fit, folder, generated))
+        stats = dict(train_judge(model, store, train, fit, folder, generated, recorded))
         stats["generated_frames"] = len(generated)
-    _calibrate(model, store)
+    _calibrate(model, store, world, bf16)
     save_weights(model, folder)
-    return {**stats, "threshold": float(model.threshold)}
+    return {**stats, "threshold": float(model.threshold), **model.facts()}
 
 
 def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor) -> TensorDict:
@@ -139,12 +142,13 @@ def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor)
     return torch.cat([near, generated_frames(world, store, episodes[1::2], bf16)])
 
 
-def _calibrate(model: Any, store: ClipStore) -> None:
+def _calibrate(model: Judge, store: ClipStore, world: Simulator, bf16: bool) -> None:
     """Set the judge's threshold on the calibration split, where its scores tell success."""
     unseen = labelled(store, store.split("calibration"))
     if not len(unseen):
         return
-    score = judge_recordings(model, store, unseen)
+    features = features_of_episodes(world, store, unseen, bf16) if model.reads_features else None
+    score = judge_recordings(model, store, unseen, features)
     succeeded = episode_success(store, unseen)
     if not calibrate(model, score, succeeded):
         tqdm.write(
