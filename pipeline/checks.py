@@ -157,6 +157,8 @@ def _together(cfg: Cfg) -> Iterator[str]:
             f"rl.envs / rl.shards = {rl['envs'] // rl['shards']} must be a multiple of"
             f" algorithm.group={cfg['algorithm']['group']}, or groups would be torn apart"
         )
+    if rl["evaluate_every"] and not task.get("suite"):
+        yield f"rl.evaluate_every={rl['evaluate_every']} needs physics, which this task has not; set it to 0"
     parts, learners = cfg["microbatches"], launch.get("learners", 1)
     if parts % learners:
         yield (

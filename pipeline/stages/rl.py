@@ -39,6 +39,7 @@ from pipeline.stages.given import (
     rl_options,
     successful_episodes,
 )
+from pipeline.stages.trials import true_success
 
 LEARNING = ("policy", "algorithm", "rl", "imitation", "microbatches")
 
@@ -80,7 +81,8 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     try:
         starts = len(store) if inside is None else len(decision_points(store, inside)[0])
         true = TrueExperience(anchor, decisions)
-        stats = train_rl(fleet, policy, algorithm, settings, folder, starts, true=true)
+        watch = true_success(cfg, settings, inputs.weights("policy"))
+        stats = train_rl(fleet, policy, algorithm, settings, folder, starts, true=true, watch=watch)
     finally:
         if fleet is not None:
             fleet.close()
@@ -147,7 +149,8 @@ def rl_in_physics(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, An
     pool = episode_seeds(cfg["seed"], Purpose.PRACTICE, 4 * settings.envs * iterations)
     fleet = build_fleet(recipe)
     try:
-        stats = train_rl(fleet, policy, algorithm, settings, folder, pool)
+        watch = true_success(cfg, settings, inputs.weights("policy"))
+        stats = train_rl(fleet, policy, algorithm, settings, folder, pool, watch=watch)
     finally:
         fleet.close()
     save_weights(policy, folder)
