@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 
 from envs.targets import ConfigError, nearest
-from pipeline.cli.words import Words, prepared, root_of
+from pipeline.cli.words import Words, listed, prepared, root_of
 
 
 def run(words: Words) -> None:
@@ -109,6 +109,38 @@ def trust(words: Words) -> None:
     cfg, root = prepared(rest)
     number = own.pop("round")
     print(table(cfg, root, number, **own))
+
+
+def rewards(words: Words) -> None:
+    """rewards side by side along the same episodes of seen and unseen scenes: worldloop rewards
+    rewards=[learned,proxy,embedding,rule] [episodes=64] [variants=[out_of_domain]] experiment=...
+    """
+    from pipeline.config import choices, load_config
+
+    own, rest = {"rewards": "[learned,proxy,embedding,rule]", "episodes": "64", "variants": ""}, []
+    for word in words:
+        key, _, value = word.partition("=")
+        if key in own:
+            own[key] = value
+        else:
+            rest.append(word)
+    names, known = listed(own["rewards"]), ["rule", *choices("judge")]
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"rewards={own['rewards']}: no reward {name}{nearest(name, known)}")
+    if not own["episodes"].isdigit() or int(own["episodes"]) < 2 or not names:
+        raise ConfigError("say which rewards=[...], and episodes=N of at least 2")
+    cfg, root = prepared(rest)
+    from pipeline.commands.rewards import Plan, compare_rewards
+    from pipeline.graph.owner import owning
+    from pipeline.track import tracking
+
+    others = [word for word in rest if not word.startswith(("judge=", "judge."))]
+    configs = {name: cfg if name == "rule" else load_config([*others, f"judge={name}"]) for name in names}
+    variants = listed(own["variants"]) if own["variants"] else list(cfg["task"].get("variants", {}))
+    with owning(root, "rewards"), tracking(cfg, root) as tracker:
+        print(compare_rewards(cfg, root, Plan(configs, int(own["episodes"]), variants), tracker))
+    print(f"{root}/rewards.html, {root}/rewards.json")
 
 
 def controls(words: Words) -> None:
