@@ -38,10 +38,14 @@ def goal() -> Iterator[dict[str, Any]]:
 
 # What a judge needs that is not in its config, a file or a server: while the context lasts it is there, at
 # the options that the context gives. A judge that is not named here is built as its config says.
-SURROUNDINGS: dict[str, Callable[[], AbstractContextManager[dict[str, Any]]]] = {"goal_picture": goal}
+SURROUNDINGS: dict[str, Callable[[], AbstractContextManager[dict[str, Any]]]] = {
+    "goal_picture": goal,
+    "goal_image": goal,
+}
 # What a judge does not look at, and says so; all others look at everything.
 IGNORES: dict[str, tuple[str, ...]] = {
     "goal_picture": ("instruction", "other views"),
+    "goal_image": ("instruction", "other views"),
     "proxy": ("first frame", "instruction"),
     "embedding": ("first frame", "frames"),
 }
