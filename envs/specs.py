@@ -159,6 +159,14 @@ def memory_indices(length: Tensor, count: int) -> Tensor:
     return ((length.unsqueeze(-1) - 1) * share).round().long()
 
 
+def recent_indices(length: Tensor, count: int) -> Tensor:
+    """The last `count` of the first `length` [...] frames, [..., count]; the first repeats where there are
+    fewer.
+    """
+    back = torch.arange(count - 1, -1, -1, device=length.device)
+    return (length.unsqueeze(-1) - 1 - back).clamp(min=0)
+
+
 def text_to_bytes(texts: Sequence[str]) -> Tensor:
     """Texts as uint8 [N, TEXT_BYTES], UTF-8 padded with zeros; longer ones are cut at a character."""
     out = torch.zeros(len(texts), TEXT_BYTES, dtype=torch.uint8)

@@ -35,16 +35,18 @@ class Simulator(nn.Module):
 
     Args:
         spec: what it shows of which robot.
-        memory_frames: sparse memory frames, M; the first frame is always one of them.
+        memory_frames: memory frames, M; of sparse ones the first frame is always one.
 
     Attributes:
         feature_shape: of the features that state experts read, without the batch.
         hidden: names of the layers that optimisers may take for hidden ones (training/optimisers.py);
             none for all.
+        recent_memory: whether memory is the newest frames instead of some that are spread over the past.
     """
 
     feature_shape: tuple[int, ...]
     hidden: tuple[str, ...] = ()
+    recent_memory: bool = False
 
     def __init__(self, spec: WorldSpec, memory_frames: int):
         super().__init__()
@@ -99,8 +101,10 @@ class Simulator(nn.Module):
         """
 
     def recall(self, state: TensorDict, future: TensorDict) -> TensorDict:
-        """Memory for the next chunk, [B, M, ...]: evenly spread over the past, with the first frame."""
-        return memory.recall(state, self.memory_frames)
+        """Memory for the next chunk, [B, M, ...]: evenly spread over the past, with the first frame, or the
+        newest ones.
+        """
+        return memory.recall(state, self.memory_frames, self.recent_memory)
 
     def release(self, state: TensorDict, mask: Tensor) -> None:
         """The sessions of `mask` [B] end; what is held for them elsewhere can go. Here nothing is."""

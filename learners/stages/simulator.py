@@ -72,7 +72,8 @@ def train_simulator(
     def batch(step: int, generator: torch.Generator) -> TensorDict:
         chunks = 1 if step < config.single_chunk_fraction * options.steps else config.unroll
         stride = config.strides[int(torch.randint(len(config.strides), (1,), generator=generator))]
-        spec = ClipSpec(simulator.memory_frames, simulator.spec.chunk, chunks, stride)
+        memory, chunk = simulator.memory_frames, simulator.spec.chunk
+        spec = ClipSpec(memory, chunk, chunks, stride, recent=simulator.recent_memory)
         count = max(1, options.part // chunks)
         recent = round(count * config.recent_fraction) if newest is not None and len(newest) else 0
         parts = [store.sample(episodes, count - recent, spec, generator)] if recent < count else []

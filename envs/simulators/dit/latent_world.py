@@ -19,7 +19,7 @@ from envs.simulators.dit.augment import augment_memory_frames, augment_memory_la
 from envs.simulators.dit.network import MultiViewDiT
 from envs.simulators.dit.prediction import Prediction
 from envs.simulators.foreground import foreground_weight
-from envs.simulators.inputs import build_inputs
+from envs.simulators.inputs import own_frames
 from envs.simulators.samplers import Sampler
 from envs.simulators.tokenizers.autoencoder import STRIDE, Codec
 from envs.specs import WorldSpec
@@ -148,12 +148,8 @@ class LatentWorld(Simulator):
         """Loss of the future latents of one chunk (memory has none), any of the clip's; the frames of those
         before it are the model's own.
         """
-        chunk = self.spec.chunk
-        # Chunks wholly past the end of every episode teach nothing.
-        whole = clip["future", "valid"].bool().any(0).unflatten(0, (-1, chunk)).any(1)
-        chosen = int(torch.randint(max(1, int(whole.long().sum())), (1,), generator=generator))
-        inputs = self._unroll(clip, chosen, generator)
-        part = slice(chosen * chunk, (chosen + 1) * chunk)
+        chosen, inputs = own_frames(self, clip, generator)
+        part = slice(chosen * self.spec.chunk, (chosen + 1) * self.spec.chunk)
         truth, valid = unit(clip["future", "frames"][:, part]), clip["future", "valid"][:, part]
         augmented = chosen_clips(len(truth), self.diffusion.augment, generator)
         remembered = augment_memory_frames(unit(inputs["memory", "frames"]), augmented, generator)
@@ -172,15 +168,6 @@ class LatentWorld(Simulator):
         return value, {}
 
     # -- parts
-    def _unroll(self, clip: TensorDict, chosen: int, generator: torch.Generator) -> TensorDict:
-        """Inputs of chunk number `chosen`, whose memory shows the model's own frames of the chunks before."""
-        own: Tensor | None = None
-        for number in range(chosen):
-            with torch.no_grad():
-                frames = self.predict(build_inputs(self.spec, clip, number, own, generator))[0]
-            own = frames if own is None else torch.cat([own, frames], 1)
-        return build_inputs(self.spec, clip, chosen, own, generator)
-
     def _channels(self, inputs: TensorDict, memory: Tensor) -> tuple[Tensor, Tensor | None]:
         """What stays the same at every step: conditioning channels and action vectors."""
         return self.conditioning(inputs, (memory.shape[-2], memory.shape[-1])), self.actions(inputs)
