@@ -75,9 +75,9 @@ class GoldenGoalJudge(GoalJudge):
         """See GoalJudge.goals; imagines those that are not remembered."""
         keys = [_digest(*pair) for pair in zip(first, instruction, strict=True)]
         found = {key: self._known[key] for key in dict.fromkeys(keys) if key in self._known}
-        rows = {key: row for row, key in enumerate(keys) if key not in found}
-        for part in torch.tensor(list(rows.values()), dtype=torch.int64).split(_AT_ONCE):
-            some = part.tolist()
+        rows = list({key: row for row, key in enumerate(keys) if key not in found}.values())
+        for begin in range(0, len(rows), _AT_ONCE):
+            some = rows[begin : begin + _AT_ONCE]
             # From the content alone: whoever asks about the same episode gets the same goal.
             seeds = torch.tensor([int.from_bytes(keys[row][:5], "big") for row in some])
             golden = self.text_world.imagine(first[some], [instruction[row] for row in some], seeds)

@@ -73,7 +73,8 @@ def features_of_chunks(
         bf16: whether the simulator computes in bfloat16 where the device does.
         still: of a chunk that would change nothing, instead of the one that was recorded.
     """
-    device, spec = simulator.device, ClipSpec(simulator.memory_frames, simulator.spec.chunk)
+    memory_frames, chunk = simulator.memory_frames, simulator.spec.chunk
+    device, spec = simulator.device, ClipSpec(memory_frames, chunk, recent=simulator.recent_memory)
     simulator.eval()
     parts = []
     for some in torch.arange(len(episode)).split(_AT_ONCE):
