@@ -27,6 +27,7 @@ from envs.physics.pool import TaskPool, available_cores
 from envs.physics.suite import SuiteError
 from envs.simulators.base import WORLD_OPTIONS, Simulator
 from envs.simulators.state_experts.base import StateDecoder
+from envs.simulators.tokens.text_world import TextWorld
 from envs.specs import ActionMode
 from envs.targets import ConfigError, build, target, to_plain
 from envs.transforms import world_transforms
@@ -78,6 +79,12 @@ def _feature_shape(cfg: Mapping[str, Any]) -> tuple[int, ...]:
         with torch.random.fork_rng(devices=[]):
             _shapes[known] = build_simulator(cfg).feature_shape
     return _shapes[known]
+
+
+def build_text_world(cfg: Mapping[str, Any], weights: Path | None = None) -> TextWorld:
+    """The text world of a judge that asks for one, judge.text_world; see tokens/text_world.py."""
+    world: TextWorld = build(cfg["judge"]["text_world"], "judge.text_world", spec=world_spec(cfg))
+    return load(world, weights).to(device_of(cfg))
 
 
 def build_policy(cfg: Mapping[str, Any], weights: Path | None = None) -> TensorDictModuleBase:

@@ -31,6 +31,7 @@ _SECTIONS = {
     "clone": sections.CloneSection,
     "judge_fit.first": sections.JudgeFitSection,
     "judge_fit.refresh": sections.JudgeFitSection,
+    "text_world_fit": sections.TextWorldFitSection,
     "state_fit.first": sections.StateFitSection,
     "state_fit.refresh": sections.StateFitSection,
     "finetune": sections.FinetuneSection,
@@ -45,6 +46,7 @@ _SECTIONS = {
 _FITS = (
     *("imitation.perception", "imitation.fit", "clone.perception", "clone.fit", "tokenizer_fit"),
     *(f"{stage}.{phase}.fit" for stage in ("state_fit", "judge_fit") for phase in ("first", "refresh")),
+    *(f"text_world_fit.{part}" for part in ("tokenizer", "first", "refresh")),
     "finetune.state.fit",
 )
 _SIMULATOR_FITS = ("simulator_fit.first", "simulator_fit.refresh", "finetune.simulator")

@@ -26,10 +26,11 @@ class World:
     simulator: str = ""
     state: str = ""
     judge: str = ""
+    text_world: str = ""  # whose weights are the judge's, once it has learned
 
     def roles(self) -> dict[str, str]:
         """Inputs of whatever runs in it."""
-        return dict(vars(self))
+        return {"simulator": self.simulator, "state": self.state, "judge": self.judge}
 
 
 def build_loop(cfg: Cfg, root: Path, with_rl: bool = True) -> Graph:
@@ -127,8 +128,13 @@ def _refresh(graph: Graph, cfg: Cfg, data: list[str], before: World, number: int
     simulator = graph.add(f"simulator-{number}", world.simulator, {"data": data, "warm": warm}, phase=phase)
     inputs = {"data": data, "simulator": simulator}
     state = graph.add(f"state-{number}", world.state, {**inputs, "warm": before.state}, phase=phase)
-    judge = graph.add(f"judge-{number}", world.judge, {**inputs, "warm": before.judge}, phase=phase)
-    return World(simulator, state, judge)
+    golden = ""
+    if "text_world" in cfg["judge"]:
+        roles = {"data": data, "warm": before.text_world}
+        golden = graph.add(f"text_world-{number}", world.text_world, roles, phase=phase)
+    roles = {**inputs, "warm": before.judge, "text_world": golden}
+    judge = graph.add(f"judge-{number}", world.judge, roles, phase=phase)
+    return World(simulator, state, judge, golden)
 
 
 def _learn(

@@ -110,6 +110,16 @@ class JudgeFitSection:
 
 
 @dataclass(frozen=True)
+class TextWorldFitSection:
+    """Section text_world_fit."""
+
+    stride: Count
+    tokenizer: Fit
+    first: Fit
+    refresh: Fit
+
+
+@dataclass(frozen=True)
 class StateFitSection:
     """Sections state_fit.first, state_fit.refresh and finetune.state."""
 

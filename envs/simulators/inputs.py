@@ -62,8 +62,8 @@ def build_inputs(
 
 
 def own_frames(simulator: Simulator, clip: TensorDict, generator: torch.Generator) -> tuple[int, TensorDict]:
-    """A chunk of a clip, any of those that are not wholly past the end of every episode, and its inputs, whose
-    memory shows the simulator's own frames of the chunks before it.
+    """A chunk of a clip, any of those that are not wholly past the end of every episode, and its inputs,
+    whose memory shows the simulator's own frames of the chunks before it.
     """
     chunk = simulator.spec.chunk
     whole = clip["future", "valid"].bool().any(0).unflatten(0, (-1, chunk)).any(1)

@@ -36,6 +36,7 @@ PHYSICS = (*POLICY, "judge.rewards")
 EVERYTHING = (
     *("name", "seed", "microbatches", "task", "simulator", "judge", "policy", "algorithm", "rl", "rounds"),
     *("collect", "imitation", "clone", "tokenizer_fit", "simulator_fit", "state_fit", "judge_fit"),
+    "text_world_fit",
     *("evaluate", "measure"),
 )
 

@@ -81,8 +81,8 @@ class LookupFreeQuantiser(nn.Module):
         return each, torch.special.entr(mean).sum()
 
     def use(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """How tokens [..., factors] use the codebook: the share of the codes that occur, and their perplexity,
-        exp of the entropy of their frequencies, each a mean over the factors.
+        """How tokens [..., factors] use the codebook: the share of the codes that occur, and their
+        perplexity, exp of the entropy of their frequencies, each a mean over the factors.
         """
         shares, perplexities = [], []
         for factor in tokens.reshape(-1, self.factors).unbind(-1):
@@ -102,8 +102,8 @@ class LookupFreeTokenizer(nn.Module):
         width: channels of all layers, a multiple of 8.
         gradients: loss weight of the multi-scale gradient difference (errors.py).
         commitment: loss weight of the distance between numbers and their signs.
-        entropy: loss weight of the entropy of a place's code less that of all codes: a code shall be sure, and
-            codes shall be many.
+        entropy: loss weight of the entropy of a place's code less that of all codes: a code shall be sure,
+            and codes shall be many.
 
     Raises:
         ValueError: if the bits cannot be split, or the stride is no power of two from 4 on.

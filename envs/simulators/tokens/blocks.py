@@ -1,8 +1,9 @@
-"""A spatio-temporal block (Genie, Bruce et al. 2024) over two streams: frames that are known, and frames asked
-for.
+"""A spatio-temporal block (Genie, Bruce et al. 2024) over two streams: frames that are known, and frames
+asked for.
 
-Known frames see themselves and the past. A frame that is asked for sees what is given of itself, and the known
-frames before it. In training both streams run side by side, so that every frame of a clip is asked for at once
+Known frames see themselves and the past. A frame that is asked for sees what is given of itself, and the
+known frames before it. In training both streams run side by side, so that every frame of a clip is asked for
+at once
 under just the conditions of a rollout: its past is clean, whatever of it is masked.
 """
 
@@ -75,7 +76,8 @@ class STBlock(nn.Module):
         return self._finish(x, told), known
 
     def ask(self, y: Tensor, told: Tensor, known: Keys, causal: bool) -> Tensor:
-        """Frames asked for [B, T - 1, P, width], after the block: all but the first of T frames that are known.
+        """Frames asked for [B, T - 1, P, width], after the block: all but the first of T frames that are
+        known.
 
         Args:
             known: keys and values of time, of all T.

@@ -1,7 +1,7 @@
 """How every block of a world of tokens is told what happens: commands, or an instruction.
 
-What is told are a few tokens per frame, [B, T, N, width]. They are read by cross-attention, as in RoboScape-R,
-or modulate the norms (adaLN, Peebles & Xie 2023).
+What is told are a few tokens per frame, [B, T, N, width]. They are read by cross-attention, as in
+RoboScape-R, or modulate the norms (adaLN, Peebles & Xie 2023).
 """
 
 from __future__ import annotations

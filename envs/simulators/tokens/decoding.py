@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -56,8 +56,8 @@ class Decoding(Protocol):
 
 @dataclass(frozen=True)
 class MaskGIT:
-    """All places at once, in steps: of what is said of them the surest stays, by a cosine schedule (Chang et al.
-    2022).
+    """All places at once, in steps: of what is said of them the surest stays, by a cosine schedule (Chang et
+    al. 2022).
 
     Args:
         steps: passes per frame.

@@ -44,12 +44,14 @@ class Made:
 class TokensSimulator(Simulator):
     """Spatio-temporal transformer over lookup-free tokens of all views.
 
-    Commands become a few tokens per frame; pose map and ray map are added to the places where the spec asks for
-    them. Features are the means over the places of each frame of the chunk, and of each view of its last one.
+    Commands become a few tokens per frame; pose map and ray map are added to the places where the spec asks
+    for them. Features are the means over the places of each frame of the chunk, and of each view of its last
+    one.
 
     Args:
         spec: what it shows; sizes must be multiples of codec.stride.
-        window: frames that a frame sees, itself included; more than a chunk. Memory is all but a chunk of them.
+        window: frames that a frame sees, itself included; more than a chunk. Memory is all but a chunk of
+            them.
         codec, net, conditioning, decoding, training: see TokenVideo.
 
     A session's state also holds `done`, float32 [B, K]: whether the task is done in the frames of the last

@@ -50,15 +50,15 @@ class TokenAttention(nn.Module):
         mask: Tensor | None = None,
         rope: tuple[Tensor, Tensor] | None = None,
     ) -> Tensor:
-        """What tokens [..., L, width] are told by keys and values; where the mask [L, keys] is false they do not
-        look.
+        """What tokens [..., L, width] are told by keys and values; where the mask [L, keys] is false they do
+        not look.
         """
         queries = self.norm_q(self._split(self.to_q(x)))
         queries = queries if rope is None else rotate(queries, rope)
         keys, values = known
         lead = queries.shape[:-3]
-        flat = [part.flatten(0, -4) for part in (queries.to(values.dtype), keys.to(values.dtype), values)]
-        out = F.scaled_dot_product_attention(*flat, attn_mask=mask).unflatten(0, lead)
+        q, k, v = (part.to(values.dtype).flatten(0, -4) for part in (queries, keys, values))
+        out = F.scaled_dot_product_attention(q, k, v, attn_mask=mask).unflatten(0, lead)
         return self.to_out[0](out.transpose(-2, -3).flatten(-2))
 
     def _split(self, x: Tensor) -> Tensor:

@@ -69,8 +69,8 @@ class Vocabulary:
 
 
 class SpatioTemporalTransformer(nn.Module):
-    """See the module's docstring. P are places, F factors; `told` are tokens [B, T, N, width], and `beside` what
-    else is known of every place, [B, T, P, width], or None.
+    """See the module's docstring. P are places, F factors; `told` are tokens [B, T, N, width], and `beside`
+    what else is known of every place, [B, T, P, width], or None.
 
     Args:
         vocabulary: the tokens of a frame.
@@ -140,8 +140,8 @@ class SpatioTemporalTransformer(nn.Module):
     def ask_place(
         self, place: int, shown: Tensor, told: Tensor, beside: Tensor | None, memory: Memory
     ) -> Tensor:
-        """Logits [B, F, codes] of one place of that frame, where `shown` [B, F] is given there. Places are asked
-        for in order, from 0 on.
+        """Logits [B, F, codes] of one place of that frame, where `shown` [B, F] is given there. Places are
+        asked for in order, from 0 on.
         """
         here = self._places()[place : place + 1]
         y = self._embed(shown[:, None, None]) + here + self.asked

@@ -1,7 +1,7 @@
 """Video as tokens and its continuation: what the action world and the text world have in common.
 
-A tokenizer that was trained apart, the transformer over its tokens, and the head that says whether the task is
-done in a frame.
+A tokenizer that was trained apart, the transformer over its tokens, and the head that says whether the task
+is done in a frame.
 """
 
 from __future__ import annotations
