@@ -113,11 +113,12 @@ def trust(words: Words) -> None:
 
 def rewards(words: Words) -> None:
     """rewards side by side along the same episodes of seen and unseen scenes: worldloop rewards
-    rewards=[learned,proxy,embedding,rule] [episodes=64] [variants=[out_of_domain]] experiment=...
+    [rewards=[learned,proxy,embedding,golden_goal,rule]] [episodes=64] [variants=[out_of_domain]]
+    experiment=...
     """
     from pipeline.config import choices, load_config
 
-    own, rest = {"rewards": "[learned,proxy,embedding,rule]", "episodes": "64", "variants": ""}, []
+    own, rest = {"rewards": "learned,proxy,embedding,golden_goal,rule", "episodes": "64", "variants": ""}, []
     for word in words:
         key, _, value = word.partition("=")
         if key in own:

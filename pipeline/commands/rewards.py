@@ -25,8 +25,8 @@ from envs.simulators.base import Simulator
 from envs.simulators.replay import replay
 from envs.targets import ConfigError
 from pipeline.evaluation.judging import Scores, judge_both, labelled
-from pipeline.evaluation.reward_page import build_page, table_text
-from pipeline.evaluation.rewards import BY_PHYSICS, Truth, by_rule, chosen, curve, figures, truth_of
+from pipeline.evaluation.rewards.page import build_page, table_text
+from pipeline.evaluation.rewards.figures import BY_PHYSICS, Truth, by_rule, chosen, curve, figures, truth_of
 from pipeline.graph.graph import Graph
 from pipeline.loop import build_loop
 from pipeline.stages.given import datasets, open_store

@@ -50,7 +50,7 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(mine)), mine)
     seeds = list(range(len(mine)))
     outcome = evaluate(world, policy, seeds, stochastic=True, label="gap", sampling_seed=cfg["seed"])
-    tasks = tasks_of_episodes(cfg, store, mine)
+    tasks, judge = tasks_of_episodes(cfg, store, mine), world.transform[-1].judge
     result = {
         "round": number,
         **_gap(truth, outcome.success, outcome.judged),
@@ -60,11 +60,9 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     held = held[torch.isin(held, store.select(["policy-*"]))]
     if len(held):
         made = replay(world.base_env.simulator, store, held, bf16=cfg["simulator"]["bf16"])
-        judge = build_judge(cfg, inputs.weights("judge"))
         scores = judge_frames(judge, made.frames, store, held, made.features)
         result["replayed"] = judge_table(judge, scores, made.valid, store, held)
-        result["judged_by"] = judge.facts()
-    return result
+    return {**result, "judged_by": judge.facts()}
 
 
 @stage(reads=(*PHYSICS, "evaluate"), place=Place.EVALUATOR)

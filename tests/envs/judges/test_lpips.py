@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from envs.lpips import LPIPS
+from envs.judges.lpips import LPIPS
 
 SHAPES = {
     0: (64, 3, 11, 11),

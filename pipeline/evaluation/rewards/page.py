@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from pipeline.evaluation.charts import Curve, line_chart
 from pipeline.evaluation.report import templates
-from pipeline.evaluation.rewards import cell
+from pipeline.evaluation.rewards.figures import cell
 
 # Figures of a reward: key, and heading.
 FIGURES = (
