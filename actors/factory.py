@@ -93,8 +93,20 @@ def build_policy(cfg: Mapping[str, Any], weights: Path | None = None) -> TensorD
     return load(policy, weights).to(device_of(cfg))
 
 
-def build_physics(cfg: Mapping[str, Any], batch: int, record: bool = False, seed: int = 0) -> PhysicsEnv:
+def build_physics(
+    cfg: Mapping[str, Any],
+    batch: int,
+    record: bool = False,
+    seed: int = 0,
+    changes: Mapping[str, Any] | None = None,
+) -> PhysicsEnv:
     """The true world.
+
+    Args:
+        batch: episodes side by side.
+        record: keep every frame, for PhysicsEnv.pop_tracks.
+        seed: of the stream of episode seeds.
+        changes: options of the suite that are other than the config says, as one of task.variants is.
 
     Raises:
         ConfigError: if the task has no suite, or no task of that name.
@@ -103,17 +115,26 @@ def build_physics(cfg: Mapping[str, Any], batch: int, record: bool = False, seed
     if task.get("suite") is None:
         raise ConfigError("task.suite is empty: this task is known from data alone and has no physics")
     try:
-        pool = TaskPool(task["suite"], task["name"], batch, task["horizon"], cfg["launch"]["workers"])
+        suite = {**task["suite"], **(changes or {})}
+        pool = TaskPool(suite, task["name"], batch, task["horizon"], cfg["launch"]["workers"])
         return PhysicsEnv(pool, world_spec(cfg), ActionMode(task["mode"]), rewards_of(cfg), record, seed)
     except (SuiteError, EmbodimentError) as error:
         raise ConfigError(str(error)) from error
 
 
-def build_pool(cfg: Mapping[str, Any]) -> TaskPool:
-    """Worker processes that run scripted episodes of the task, one slot each."""
+def build_pool(
+    cfg: Mapping[str, Any], changes: Mapping[str, Any] | None = None, horizon: int | None = None
+) -> TaskPool:
+    """Worker processes that run scripted episodes of the task, one slot each.
+
+    Args:
+        changes: see build_physics.
+        horizon: actions of an episode, the task's by default; 0 only lays it out.
+    """
     task, workers = cfg["task"], cfg["launch"]["workers"] or available_cores()
+    actions = task["horizon"] if horizon is None else horizon
     try:
-        return TaskPool(task["suite"], task["name"], workers, task["horizon"], workers)
+        return TaskPool({**task["suite"], **(changes or {})}, task["name"], workers, actions, workers)
     except (SuiteError, EmbodimentError) as error:
         raise ConfigError(str(error)) from error
 

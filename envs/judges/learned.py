@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from envs.encoders import MultiViewEncoder, to_signed
 from envs.judges.fitted import FrameJudge
 from envs.language import TextEncoder
-from envs.ranges import Count, Discount, Share
+from envs.ranges import Count, Discount, Natural, Share
 from envs.specs import WorldSpec
 
 
@@ -30,6 +30,7 @@ class LearnedJudge(FrameJudge):
         points: soft key-points of the encoder.
         text: size of the encoded instruction.
         hidden: width of the last layers.
+        asked: key-points per view that look for what the instruction says.
     """
 
     def __init__(
@@ -43,10 +44,14 @@ class LearnedJudge(FrameJudge):
         text: Count,
         hidden: Count,
         cameras: str | Sequence[str],
+        asked: Natural,
     ):
         super().__init__(hold, margin, discount)
         self.spec = spec
-        self.encoder = MultiViewEncoder(spec, points, width, pictures=2, cameras=cameras)
+        self.encoder = MultiViewEncoder(
+            spec, points, width, pictures=2, cameras=cameras, asked=asked, words=text
+        )
+        self.asked = asked
         self.words = TextEncoder(text)
         self.head = nn.Sequential(
             nn.Linear(self.encoder.out_features + text, hidden),
@@ -61,6 +66,7 @@ class LearnedJudge(FrameJudge):
         frames, first = data["frames"], data["first"]
         bytes_alone = frames.dtype == first.dtype == torch.uint8  # the encoder converts what it looks at
         both = (frames, first) if bytes_alone else (to_signed(frames), to_signed(first))
-        seen = self.encoder(torch.cat(both, 2))
-        logits: Tensor = self.head(torch.cat((seen, self.words(data["text"])), -1))
+        words = self.words(data["text"])
+        seen = self.encoder(torch.cat(both, 2), words if self.asked else None)
+        logits: Tensor = self.head(torch.cat((seen, words), -1))
         return logits.float()

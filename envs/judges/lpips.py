@@ -86,7 +86,9 @@ class LPIPS(nn.Module):
 def _read(path: str, key: str) -> dict[str, Tensor]:
     file = Path(path)
     if not file.is_file():
-        raise ValueError(f"{key}={path} does not exist; LPIPS needs its weights on disk, see envs/judges/lpips.py")
+        raise ValueError(
+            f"{key}={path} does not exist; LPIPS needs its weights on disk, see envs/judges/lpips.py"
+        )
     if file.suffix == ".safetensors":
         return load_file(file)
     found = torch.load(file, map_location="cpu", weights_only=True)

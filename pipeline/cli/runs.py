@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 
 from envs.targets import ConfigError, nearest
-from pipeline.cli.words import Words, listed, prepared, root_of
+from pipeline.cli.words import Words, prepared, root_of
 
 
 def run(words: Words) -> None:
@@ -74,14 +74,14 @@ def evaluate(words: Words) -> None:
     """success of a policy: worldloop evaluate policy=<stage|folder> world=physics|imagined experiment=...;
     one that needs no weights is a choice of configs/policy: policy=openpi policy.url=ws://...
     """
-    from pipeline.config import choices
+    from pipeline.config import offered
 
     own, rest = {"weights": "", "world": "physics"}, []
     for word in words:
         key, _, value = word.partition("=")
         if key == "world":
             own["world"] = value
-        elif key == "policy" and value not in choices("policy"):
+        elif key == "policy" and not offered("policy", value, words):
             own["weights"] = value
         else:
             rest.append(word)
@@ -111,39 +111,6 @@ def trust(words: Words) -> None:
     print(table(cfg, root, number, **own))
 
 
-def rewards(words: Words) -> None:
-    """rewards side by side along the same episodes of seen and unseen scenes: worldloop rewards
-    [rewards=[learned,proxy,embedding,golden_goal,rule]] [episodes=64] [variants=[out_of_domain]]
-    experiment=...
-    """
-    from pipeline.config import choices, load_config
-
-    own, rest = {"rewards": "learned,proxy,embedding,golden_goal,rule", "episodes": "64", "variants": ""}, []
-    for word in words:
-        key, _, value = word.partition("=")
-        if key in own:
-            own[key] = value
-        else:
-            rest.append(word)
-    names, known = listed(own["rewards"]), ["rule", *choices("judge")]
-    for name in names:
-        if name not in known:
-            raise ConfigError(f"rewards={own['rewards']}: no reward {name}{nearest(name, known)}")
-    if not own["episodes"].isdigit() or int(own["episodes"]) < 2 or not names:
-        raise ConfigError("say which rewards=[...], and episodes=N of at least 2")
-    cfg, root = prepared(rest)
-    from pipeline.commands.rewards import Plan, compare_rewards
-    from pipeline.graph.owner import owning
-    from pipeline.track import tracking
-
-    others = [word for word in rest if not word.startswith(("judge=", "judge."))]
-    configs = {name: cfg if name == "rule" else load_config([*others, f"judge={name}"]) for name in names}
-    variants = listed(own["variants"]) if own["variants"] else list(cfg["task"].get("variants", {}))
-    with owning(root, "rewards"), tracking(cfg, root) as tracker:
-        print(compare_rewards(cfg, root, Plan(configs, int(own["episodes"]), variants), tracker))
-    print(f"{root}/rewards.html, {root}/rewards.json")
-
-
 def controls(words: Words) -> None:
     """whose gain is it: beside a finished run the loop without RL iterations, RL in physics, filtered BC"""
     cfg, root = prepared(words)
@@ -154,6 +121,25 @@ def controls(words: Words) -> None:
     with owning(root, "controls"), tracking(cfg, root) as tracker:
         table = run_controls(cfg, root, tracker)
     print(f"{table_text(table)}\n{root}/controls.json, {root}/report.html")
+
+
+def study(words: Words) -> None:
+    """the table of an experiment, its rows (imitation, the loop with and without RL, RL in physics) by tasks
+    and seeds; goes on where it stopped: worldloop study experiment=bench4 [study.minutes=60]
+    """
+    from pipeline.study.plan import plan_study
+
+    made = plan_study(words)
+    # a mistake in the words is told before any work
+    from actors.process import device_of, prepare_process
+    from pipeline.graph.owner import owning
+    from pipeline.study.run import run_study
+
+    device_of(made.cfg)
+    prepare_process(made.cfg["seed"])
+    with owning(made.root, "study"):
+        text = run_study(made)
+    print(f"\n{text}\n{made.root}/study.md, study.json, study.html")
 
 
 def compare(words: Words) -> None:
@@ -177,7 +163,7 @@ def finetune(words: Words) -> None:
     graph = build_finetune(cfg, root)
     with owning(root, "finetune"), tracking(cfg, root / "finetune") as tracker:
         graph.run(tracker=tracker)
-    print(f"weights in {graph.folder('simulator')} and {graph.folder('state')}")
+    print(f"weights in {' and '.join(str(graph.folder(name)) for name in graph.nodes)}")
 
 
 def _run_until(name: str, words: Words) -> Path:

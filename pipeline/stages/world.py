@@ -19,12 +19,14 @@ from envs.rng import order_generator
 from envs.simulators.base import Simulator
 from envs.simulators.features import features_of_episodes
 from envs.targets import ConfigError, options
+from learners.stages.distill.stage import train_student
 from learners.stages.generated import generated_frames, recorded_features
 from learners.stages.judge import calibrate, judge_recordings, train_judge
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
 from learners.stages.text_world import train_text_world
 from learners.stages.tokenizer import train_tokenizer
+from pipeline.acting import acting
 from pipeline.evaluation.judging import episode_success, labelled
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
@@ -40,14 +42,14 @@ from pipeline.stages.given import (
     open_store,
 )
 
-SIMULATOR = ("seed", *TASK, "simulator", "microbatches")
+SIMULATOR = ("seed", "threads", *TASK, "simulator", "microbatches")
 
 
 @stage(reads=(*SIMULATOR, "tokenizer_fit"), place=Place.LEARNERS)
 def tokenizer(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The video autoencoder of a simulator that works on latents."""
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg)
     fit = fit_options(cfg, cfg["tokenizer_fit"], "tokenizer_fit")
     stats = train_tokenizer(model, store, learning_episodes(store), fit, folder)
@@ -67,7 +69,7 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     how = options(SimulatorFitConfig, section, f"simulator_fit.{phase}")
     store = open_store(cfg, inputs)
     episodes = learning_episodes(store)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg, inputs.weights("warm"))
     stats = (
         train_simulator(
@@ -82,6 +84,46 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return {**stats, "parameters": sum(p.numel() for p in model.parameters())}
 
 
+@stage(reads=(*SIMULATOR, "distill.steps", "distill.method", "distill.{phase}"), place=Place.LEARNERS)
+def student(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """The few-step student of the role `simulator`, going on from the role `warm`, the student before, if
+    there is one. Later stages meet it by the config of `acting`.
+
+    Settings: phase, first or refresh.
+    """
+    phase = inputs.settings["phase"]
+    store = open_store(cfg, inputs)
+    episodes = learning_episodes(store)
+    newest = newest_episodes(store, episodes)
+    return distil(cfg, folder, inputs, f"distill.{phase}", store, episodes, newest)
+
+
+def distil(
+    cfg: Cfg,
+    folder: Path,
+    inputs: Inputs,
+    key: str,
+    store: ClipStore,
+    episodes: Tensor,
+    newest: Tensor | None = None,
+) -> dict[str, Any]:
+    """A student trained on some episodes as the section at `key`, such as distill.first, says."""
+    section = dict(cfg["distill"][key.rpartition(".")[2]])
+    fit = fit_options(cfg, section.pop("fit"), f"{key}.fit")
+    how = options(SimulatorFitConfig, section, key)
+    prepare_process(cfg["seed"])
+    teacher = build_simulator(cfg, inputs.weights("simulator"))
+    weights = inputs.weights("warm") or inputs.weights("simulator")
+    model = build_simulator(acting(cfg), weights)
+    method = dict(cfg["distill"]["method"])
+    try:
+        stats = train_student(teacher, model, method, store, episodes, how, fit, folder, newest)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    save_weights(model, folder)
+    return {**stats, "evaluations": cfg["distill"]["steps"]}
+
+
 @stage(reads=(*SIMULATOR, "state_fit.{phase}"), place=Place.LEARNERS)
 def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The state expert on the frozen simulator.
@@ -90,7 +132,7 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     phase = inputs.settings["phase"]
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, model, inputs.weights("warm"))
     section = cfg["state_fit"][phase]
@@ -133,7 +175,7 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     phase = inputs.settings["phase"]
     section = cfg["judge_fit"][phase]
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model, world = build_judge(cfg, inputs.weights("warm")), build_simulator(cfg, inputs.weights("simulator"))
     if golden := inputs.weights("text_world"):
         load(model.text_world, golden).requires_grad_(False)

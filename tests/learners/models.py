@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from envs.judges import Judge
 from envs.simulators.base import WORLD_OPTIONS, Simulator
+from envs.simulators.dit.engine import DiTSimulator
 from envs.simulators.state_experts.base import StateDecoder
 from envs.specs import ActionMode, WorldSpec
 from envs.targets import build
@@ -40,6 +41,13 @@ def simulator_of(name: str, spec: WorldSpec) -> Simulator:
     section = section_of("simulator", name)
     own = {key: value for key, value in section.items() if key not in WORLD_OPTIONS}
     return build(own, "simulator", spec=spec)  # type: ignore[no-any-return]
+
+
+def distilled(spec: WorldSpec, steps: int = 2) -> Simulator:
+    """An untrained student of dit_small."""
+    section = section_of("simulator", "dit_small")
+    own = {key: value for key, value in section.items() if key not in WORLD_OPTIONS}
+    return build(DiTSimulator.student_section(own, steps), "simulator", spec=spec)  # type: ignore[no-any-return]
 
 
 def decoder_of(name: str, simulator: Simulator) -> StateDecoder:

@@ -71,9 +71,7 @@ def test_goals_are_imagined_once_for_each_first_frame_and_instruction() -> None:
     few = golden(cache=1)
     for _ in range(2):
         again = few.score(frames, first, TEXTS)
-        assert torch.allclose(
-            again.progress, whole.progress, atol=1e-5
-        )  # the same goals
+        assert torch.allclose(again.progress, whole.progress, atol=1e-5)  # the same goals
     assert few.imagined == 3 and len(few._known) == 1
 
 

@@ -16,7 +16,7 @@ from envs.episodes.privileged import read_privileged
 from envs.judges import RuleJudge
 from envs.physics.suite import build_suite, scene_of
 from envs.targets import ConfigError
-from pipeline.commands.rewards import Plan, compare_rewards
+from pipeline.commands.worlds.rewards import Plan, compare_rewards
 from pipeline.config import load_config
 from pipeline.evaluation.judging import Scores
 from pipeline.evaluation.rewards.figures import BY_PHYSICS, BY_TIME, Truth, auc, by_rule, figures, truth_of

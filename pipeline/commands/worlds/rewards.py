@@ -25,8 +25,8 @@ from envs.simulators.base import Simulator
 from envs.simulators.replay import replay
 from envs.targets import ConfigError
 from pipeline.evaluation.judging import Scores, judge_both, labelled
-from pipeline.evaluation.rewards.page import build_page, table_text
 from pipeline.evaluation.rewards.figures import BY_PHYSICS, Truth, by_rule, chosen, curve, figures, truth_of
+from pipeline.evaluation.rewards.page import build_page, table_text
 from pipeline.graph.graph import Graph
 from pipeline.loop import build_loop
 from pipeline.stages.given import datasets, open_store
@@ -75,7 +75,7 @@ def compare_rewards(cfg: Cfg, root: Path, plan: Plan, tracker: Tracker | None = 
     base = build_loop(cfg, root)
     base.run(base.nodes[JUDGE].inputs["simulator"], tracker)
     judges = dict(_judges(cfg, root, plan, tracker))
-    simulator = build_simulator(cfg, base.inputs(JUDGE).weights("simulator")).eval()
+    simulator = build_simulator(base.cfg, base.inputs(JUDGE).weights("simulator")).eval()
     domains = {
         name: _domain(cfg, judges, simulator, store, episodes, plan.drawn)
         for name, store, episodes in _domains(cfg, base, plan, tracker)
@@ -98,7 +98,7 @@ def _judges(cfg: Cfg, root: Path, plan: Plan, tracker: Tracker | None) -> Iterat
         mine = {**other, "judge": {**other["judge"], "rewards": worth}}
         graph = build_loop(mine, root)
         graph.run(JUDGE, tracker)
-        yield name, build_judge(mine, graph.folder(JUDGE) / "weights.safetensors").eval()
+        yield name, build_judge(graph.cfg, graph.folder(JUDGE) / "weights.safetensors").eval()
 
 
 def _domains(
