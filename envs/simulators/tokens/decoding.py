@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -66,7 +66,7 @@ class MaskGIT:
 
     steps: Count
     temperature: NonNegative
-    causal: ClassVar[bool] = False
+    causal = False
 
     def shown(self, tokens: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """See Decoding: of every frame a random set of places is masked, by the same cosine."""
@@ -100,7 +100,7 @@ class Raster:
     """
 
     temperature: NonNegative
-    causal: ClassVar[bool] = True
+    causal = True
 
     def shown(self, tokens: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """See Decoding: every place is shown the tokens of the one before it."""
