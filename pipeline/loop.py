@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from envs.manifest import digest_of
+from envs.targets import target
 from pipeline.graph.graph import Graph
 from pipeline.graph.workers import learners_of
 from pipeline.stages import collect, imitation, keep, prove, rl, show, world
@@ -127,8 +129,18 @@ def _refresh(graph: Graph, cfg: Cfg, data: list[str], before: World, number: int
     simulator = graph.add(f"simulator-{number}", world.simulator, {"data": data, "warm": warm}, phase=phase)
     inputs = {"data": data, "simulator": simulator}
     state = graph.add(f"state-{number}", world.state, {**inputs, "warm": before.state}, phase=phase)
-    judge = graph.add(f"judge-{number}", world.judge, {**inputs, "warm": before.judge}, phase=phase)
+    inputs["warm"], files = before.judge, _judge_files(cfg)
+    judge = graph.add(f"judge-{number}", world.judge, inputs, phase=phase, **files)
     return World(simulator, state, judge)
+
+
+def _judge_files(cfg: Cfg) -> dict[str, Any]:
+    """A setting with the hashes of files that decide what the judge says, if there are any: when one changes,
+    what it judged is out of date.
+    """
+    kind: Any = target(cfg["judge"], "judge")
+    found = {path.name: digest_of(path) for path in kind.files(cfg["judge"])}
+    return {"files": found} if found else {}
 
 
 def _learn(

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from envs.specs import Status
+
+
+class JudgeError(RuntimeError):
+    """A judge cannot go on, and asking it again would not help: its budget is spent, or nobody is there.
+
+    The run stops; the message names the config key and the fix.
+    """
 
 
 class Judgement(NamedTuple):
@@ -29,11 +38,15 @@ class Judge(nn.Module):
         hold: frames in a row that must count as success before the episode does.
         threshold: probability from which a frame counts as success; calibration sets it later.
 
+    Attributes:
+        calibrates: whether the threshold is to be set on recorded video (learners/stages/judge.py).
+
     Raises:
         ValueError: if hold is less than one frame.
     """
 
     threshold: Tensor
+    calibrates = True
 
     def __init__(self, hold: int, threshold: float = 0.5):
         super().__init__()
@@ -62,6 +75,28 @@ class Judge(nn.Module):
     def fetch(self, ticket: Any) -> Judgement:
         """The judgement on what `submit` was given."""
         return self.score(*ticket)
+
+    @classmethod
+    def check(cls, options: Mapping[str, Any]) -> None:
+        """See that a judge of these options (section judge) can work here, before hours are spent on others.
+
+        Raises:
+            ConfigError: naming the key and the fix.
+        """
+
+    @classmethod
+    def files(cls, options: Mapping[str, Any]) -> tuple[Path, ...]:
+        """Files whose contents decide judgements, by options that name one: when they change, what was made
+        with the judge is out of date.
+        """
+        return tuple(Path(value) for value in options.values() if isinstance(value, str) and _is_file(value))
+
+    @classmethod
+    def spent(cls, options: Mapping[str, Any]) -> dict[str, float]:
+        """What judges of these options have asked for and paid so far, over all processes; {} if they are
+        free.
+        """
+        return {}
 
     def streak(self, success: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         """Whether `hold` frames in a row were successes by the end of each frame.
@@ -92,6 +127,13 @@ class Judge(nn.Module):
         masked = torch.where(valid, success, 0.0)
         done, _ = self.streak(masked, torch.zeros(len(success), dtype=torch.int64, device=success.device))
         return done.any(1)
+
+
+def _is_file(name: str) -> bool:
+    try:
+        return Path(name).is_file()
+    except OSError:  # too long for a name
+        return False
 
 
 def judgement_status(success: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ COMMANDS: dict[str, Callable[[Words], None]] = {
     for command in (
         *(runs.run, runs.rl, runs.stage, runs.stages, runs.evaluate, runs.trust, runs.controls),
         *(runs.compare, runs.finetune, tools.serve, tools.play, tools.convert, tools.inspect, tools.bench),
+        tools.judge,
         *(tools.verify, tools.submit, tools.chaos, tools.tasks, tools.config, tools.doctor, tools.completion),
     )
 }

@@ -39,11 +39,13 @@ from pipeline.stages.given import (
     rl_options,
     successful_episodes,
 )
+from pipeline.stages.judge_cost import priced
 
 LEARNING = ("policy", "algorithm", "rl", "imitation", "microbatches")
 
 
 @stage(reads=(*WORLD, *LEARNING), place=Place.LEARNERS)
+@priced
 def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Reinforcement learning inside the simulator.
 

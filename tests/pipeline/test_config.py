@@ -75,7 +75,8 @@ WRONG: dict[type, list[Any]] = {
     dict: [3, None, "none", [1]],
 }
 # other packages' options; where null has a meaning
-FREE, NULLABLE = ("simulator.scratch", "policy.policy"), ("rl.chunks", "task.suite", "finetune.weights")
+FREE = ("simulator.scratch", "policy.policy", "judge.chat.body")
+NULLABLE = ("rl.chunks", "task.suite", "finetune.weights", "judge.chat.key")
 
 
 @pytest.mark.parametrize("word", [f"{group}={name}" for group in groups() for name in choices(group)])
