@@ -94,6 +94,11 @@ class HTTPChat:
         secret = self._secret()
         return text.replace(secret, "[key]") if secret else text
 
+    def _words(self, text: str) -> str:
+        """The first words of an answer, or of its error message if it is JSON with one, without the key."""
+        found = " ".join(self._hidden(_message(self._hidden(text))).split())
+        return found[:_SAID] or "nothing"
+
     def _session(self, seconds: float | None = None) -> aiohttp.ClientSession:
         # One for each question, which takes seconds: so nothing is left open when a run is interrupted.
         secret = self._secret()
@@ -151,7 +156,7 @@ class HTTPChat:
         """What to raise for an answer that is none."""
         if status in (401, 403):
             return self._unwelcome(status, text)
-        said = f"{self.url} answered {status}: {self._hidden(_words(text))}"
+        said = f"{self.url} answered {status}: {self._words(text)}"
         if status in (404, 405) or 300 <= status < 400:
             return JudgeError(
                 f"{said}. It knows no judge.chat.model={self.model}, or judge.chat.url is not the address up"
@@ -162,7 +167,7 @@ class HTTPChat:
     def _unwelcome(self, status: int, text: str) -> JudgeError:
         key = "null" if self.key is None else self.key
         return JudgeError(
-            f"{self.url} answered {status}: {self._hidden(_words(text))}; judge.chat.key={key} must name the"
+            f"{self.url} answered {status}: {self._words(text)}; judge.chat.key={key} must name the"
             " environment variable of a key that it takes"
         )
 
@@ -178,9 +183,7 @@ class HTTPChat:
             said, usage = message.get("content"), found.get("usage") or {}
             tokens = [int(usage.get(name) or 0) for name in ("prompt_tokens", "completion_tokens")]
         except (ValueError, KeyError, IndexError, TypeError, AttributeError):
-            raise Unanswered(
-                f"{self.url} answered no chat completion: {self._hidden(_words(text))}"
-            ) from None
+            raise Unanswered(f"{self.url} answered no chat completion: {self._words(text)}") from None
         # A refusal has no content: an answer that is neither yes nor no.
         return Reply(self._hidden(said) if isinstance(said, str) else "", *tokens)
 
@@ -214,14 +217,13 @@ def _wait(header: str) -> float:
         return 0.0
 
 
-def _words(text: str) -> str:
-    """The first words of an answer, or its error message if it is JSON with one."""
+def _message(text: str) -> str:
+    """The error message in an answer that is JSON with one, else all of it."""
     try:
         found = json.loads(text)["error"]
-        text = str(found["message"] if isinstance(found, dict) else found)
+        return str(found["message"] if isinstance(found, dict) else found)
     except (ValueError, KeyError, TypeError):
-        pass
-    return " ".join(text.split())[:_SAID] or "nothing"
+        return text
 
 
 def _reason(error: BaseException) -> str:

@@ -59,7 +59,7 @@ def weights() -> Iterator[dict[str, Any]]:
         yield {
             "chat": {"path": str(path), "device": "cpu", "max_tokens": 1},
             "prompt": str(prompt),
-            "votes": {"count": 9, "calibrate": True},
+            "votes": {"count": 15, "calibrate": True},
             "pictures": {"side": 0},
             "asking": {"cache": folder},
         }

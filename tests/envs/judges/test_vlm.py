@@ -292,7 +292,7 @@ def test_a_wrong_address_and_an_unwelcome_key_stop_the_run_at_once(
 @pytest.mark.parametrize(
     ("prompt", "said"),
     [
-        ("nowhere", r"judge\.prompt=nowhere is no text file, nor a prompt's name.*done"),
+        ("nowhere", r"judge\.prompt=nowhere is no text file, and no prompt of that name; there are .*done"),
         ("Is it done?", r"must say \$instruction, .* found \[\]"),
         ("$instruction costs 5$", r"found \['\$', '\$instruction'\]"),
         ("$instruction by $whom", r"found \['\$instruction', '\$whom'\]"),

@@ -17,7 +17,7 @@ _TEMPLATE = (
 )
 
 
-def save_tiny_vlm(folder: Path, seed: int = 0) -> Path:
+def save_tiny_vlm(folder: Path, seed: int = 9) -> Path:
     """Write the model, its processor and its chat template."""
     from tokenizers import Tokenizer, models
     from transformers import (
