@@ -21,6 +21,7 @@ COMMANDS: dict[str, Callable[[Words], None]] = {
         *(runs.run, runs.rl, runs.stage, runs.stages, runs.evaluate, runs.trust, runs.controls, runs.study),
         *(worlds.policy_value, worlds.fidelity, worlds.sweep, worlds.rewards, runs.compare, runs.finetune),
         *(tools.serve, tools.play, tools.convert, tools.inspect, tools.bench, tools.gridworld),
+        tools.judge,
         *(tools.verify, tools.submit, tools.chaos, tools.tasks, tools.config, tools.doctor, tools.completion),
     )
 }

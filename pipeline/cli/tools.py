@@ -118,6 +118,25 @@ def gridworld(words: Words) -> None:
         print(study(cfg, root, [int(count) for count in counts], tracker))
 
 
+def judge(words: Words) -> None:
+    """verdicts on recorded episodes against their recorded success, and what they cost, by which frames are
+    shown: worldloop judge judge=vlm judge.chat.model=<name> [data=<LeRobot set>] [split=held_out|all]
+    [episodes=N] [frames=all,4,ends] experiment=...
+    """
+    from pipeline.commands.judge import Selection, judge_study
+
+    own, rest = {}, []
+    for word in words:
+        key, _, value = word.partition("=")
+        if key in ("data", "split", "episodes", "frames"):
+            own[key] = value
+        else:
+            rest.append(word)
+    selection = Selection.of(own)
+    cfg, root = prepared(rest)
+    print(judge_study(cfg, root, selection))
+
+
 def verify(words: Words) -> None:
     """see that every file of a run is what its stage left: worldloop verify runs/quickstart; or compare our
     network with a public one's outputs: worldloop verify gesim FIXTURE.safetensors
