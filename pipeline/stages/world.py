@@ -41,6 +41,7 @@ from pipeline.stages.given import (
     newest_episodes,
     open_store,
 )
+from pipeline.stages.judge_cost import priced
 
 SIMULATOR = ("seed", "threads", *TASK, "simulator", "microbatches")
 
@@ -165,6 +166,7 @@ def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 
 @stage(reads=(*WORLD, "judge_fit.{phase}", "rl.starts", "rl.chunks", "microbatches"), place=Place.LEARNERS)
+@priced
 def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The judge on recorded and on generated frames; its threshold on recorded video that no judge learns
     from. A judge without weights is only calibrated. One with a text world takes over what the role
@@ -212,7 +214,11 @@ def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor)
 
 
 def _calibrate(model: Judge, store: ClipStore, world: Simulator, bf16: bool) -> None:
-    """Set the judge's threshold on the calibration split, where its scores tell success."""
+    """Set the judge's threshold on the calibration split, where its scores tell success; a judge that says
+    (judge.votes.calibrate=false) that its answers need none is not asked.
+    """
+    if not model.calibrates:
+        return
     unseen = labelled(store, store.split("calibration"))
     if not len(unseen):
         return

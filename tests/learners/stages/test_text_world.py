@@ -60,6 +60,8 @@ def test_the_graph_has_it_where_the_judge_asks_for_one(tmp_path: Path) -> None:
     graph = build_loop(cfg, tmp_path)
     assert [name for name in graph.nodes if name.startswith("text_world")] == ["text_world-1", "text_world-2"]
     roles = {name: graph.nodes[name].identity.roles for name in graph.nodes}
-    assert roles["judge-2"]["text_world"] == ["text_world-2"] and roles["text_world-2"]["warm"] == ["text_world-1"]
+    assert roles["judge-2"]["text_world"] == ["text_world-2"] and roles["text_world-2"]["warm"] == [
+        "text_world-1"
+    ]
     users = [name for name in roles if "text_world" in roles[name]]
     assert users == ["judge-1", "judge-2"]
