@@ -112,7 +112,7 @@ def distil(
     section = dict(cfg["distill"][key.rpartition(".")[2]])
     fit = fit_options(cfg, section.pop("fit"), f"{key}.fit")
     how = options(SimulatorFitConfig, section, key)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     teacher = build_simulator(cfg, inputs.weights("simulator"))
     weights = inputs.weights("warm") or inputs.weights("simulator")
     model = build_simulator(acting(cfg), weights)
@@ -144,7 +144,7 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return stats
 
 
-@stage(reads=(*ROBOT, "judge.text_world", "text_world_fit", "microbatches"), place=Place.LEARNERS)
+@stage(reads=(*ROBOT, "threads", "judge.text_world", "text_world_fit", "microbatches"), place=Place.LEARNERS)
 def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The text world of a judge that asks for one, with its tokenizer, going on from the role `warm` if there
     is one.
@@ -153,7 +153,7 @@ def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     phase, section = inputs.settings["phase"], cfg["text_world_fit"]
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_text_world(cfg, inputs.weights("warm"))
     fit = fit_options(cfg, section[phase], f"text_world_fit.{phase}")
     tokenizer = fit_options(cfg, section["tokenizer"], "text_world_fit.tokenizer")
