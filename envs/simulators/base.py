@@ -8,6 +8,9 @@ seed, chunk index).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -35,16 +38,18 @@ class Simulator(nn.Module):
 
     Args:
         spec: what it shows of which robot.
-        memory_frames: sparse memory frames, M; the first frame is always one of them.
+        memory_frames: memory frames, M; of sparse ones the first frame is always one.
 
     Attributes:
         feature_shape: of the features that state experts read, without the batch.
         hidden: names of the layers that optimisers may take for hidden ones (training/optimisers.py);
             none for all.
+        recent_memory: whether memory is the newest frames instead of some that are spread over the past.
     """
 
     feature_shape: tuple[int, ...]
     hidden: tuple[str, ...] = ()
+    recent_memory: bool = False
 
     def __init__(self, spec: WorldSpec, memory_frames: int):
         super().__init__()
@@ -78,6 +83,23 @@ class Simulator(nn.Module):
         """Training loss of a clip (see episodes/clips.py) and figures to log."""
         raise NotImplementedError
 
+    @classmethod
+    def student_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
+        """The config section of a student that takes so many steps, where `section` is the teacher's.
+
+        Raises:
+            ValueError: naming what cannot be, as of an engine that does not denoise in steps.
+        """
+        raise ValueError(
+            f"distill.steps={steps}, but {cls.__name__} does not denoise in steps, so there is nothing to"
+            " distil; set distill.steps=0, or choose simulator=dit or gesim"
+        )
+
+    @property
+    def lost_in_training(self) -> str:
+        """What its own loss takes from the weights, in a sentence; "" for nothing."""
+        return ""
+
     def features(self, inputs: TensorDict) -> Tensor:
         """Only the features of `predict`, for training the state expert."""
         return self.predict(inputs)[1]
@@ -99,8 +121,10 @@ class Simulator(nn.Module):
         """
 
     def recall(self, state: TensorDict, future: TensorDict) -> TensorDict:
-        """Memory for the next chunk, [B, M, ...]: evenly spread over the past, with the first frame."""
-        return memory.recall(state, self.memory_frames)
+        """Memory for the next chunk, [B, M, ...]: evenly spread over the past, with the first frame, or the
+        newest ones.
+        """
+        return memory.recall(state, self.memory_frames, self.recent_memory)
 
     def release(self, state: TensorDict, mask: Tensor) -> None:
         """The sessions of `mask` [B] end; what is held for them elsewhere can go. Here nothing is."""

@@ -13,6 +13,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from envs.judges.base import Judge, Judgement
+from envs.simulators.features import pooled
 from envs.specs import FEATURES, FRAMES, IMAGE, JUDGE_STATUS, PROGRESS, SUCCESS, Rewards, Status
 
 
@@ -41,7 +42,9 @@ class JudgeReward(Transform):
         self._first = torch.zeros(0, dtype=torch.uint8)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        clips = (next_tensordict[FRAMES], self._first, self.parent.base_env.instructions)
+        clips = [next_tensordict[FRAMES], self._first, self.parent.base_env.instructions]
+        if self.judge.reads_features:
+            clips.append(pooled(next_tensordict[FEATURES])[:, None])
         if self.later:
             if not self._tickets:
                 self._opening = (self._progress, self._begun)
@@ -116,7 +119,10 @@ class JudgeReward(Transform):
         if not self.rewards.progress:
             nothing = torch.zeros(len(image), 1, device=image.device)
             return nothing, nothing.squeeze(-1).long()
-        judgement = self.judge.score(image.unsqueeze(1), world.opening, world.instructions)
+        shown = [image.unsqueeze(1), world.opening, world.instructions]
+        if self.judge.reads_features:
+            shown.append(world.features_now()[:, None])
+        judgement = self.judge.score(*shown)
         known = judgement.status == Status.OK.value
         return torch.where(known.unsqueeze(-1), judgement.progress, 0.0), judgement.status
 

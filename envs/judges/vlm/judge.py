@@ -109,7 +109,9 @@ class VLMJudge(Judge):
         limits = options_of(Budget, options["budget"], "judge.budget")
         return spent(Path(options["asking"]["cache"]), limits)
 
-    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Judgement:
+    def score(
+        self, frames: Tensor, first: Tensor, instruction: list[str], features: Tensor | None = None
+    ) -> Judgement:
         """See Judge.score.
 
         Raises:
@@ -117,7 +119,9 @@ class VLMJudge(Judge):
         """
         return self.fetch(self.submit(frames, first, instruction))
 
-    def submit(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Ticket:
+    def submit(
+        self, frames: Tensor, first: Tensor, instruction: list[str], features: Tensor | None = None
+    ) -> Ticket:
         """See Judge.submit; the first questions are under way when it returns."""
         clips = zip(frames.cpu().numpy(), first.cpu().numpy(), list(instruction), strict=True)
         work = _all([self._clip(*clip) for clip in clips])

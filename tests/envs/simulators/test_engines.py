@@ -30,6 +30,8 @@ BATCH = 3
 CHUNK = 5  # 1 + 4 k, as GE-Sim's autoencoder wants it
 # It generates nothing: a server does, whose engine is tested here; tests/actors/test_remote.py has the rest.
 SERVED = ("remote",)
+# Of a published size, which is counted on the meta device (tests/pipeline/test_bench_size.py).
+FULL = "_full"
 # Conditioned on pose and ray maps alone, as released: whoever cannot draw them is refused.
 MAPS_ALONE = ("gesim_tiny",)
 # What its kinematics are does not matter where pose maps are given.
@@ -44,7 +46,7 @@ def parents_of(name: str) -> list[str]:
 
 def engines() -> list[str]:
     """What configs/simulator offers: of an engine with a config that builds on another's, the smaller one."""
-    names = [name for name in offered("simulator") if name not in SERVED]
+    names = [name for name in offered("simulator") if name not in SERVED and not name.endswith(FULL)]
     larger = {parent for name in names for parent in parents_of(name)}
     return [name for name in names if name not in larger]
 
