@@ -28,6 +28,7 @@ class Purpose(IntEnum):
     COLLECT = 0
     DEPLOY = 4_000_000
     PRACTICE = 6_000_000  # RL in physics
+    STARTS = 8_000_000  # first frames, from which only imagination goes on
     EVALUATE = 9_000_000
 
 
@@ -74,6 +75,11 @@ def iteration_generator(seed: int, iteration: int) -> torch.Generator:
 def episode_stream(seed: int) -> torch.Generator:
     """The generator from which an environment draws episode seeds once it was given no more."""
     return _generator(seed)
+
+
+def vote_generator(vote: int) -> torch.Generator:
+    """The generator by which a judge's vote is sampled; equal questions get equal answers."""
+    return _generator(vote)
 
 
 # -- learning

@@ -37,6 +37,7 @@ C2W = ("camera", "c2w")  # float32 [B, V, 4, 4] camera to world, OpenCV conventi
 EPISODE = "episode_seed"  # int64 [B, 1]: episodes with equal seeds start from the same frame
 SUCCESS = "success"  # bool [B, 1]
 PROGRESS = "progress"  # float32 [B, 1] in 0..1
+LOST = "lost"  # bool [B, 1], in physics only: it crashes in this episode, which nobody learns from or counts
 JUDGE_STATUS = "judge_status"  # int64 [B, 1], see Status
 COMMANDS = "commands"  # float32 [B, K, A], what a chunk comes to, on the inverse path only
 POSE_MAP = "pose_map"  # uint8 [B, K, V, 3, H, W], on the inverse path only

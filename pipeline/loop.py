@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from envs.manifest import digest_of
+from envs.targets import target
+from pipeline.acting import acting
 from pipeline.graph.graph import Graph
 from pipeline.graph.workers import learners_of
 from pipeline.stages import collect, imitation, keep, prove, rl, show, world
@@ -21,8 +24,12 @@ T = TypeVar("T")
 
 @dataclass
 class World:
-    """Names of the stages that make the imagined world; "" before there is one."""
+    """Names of the stages that make the imagined world; "" before there is one.
 
+    Policies act in `simulator`, which is `teacher`, or its few-step student.
+    """
+
+    teacher: str = ""
     simulator: str = ""
     state: str = ""
     judge: str = ""
@@ -46,7 +53,7 @@ def build_loop(cfg: Cfg, root: Path, with_rl: bool = True) -> Graph:
         ConfigError: for what can be seen to fail before anything starts.
     """
     learners_of(cfg)
-    graph = Graph(cfg, root / "stages")
+    graph = Graph(acting(cfg), root / "stages")
     if has_physics(cfg):
         _physics_loop(graph, cfg, with_rl)
     else:
@@ -69,9 +76,23 @@ def of_round(values: Sequence[T], number: int) -> T:
     return values[min(number, len(values)) - 1]
 
 
+def deployed_episodes(cfg: Cfg) -> int:
+    """Physics episodes of all deployments; the last one is of what the last round has learned."""
+    return sum(of_round(cfg["rounds"]["deploy"], n) for n in range(1, last_round(cfg) + 2))
+
+
+def imagined_iterations(cfg: Cfg) -> int:
+    """Iterations of RL whose episodes, if they were whole, would take as many steps as all rounds imagine."""
+    iterations = sum(of_round(cfg["rounds"]["iterations"], n) for n in range(1, last_round(cfg) + 1))
+    whole = cfg["task"]["horizon"] // cfg["task"]["chunk"]
+    share = min(1.0, (cfg["rl"]["chunks"] or whole) / whole)  # of a whole episode, has an imagined one
+    return max(1, round(iterations * share))
+
+
 def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
     data: list[str] = [graph.add("collect", collect.collect)]
     first = policy = best = graph.add("imitation", imitation.imitation, {"data": data})
+    starts = _extra_starts(graph, cfg) if with_rl else []
     made, known = World(), ""
     for number in range(1, last_round(cfg) + 1):
         deployed = _deploy(graph, cfg, policy, number)
@@ -89,7 +110,7 @@ def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
                 number=number,
             )
         if with_rl:
-            policy = _learn(graph, cfg, data, made, policy, number)
+            policy = _learn(graph, cfg, data, made, policy, number, starts)
     last = last_round(cfg) + 1
     policy, _ = _keep(graph, policy, _deploy(graph, cfg, policy, last), best, known, last)
     before = graph.add("evaluate-before", prove.evaluate_physics, {"policy": first})
@@ -111,21 +132,40 @@ def _keep(graph: Graph, policy: str, deployed: str, best: str, known: str, numbe
     return kept, kept
 
 
+def _extra_starts(graph: Graph, cfg: Cfg) -> list[str]:
+    """The stages that hold the first frames of which nothing more was recorded."""
+    section = cfg["extra_starts"]
+    out = [
+        graph.add(f"starts-{variant}", collect.first_frames, variant=variant)
+        for variant in section["variants"]
+    ]
+    if section["data"]:
+        mark = collect.fingerprint(section["data"], "extra_starts.data")
+        out.append(graph.add("starts-recorded", collect.recorded_starts, fingerprint=mark))
+    return out
+
+
 def _data_loop(graph: Graph, cfg: Cfg) -> None:
     mark = collect.fingerprint(cfg["task"]["data"])
     data = [graph.add("recordings", collect.recordings, fingerprint=mark)]
     made = _refresh(graph, cfg, data, World(), 1)
     first = graph.add("imitation", imitation.imitation, {"data": data})
-    policy = _learn(graph, cfg, data, made, first, 1, deployed=0)
+    starts = _extra_starts(graph, cfg)
+    policy = _learn(graph, cfg, data, made, first, 1, starts, deployed=0)
     _conclude(graph, data, made, first, policy, {})
 
 
 def _refresh(graph: Graph, cfg: Cfg, data: list[str], before: World, number: int) -> World:
     """The stages that train the imagined world on all data so far, from its predecessor if there is one."""
-    phase, warm = ("refresh", before.simulator) if before.simulator else ("first", "")
+    phase, warm = ("refresh", before.teacher) if before.teacher else ("first", "")
+    learning = graph.under(cfg)  # with the simulator as it is, not as it is acted in
     if not warm and "codec" in cfg["simulator"]:
-        warm = graph.add("tokenizer", world.tokenizer, {"data": data})
-    simulator = graph.add(f"simulator-{number}", world.simulator, {"data": data, "warm": warm}, phase=phase)
+        warm = learning.add("tokenizer", world.tokenizer, {"data": data})
+    roles = {"data": data, "warm": warm}
+    simulator = teacher = learning.add(f"simulator-{number}", world.simulator, roles, phase=phase)
+    if cfg["distill"]["steps"]:
+        roles = {"data": data, "simulator": teacher, "warm": before.simulator}
+        simulator = learning.add(f"student-{number}", world.student, roles, phase=phase)
     inputs = {"data": data, "simulator": simulator}
     state = graph.add(f"state-{number}", world.state, {**inputs, "warm": before.state}, phase=phase)
     golden = ""
@@ -133,8 +173,17 @@ def _refresh(graph: Graph, cfg: Cfg, data: list[str], before: World, number: int
         roles = {"data": data, "warm": before.text_world}
         golden = graph.add(f"text_world-{number}", world.text_world, roles, phase=phase)
     roles = {**inputs, "warm": before.judge, "text_world": golden}
-    judge = graph.add(f"judge-{number}", world.judge, roles, phase=phase)
-    return World(simulator, state, judge, golden)
+    judge = graph.add(f"judge-{number}", world.judge, roles, phase=phase, **_judge_files(cfg))
+    return World(teacher, simulator, state, judge, golden)
+
+
+def _judge_files(cfg: Cfg) -> dict[str, Any]:
+    """A setting with the hashes of files that decide what the judge says, if there are any: when one changes,
+    what it judged is out of date.
+    """
+    kind: Any = target(cfg["judge"], "judge")
+    found = {path.name: digest_of(path) for path in kind.files(cfg["judge"])}
+    return {"files": found} if found else {}
 
 
 def _learn(
@@ -144,13 +193,14 @@ def _learn(
     made: World,
     policy: str,
     number: int,
+    starts: list[str],
     deployed: int | None = None,
 ) -> str:
     """RL in the imagined world; `deployed` is the round whose successes anchor it, this one by default."""
     return graph.add(
         f"rl-{number}",
         rl.rl,
-        {"data": data, **made.roles(), "policy": policy},
+        {"data": data, "starts": starts, **made.roles(), "policy": policy},
         number=number,
         deployed=number if deployed is None else deployed,
         iterations=of_round(cfg["rounds"]["iterations"], number),

@@ -1,5 +1,6 @@
 """Action conditioning: pose maps, ray maps, action vectors; whatever the embodiment allows."""
 
+from envs.conditioning.action_text import ActionText
 from envs.conditioning.action_vector import ActionVector
 from envs.conditioning.pose_map import CANVAS, PoseMapStyle, render_pose_map
 from envs.conditioning.poses import end_effector_poses
@@ -7,6 +8,7 @@ from envs.conditioning.ray_map import render_ray_map
 
 __all__ = [
     "CANVAS",
+    "ActionText",
     "ActionVector",
     "PoseMapStyle",
     "end_effector_poses",

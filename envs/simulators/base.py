@@ -8,6 +8,9 @@ seed, chunk index).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -79,6 +82,23 @@ class Simulator(nn.Module):
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """Training loss of a clip (see episodes/clips.py) and figures to log."""
         raise NotImplementedError
+
+    @classmethod
+    def student_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
+        """The config section of a student that takes so many steps, where `section` is the teacher's.
+
+        Raises:
+            ValueError: naming what cannot be, as of an engine that does not denoise in steps.
+        """
+        raise ValueError(
+            f"distill.steps={steps}, but {cls.__name__} does not denoise in steps, so there is nothing to"
+            " distil; set distill.steps=0, or choose simulator=dit or gesim"
+        )
+
+    @property
+    def lost_in_training(self) -> str:
+        """What its own loss takes from the weights, in a sentence; "" for nothing."""
+        return ""
 
     def features(self, inputs: TensorDict) -> Tensor:
         """Only the features of `predict`, for training the state expert."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -23,10 +23,29 @@ DISTILLED = (1.0, 0.9375, 0.8333, 0.625)
 class Sampler(Protocol):
     """Turns standard normal noise into data by asking for velocities."""
 
+    @property
+    def evaluations(self) -> int:
+        """Velocities asked for."""
+
+    @property
+    def jumps(self) -> bool:
+        """Whether each step goes straight to the data, which only a few-step student does well."""
+
     def __call__(self, velocity: Velocity, noise: Tensor) -> Tensor:
         """Data like `noise`; `velocity` is called with z and its level, last with the level whose features
         are kept.
         """
+
+
+def shifted_levels(steps: int, shift: float) -> list[float]:
+    """The levels of so many steps in falling order, from 1, with the 0 at which they end.
+
+    Args:
+        shift: 1 makes equal steps, more than 1 spends more of them near noise.
+    """
+    even = torch.linspace(1.0, 0.0, steps + 1)
+    levels: list[float] = (shift * even / (1 + (shift - 1) * even)).tolist()
+    return levels
 
 
 @dataclass(frozen=True)
@@ -40,13 +59,17 @@ class Euler:
 
     steps: int
     shift: float
+    jumps: ClassVar[bool] = False
+
+    @property
+    def evaluations(self) -> int:
+        """See Sampler."""
+        return self.steps
 
     def __call__(self, velocity: Velocity, noise: Tensor) -> Tensor:
         """See Sampler."""
-        even = torch.linspace(1.0, 0.0, self.steps + 1)
-        levels = (self.shift * even / (1 + (self.shift - 1) * even)).tolist()
         z = noise
-        for level, following in pairwise(levels):
+        for level, following in pairwise(shifted_levels(self.steps, self.shift)):
             z = z + (following - level) * velocity(z, level)
         return z
 
@@ -61,6 +84,7 @@ class Distilled:
     """
 
     sigmas: tuple[float, ...] = DISTILLED
+    jumps: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if (
@@ -70,13 +94,23 @@ class Distilled:
         ):
             raise ValueError(f"sigmas={list(self.sigmas)} must fall from at most 1 and stay above 0")
 
-    def __call__(self, velocity: Velocity, noise: Tensor) -> Tensor:
+    @property
+    def evaluations(self) -> int:
         """See Sampler."""
+        return len(self.sigmas)
+
+    def before(self, number: int, velocity: Velocity, noise: Tensor) -> Tensor:
+        """What step `number`, counted from 0, sees at its level."""
         z = noise
-        for level, following in pairwise((*self.sigmas, 0.0)):
+        for level, following in pairwise(self.sigmas[: number + 1]):
             data = z - level * velocity(z, level)
             z = (1 - following) * data + following * noise
         return z
+
+    def __call__(self, velocity: Velocity, noise: Tensor) -> Tensor:
+        """See Sampler."""
+        z, last = self.before(self.evaluations - 1, velocity, noise), self.sigmas[-1]
+        return z - last * velocity(z, last)
 
 
 @dataclass(frozen=True)
@@ -95,6 +129,12 @@ class EDM:
     sigma_max: float = 80.0
     sigma_min: float = 0.002
     rho: float = 7.0
+    jumps: ClassVar[bool] = False
+
+    @property
+    def evaluations(self) -> int:
+        """See Sampler."""
+        return self.steps
 
     def sigmas(self) -> list[float]:
         """Noise of each step in falling order."""

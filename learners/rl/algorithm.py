@@ -13,7 +13,7 @@ from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
 
 from envs.ranges import Count, Natural, NonNegative, Positive, Share
-from envs.specs import CHUNK, INVALID_ACTION, JUDGE_STATUS, LOG_PROB, Status
+from envs.specs import CHUNK, INVALID_ACTION, JUDGE_STATUS, LOG_PROB, LOST, Status
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,9 @@ class RLConfig:
             end.
         freeze_perception: train only what follows the policy's encoder, so that no picture is encoded twice.
         checkpoint_every: iterations between checkpoints.
+        evaluate_every: iterations after which what has been learned so far is tried in physics, for the log
+            alone; 0 for never.
+        evaluate_episodes: of each such trial.
         seed: of start frames, exploration and minibatches.
     """
 
@@ -82,6 +85,8 @@ class RLConfig:
     rewards_later: bool
     freeze_perception: bool
     checkpoint_every: Count
+    evaluate_every: Natural
+    evaluate_episodes: Count
     seed: Natural
 
     def __post_init__(self) -> None:
@@ -161,9 +166,16 @@ def finite(batch: TensorDict) -> Tensor:
     return ~_episodes_with(batch[INVALID_ACTION].squeeze(-1), batch["next", "done"].squeeze(-1))
 
 
+def whole(batch: TensorDict) -> Tensor:
+    """Which steps [B, T] belong to episodes in which physics, if it is that, did not crash."""
+    if LOST not in batch["next"].keys(True, True):
+        return torch.ones(batch.shape, dtype=torch.bool, device=batch.device)
+    return ~_episodes_with(batch["next", LOST].squeeze(-1), batch["next", "done"].squeeze(-1))
+
+
 def sound(batch: TensorDict) -> Tensor:
     """Which steps [B, T] may be learned from."""
-    return judged(batch) & finite(batch)
+    return judged(batch) & finite(batch) & whole(batch)
 
 
 def _episodes_with(bad: Tensor, done: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ import torch
 from annotated_types import MinLen
 from tensordict import TensorDict
 from torch import Tensor
+from tqdm import tqdm
 
 from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
@@ -18,6 +19,7 @@ from envs.rng import step_generator
 from envs.simulators.base import Simulator
 from learners.training.fit import FitConfig, fit
 from learners.training.lora import low_rank
+from learners.training.parallel import leads
 
 _FIRST_FRAMES = 512  # of different episodes, by which a simulator learns how its cameras usually see
 
@@ -69,20 +71,45 @@ def train_simulator(
         order = torch.randperm(len(episodes), generator=step_generator(options.seed, options.steps))
         simulator.fit_camera_statistics(store.frames(store.start[episodes[order[:_FIRST_FRAMES]]]))
 
-    def batch(step: int, generator: torch.Generator) -> TensorDict:
-        chunks = 1 if step < config.single_chunk_fraction * options.steps else config.unroll
+    if simulator.lost_in_training and leads():
+        tqdm.write(f"simulator: {simulator.lost_in_training}")
+    batch = ClipBatches(simulator, store, episodes, config, options, newest)
+    with low_rank(simulator, config.lora):
+        return fit("simulator", simulator, batch, simulator.loss, options, folder)
+
+
+@dataclass(frozen=True)
+class ClipBatches:
+    """The training clips of each step, as SimulatorFitConfig asks for them.
+
+    Args:
+        simulator: what they are for.
+        store, episodes: where they are drawn from.
+        config, options: which clips, and how many.
+        newest: episodes that `recent_fraction` speaks of.
+    """
+
+    simulator: Simulator
+    store: ClipStore
+    episodes: Tensor
+    config: SimulatorFitConfig
+    options: FitConfig
+    newest: Tensor | None = None
+
+    def __call__(self, step: int, generator: torch.Generator) -> TensorDict:
+        """The clips [B] of one microbatch of a step."""
+        config, store = self.config, self.store
+        chunks = 1 if step < config.single_chunk_fraction * self.options.steps else config.unroll
         stride = config.strides[int(torch.randint(len(config.strides), (1,), generator=generator))]
-        memory, chunk = simulator.memory_frames, simulator.spec.chunk
-        spec = ClipSpec(memory, chunk, chunks, stride, recent=simulator.recent_memory)
-        count = max(1, options.part // chunks)
+        memory, chunk = self.simulator.memory_frames, self.simulator.spec.chunk
+        spec = ClipSpec(memory, chunk, chunks, stride, recent=self.simulator.recent_memory)
+        count = max(1, self.options.part // chunks)
+        newest = self.newest
         recent = round(count * config.recent_fraction) if newest is not None and len(newest) else 0
-        parts = [store.sample(episodes, count - recent, spec, generator)] if recent < count else []
+        parts = [store.sample(self.episodes, count - recent, spec, generator)] if recent < count else []
         if recent and newest is not None:
             parts.append(store.sample(newest, recent, spec, generator))
         return torch.cat(parts) if len(parts) > 1 else parts[0]
-
-    with low_rank(simulator, config.lora):
-        return fit("simulator", simulator, batch, simulator.loss, options, folder)
 
 
 def units(store: ClipStore, episodes: Tensor) -> tuple[Tensor, Tensor, Tensor]:

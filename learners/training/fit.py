@@ -12,6 +12,7 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from envs.ranges import Count, Decay, Natural, NonNegative, Positive
 from learners.training.ahead import Batch, BatchesAhead
 from learners.training.checkpoint import Checkpoints, buffers_of, truncate_log
 from learners.training.interrupt import deferred_signals, leave
-from learners.training.optimisers import OPTIMISERS, optimiser_state
+from learners.training.optimisers import OPTIMISERS, Optimise, optimiser_state
 from learners.training.parallel import (
     Trainee,
     averaged,
@@ -106,6 +107,7 @@ def fit(
     config: FitConfig,
     folder: Path,
     watch: str = "loss",
+    optimise: Optimise | None = None,
 ) -> dict[str, float]:
     """Train `module` in place and leave it with its averaged weights.
 
@@ -117,6 +119,8 @@ def fit(
         loss: (batch, generator) -> scalar loss and figures to log.
         folder: receives checkpoints and metrics.jsonl; a checkpoint found there is resumed.
         watch: the figure shown while it runs.
+        optimise: makes the optimisers of parts that learn differently; by default config.optimiser moves
+            all. A group's `lr_scale` multiplies the learning rate. What a step's loss does not reach stays.
 
     Returns:
         data_seconds, spent waiting for batches; compute_seconds, spent on all else; samples_per_second over
@@ -132,7 +136,8 @@ def fit(
     trainee, mine = Trainee(module), my_share(config.microbatches)
     trained = trainee.trained
     hidden = getattr(module, "hidden", ())
-    optimisers = OPTIMISERS[config.optimiser](trained, config.lr, config.weight_decay, hidden)
+    optimise = optimise or partial(OPTIMISERS[config.optimiser], hidden=hidden)
+    optimisers = optimise(trained, config.lr, config.weight_decay)
     average = twin(trained)
     first, spent = 0, {"data": 0.0, "compute": 0.0}
     smooth: float | None = None
@@ -171,7 +176,7 @@ def fit(
             began, waited = time.perf_counter(), 0.0
             for optimiser in optimisers:
                 for group in optimiser.param_groups:
-                    group["lr"] = _rate(config, step)
+                    group["lr"] = _rate(config, step) * group.get("lr_scale", 1.0)
                 optimiser.zero_grad(set_to_none=True)
             rows = []
             for _ in mine:

@@ -12,6 +12,7 @@ from torch.optim import AdamW, Optimizer
 from learners.training.muon import Muon
 
 Parameters = Mapping[str, nn.Parameter]
+Optimise = Callable[[Parameters, float, float], list[Optimizer]]  # of parameters, lr and weight decay
 
 
 def adamw(trained: Parameters, lr: float, weight_decay: float, hidden: Sequence[str] = ()) -> list[Optimizer]:
@@ -39,7 +40,7 @@ def muon(trained: Parameters, lr: float, weight_decay: float, hidden: Sequence[s
     return out + (adamw(rest, lr, weight_decay) if rest else [])
 
 
-OPTIMISERS: dict[str, Callable[[Parameters, float, float, Sequence[str]], list[Optimizer]]] = {
+OPTIMISERS: dict[str, Callable[..., list[Optimizer]]] = {
     "adamw": adamw,
     "muon": muon,
 }

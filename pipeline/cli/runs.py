@@ -74,14 +74,14 @@ def evaluate(words: Words) -> None:
     """success of a policy: worldloop evaluate policy=<stage|folder> world=physics|imagined experiment=...;
     one that needs no weights is a choice of configs/policy: policy=openpi policy.url=ws://...
     """
-    from pipeline.config import choices
+    from pipeline.config import offered
 
     own, rest = {"weights": "", "world": "physics"}, []
     for word in words:
         key, _, value = word.partition("=")
         if key == "world":
             own["world"] = value
-        elif key == "policy" and value not in choices("policy"):
+        elif key == "policy" and not offered("policy", value, words):
             own["weights"] = value
         else:
             rest.append(word)
@@ -123,6 +123,25 @@ def controls(words: Words) -> None:
     print(f"{table_text(table)}\n{root}/controls.json, {root}/report.html")
 
 
+def study(words: Words) -> None:
+    """the table of an experiment, its rows (imitation, the loop with and without RL, RL in physics) by tasks
+    and seeds; goes on where it stopped: worldloop study experiment=bench4 [study.minutes=60]
+    """
+    from pipeline.study.plan import plan_study
+
+    made = plan_study(words)
+    # a mistake in the words is told before any work
+    from actors.process import device_of, prepare_process
+    from pipeline.graph.owner import owning
+    from pipeline.study.run import run_study
+
+    device_of(made.cfg)
+    prepare_process(made.cfg["seed"], made.cfg["threads"])
+    with owning(made.root, "study"):
+        text = run_study(made)
+    print(f"\n{text}\n{made.root}/study.md, study.json, study.html")
+
+
 def compare(words: Words) -> None:
     """finished runs side by side as Markdown: worldloop compare runs/quickstart runs/quickstart_dit"""
     from pipeline.evaluation.compare import compare as table
@@ -144,7 +163,7 @@ def finetune(words: Words) -> None:
     graph = build_finetune(cfg, root)
     with owning(root, "finetune"), tracking(cfg, root / "finetune") as tracker:
         graph.run(tracker=tracker)
-    print(f"weights in {graph.folder('simulator')} and {graph.folder('state')}")
+    print(f"weights in {' and '.join(str(graph.folder(name)) for name in graph.nodes)}")
 
 
 def _run_until(name: str, words: Words) -> Path:

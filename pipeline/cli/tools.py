@@ -92,11 +92,31 @@ def inspect(words: Words) -> None:
 
 def bench(words: Words) -> None:
     """measure performance: worldloop bench
-    conditioning|collection|experts|world|actors|learning|serving|gesim|overfit|pretrained
+    conditioning|collection|experts|world|actors|learning|serving|gesim|size|overfit|pretrained; of serving
+    also for how long: worldloop bench serving seconds=7200
     """
     from pipeline.benches.bench import run_bench
 
     run_bench(words)
+
+
+def judge(words: Words) -> None:
+    """verdicts on recorded episodes against their recorded success, and what they cost, by which frames are
+    shown: worldloop judge judge=vlm judge.chat.model=<name> [data=<LeRobot set>] [split=held_out|all]
+    [episodes=N] [frames=all,4,ends] experiment=...
+    """
+    from pipeline.commands.judge import Selection, judge_study
+
+    own, rest = {}, []
+    for word in words:
+        key, _, value = word.partition("=")
+        if key in ("data", "split", "episodes", "frames"):
+            own[key] = value
+        else:
+            rest.append(word)
+    selection = Selection.of(own)
+    cfg, root = prepared(rest)
+    print(judge_study(cfg, root, selection))
 
 
 def verify(words: Words) -> None:

@@ -15,6 +15,11 @@ def without_given(base: Sequence[str], words: Sequence[str]) -> list[str]:
     return [word for word in base if word.split("=")[0] not in given]
 
 
+def listed(value: str) -> list[str]:
+    """The names in a word's value, such as [a,b] or a."""
+    return [name.strip() for name in value.strip("[]").split(",") if name.strip()]
+
+
 def root_of(cfg: dict[str, Any]) -> Path:
     """The run's folder."""
     return Path(cfg["runs"]) / cfg["name"]
@@ -31,5 +36,5 @@ def prepared(words: Words) -> tuple[dict[str, Any], Path]:
 
     device_of(cfg)  # what is not there is told before any work
     check_world(cfg)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     return cfg, root_of(cfg)

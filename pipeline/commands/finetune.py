@@ -1,7 +1,7 @@
 """worldloop finetune: a simulator and its state expert trained on any LeRobot data sets of one robot, from
 released or earlier weights.
 
-Two stages of the same kind as the loop's: reused when finished, resumed when interrupted.
+Stages of the same kind as the loop's: reused when finished, resumed when interrupted.
 """
 
 from __future__ import annotations
@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from envs.targets import ConfigError
+from pipeline.acting import acting
 from pipeline.graph.graph import Graph
 from pipeline.stages import finetune
 from pipeline.stages.collect import fingerprint
 
 
 def build_finetune(cfg: Mapping[str, Any], root: Path) -> Graph:
-    """The graph of the two stages, simulator and state.
+    """The graph of the stages: simulator, its student if distill.steps asks for one, and state.
 
     Raises:
         ConfigError: if finetune.data names no data sets.
@@ -30,7 +31,10 @@ def build_finetune(cfg: Mapping[str, Any], root: Path) -> Graph:
         )
     # The robot is the one of the recordings, whatever bench the config knows.
     recorded = {**cfg, "task": {**cfg["task"], "suite": None, "data": data}}
-    graph, mark = Graph(recorded, root / "finetune"), fingerprint(data)
-    graph.add("simulator", finetune.simulator, fingerprint=mark)
-    graph.add("state", finetune.state, {"simulator": "simulator"}, fingerprint=mark)
+    graph, mark = Graph(acting(recorded), root / "finetune"), fingerprint(data)
+    learning = graph.under(recorded)  # with the simulator as it is, not as it is acted in
+    made = learning.add("simulator", finetune.simulator, fingerprint=mark)
+    if cfg["distill"]["steps"]:
+        made = learning.add("student", finetune.student, {"simulator": made}, fingerprint=mark)
+    graph.add("state", finetune.state, {"simulator": made}, fingerprint=mark)
     return graph

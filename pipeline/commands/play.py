@@ -19,7 +19,8 @@ from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.initial_states import InitialStates
 from envs.physics.suite import Observation, build_suite, task_names
 from envs.targets import ConfigError
-from pipeline.loop import build_loop, has_physics, last_round
+from pipeline.acting import acting
+from pipeline.loop import build_loop, has_physics
 
 Cfg = Mapping[str, Any]
 _PARTS = ("simulator", "state", "judge")
@@ -27,8 +28,8 @@ _PARTS = ("simulator", "state", "judge")
 
 def learned_world(cfg: Cfg, root: Path) -> dict[str, Path]:
     """Weights of the last imagined world of a run by part: simulator, state and judge; {} if it has none."""
-    graph, last = build_loop(cfg, root), last_round(cfg)
-    weights = {part: graph.folder(f"{part}-{last}") / "weights.safetensors" for part in _PARTS}
+    inputs = build_loop(cfg, root).inputs("evaluate-imagined")
+    weights = {part: inputs.folder(part) / "weights.safetensors" for part in _PARTS}
     return weights if all(path.exists() for path in weights.values()) else {}
 
 
@@ -68,6 +69,7 @@ def _start(cfg: Cfg, observed: Observation, pictures: NDArray[np.uint8]) -> Init
 
 
 def _imagination(cfg: Cfg, world: Mapping[str, Path], starts: InitialStates) -> ImaginedSide:
+    cfg = acting(cfg)
     simulator = build_simulator(cfg, world["simulator"])
     decoder = build_state_decoder(cfg, simulator, world["state"])
     return ImaginedSide(build_world(cfg, simulator, decoder, build_judge(cfg, world["judge"]), starts, 1))

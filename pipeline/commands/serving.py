@@ -14,7 +14,7 @@ from envs.embodiment import ActionKind
 from envs.simulators.remote.engine import RemoteSimulator
 from envs.targets import ConfigError, target
 from pipeline.commands.finetune import build_finetune
-from pipeline.loop import build_loop, last_round
+from pipeline.loop import build_loop
 
 
 def build_session_host(cfg: Mapping[str, Any], root: Path, config: ServeConfig) -> SessionHost:
@@ -29,12 +29,14 @@ def build_session_host(cfg: Mapping[str, Any], root: Path, config: ServeConfig) 
     if issubclass(target(cfg["simulator"], "simulator"), RemoteSimulator):  # type: ignore[arg-type]
         raise ConfigError("simulator=remote is served already; serve unet, dit or gesim")
     if cfg["finetune"]["data"]:
-        graph, stages, way = build_finetune(cfg, root), ("simulator", "state"), "worldloop finetune"
+        graph, way = build_finetune(cfg, root), "worldloop finetune"
+        folders = graph.inputs("state").folder("simulator"), graph.folder("state")
     else:
-        last = last_round(cfg)
-        graph, stages, way = build_loop(cfg, root), (f"simulator-{last}", f"state-{last}"), "worldloop run"
-    cfg = graph.cfg  # of the data's robot, if it is a fine-tuned one
-    weights, states = (graph.folder(stage) / "weights.safetensors" for stage in stages)
+        graph, way = build_loop(cfg, root), "worldloop run"
+        inputs = graph.inputs("evaluate-imagined")
+        folders = inputs.folder("simulator"), inputs.folder("state")
+    cfg = graph.cfg  # of the data's robot, if it is a fine-tuned one, and of the world that is acted in
+    weights, states = (folder / "weights.safetensors" for folder in folders)
     released = cfg["simulator"].get("checkpoint") and not cfg["finetune"]["data"]
     if not weights.exists() and not released:
         raise ConfigError(

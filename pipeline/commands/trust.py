@@ -47,6 +47,7 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
             "this task is known from recordings alone, and nobody can try other actions in those"
         )
     graph = build_loop(cfg, root)
+    cfg = graph.cfg  # of the world that is acted in
     if f"gap-{number}" not in graph.nodes:
         raise ConfigError(f"round={number}: the rounds of this run are 1 to {cfg['rounds']['count']}")
     inputs = graph.inputs(f"gap-{number}")
@@ -61,6 +62,11 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
     simulator = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
     judge = build_judge(cfg, inputs.weights("judge"))
+    if judge.reads_features:
+        raise ConfigError(
+            f"judge={cfg['judge']['_target_']} reads the simulator's features, and true frames, on which"
+            " imagination is compared, have none; ask a run whose judge looks at pictures"
+        )
     world = build_world(
         *(cfg, simulator, decoder, judge, points, len(which) * futures),
         horizon=depth * int(cfg["task"]["chunk"]),
@@ -69,11 +75,12 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
     policy = SafePolicyWrapper(build_policy(cfg, inputs.weights("policy")), physics.spec, physics.mode)
     seed_process(cfg["seed"])
     try:
-        rows = agreement(branch(world, physics, policy, judge, which, futures), cfg["seed"])
+        branches = branch(world, physics, policy, judge, which, futures)
     finally:
         physics.close()
-    write_text(root / f"trust-{number}.json", json.dumps({"moments": len(which), "depths": rows}, indent=1))
-    return _table(rows, len(which), futures)
+    rows, compared = agreement(branches, cfg["seed"]), len(branches.outcome)
+    write_text(root / f"trust-{number}.json", json.dumps({"moments": compared, "depths": rows}, indent=1))
+    return _table(rows, compared, futures)
 
 
 def _table(rows: list[dict[str, list[float]]], moments: int, futures: int) -> str:

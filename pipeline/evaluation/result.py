@@ -29,7 +29,8 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         (McNemar), None without physics; imagined_before, imagined_after; judge, rollout, frames_per_second
         (see the measure stage); tasks (the same rates by task, {} if there is one); scenes (the same rates of
         each task in each scene that occurs, [] if there is one); rounds (gaps); episodes used and held out;
-        seconds per stage; training (see `_training`); alarms.
+        seconds per stage; training (see `_training`); what the judge has cost (stages/judge_cost.py), {} if
+        it is free; alarms.
     """
     finished = manifests(inputs)
     imagined, measured = (result_of(inputs.folder(role)) for role in ("imagined", "measured"))
@@ -60,6 +61,7 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         "imagined_episodes_used": [entry["result"]["ledger"]["learned"] for entry in learned],
         "stage_seconds": {name: entry["seconds"] for name, entry in finished.items()},
         "training": _training(finished),
+        "judge_cost": _judge_cost(finished),
         "alarms": [text for entry in learned for text in entry["result"]["alarms"]],
     }
     result["verdict"] = verdict(result)
@@ -79,10 +81,13 @@ def result_of(folder: Path) -> dict[str, Any]:
     return dict(manifest["result"])
 
 
-def outcomes(folder: Path, what: str = "success") -> torch.Tensor:
-    """Success bool [N] of the evaluation seeds, as evaluate_physics left it; or "progress", or "seeds"."""
-    kept: torch.Tensor = torch.load(folder / "outcomes.pt", weights_only=True)[what]
-    return kept
+def outcomes(*folders: Path) -> tuple[list[int], list[torch.Tensor]]:
+    """The evaluation seeds that all of these stages evaluate_physics could count, and success bool [N] on
+    them in each.
+    """
+    kept = [torch.load(folder / "outcomes.pt", weights_only=True) for folder in folders]
+    counted = torch.stack([one["counted"] for one in kept]).all(0)
+    return kept[0]["seeds"][counted].tolist(), [one["success"][counted] for one in kept]
 
 
 def verdict(result: Mapping[str, Any]) -> str:
@@ -134,7 +139,7 @@ def _physics(inputs: Inputs) -> dict[str, Any]:
     entries = {
         f"physics_{when}": {key: result_of(folder)[key] for key in _ENTRY} for when, folder in folders.items()
     }
-    return {**entries, "paired": mcnemar(outcomes(folders["before"]), outcomes(folders["after"]))}
+    return {**entries, "paired": mcnemar(*outcomes(folders["before"], folders["after"])[1])}
 
 
 def _tasks(cfg: Mapping[str, Any], inputs: Inputs, imagined: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -145,9 +150,8 @@ def _tasks(cfg: Mapping[str, Any], inputs: Inputs, imagined: Mapping[str, Any]) 
     names = sorted(set().union(*shown.values()))
     true: dict[str, Mapping[str, Any]] = {}
     if "physics_before" in inputs.found:
-        before, after = (inputs.folder(f"physics_{when}") for when in ("before", "after"))
-        tasks = tasks_of_seeds(cfg, outcomes(before, "seeds").tolist())
-        true = by_task(tasks, _pair, outcomes(before), outcomes(after))
+        seeds, pair = outcomes(*(inputs.folder(f"physics_{when}") for when in ("before", "after")))
+        true = by_task(tasks_of_seeds(cfg, seeds), _pair, *pair)
         names = sorted({*names, *true})
     nothing = {"physics_before": None, "physics_after": None, "paired": None}
     return {
@@ -169,10 +173,9 @@ def _scenes(cfg: Mapping[str, Any], inputs: Inputs, imagined: Mapping[str, Any])
         for cell in imagined[when]["scenes"]
     ]
     if "physics_before" in inputs.found:
-        before, after = (inputs.folder(f"physics_{when}") for when in ("before", "after"))
-        seeds = outcomes(before, "seeds").tolist()
+        seeds, pair = outcomes(*(inputs.folder(f"physics_{when}") for when in ("before", "after")))
         tasks, scenes = tasks_of_seeds(cfg, seeds), scenes_of_seeds(cfg, seeds)
-        parts += by_scene(tasks, scenes, _pair, outcomes(before), outcomes(after))
+        parts += by_scene(tasks, scenes, _pair, *pair)
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for part in parts:
         found.setdefault((part["task"], part["scene"]), {}).update(part)
@@ -202,6 +205,15 @@ def _pair(before: torch.Tensor, after: torch.Tensor) -> dict[str, Any]:
         "physics_after": rate_entry(after),
         "paired": mcnemar(before, after),
     }
+
+
+def _judge_cost(finished: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """What all stages together asked the judge for and paid."""
+    total: dict[str, float] = {}
+    for entry in finished.values():
+        for name, value in entry["result"].get("judge_cost", {}).items():
+            total[name] = total.get(name, 0.0) + value
+    return total
 
 
 def _class_name(section: Mapping[str, Any]) -> str:

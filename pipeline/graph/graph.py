@@ -32,12 +32,14 @@ class Node:
         inputs: names of the nodes that it builds on, by role.
         settings: what tells it from other nodes of the same stage.
         identity: what its key is made of.
+        cfg: the resolved config that it is run with.
     """
 
     stage: Stage
     inputs: Mapping[str, str | tuple[str, ...]]
     settings: Mapping[str, Any]
     identity: Identity
+    cfg: Mapping[str, Any]
 
     @property
     def parents(self) -> tuple[str, ...]:
@@ -57,6 +59,7 @@ class Graph:
     cfg: Mapping[str, Any]
     root: Path
     nodes: dict[str, Node] = field(default_factory=dict, init=False)
+    _met: set[str] = field(default_factory=set, init=False)  # finished ones, checked and told
 
     def add(self, name: str, stage: Stage, inputs: Names | None = None, **settings: Any) -> str:
         """Add a node and return its name.
@@ -90,8 +93,14 @@ class Graph:
             roles={role: list(_names(names)) for role, names in roles.items()},
             code=code_of(stage.run.__module__, read),
         )
-        self.nodes[name] = Node(stage, roles, settings, identity)
+        self.nodes[name] = Node(stage, roles, settings, identity, self.cfg)
         return name
+
+    def under(self, cfg: Mapping[str, Any]) -> Graph:
+        """The same graph, to which stages of another config can be added."""
+        other = Graph(cfg, self.root)
+        other.nodes = self.nodes
+        return other
 
     def key(self, name: str) -> str:
         """Hash of the config sections that the node reads, its settings, its parents' keys and its code."""
@@ -113,10 +122,14 @@ class Graph:
     def view(self, name: str) -> ConfigView:
         """The part of the config that a node may read."""
         node = self.nodes[name]
-        return node.stage.view(name, self.cfg, node.settings)
+        return node.stage.view(name, node.cfg, node.settings)
 
-    def result(self, name: str) -> dict[str, Any]:
-        """What a finished node returned.
+    def finished(self, name: str) -> bool:
+        """Whether the node's artefact is there."""
+        return read_manifest(self.folder(name)) is not None
+
+    def manifest(self, name: str) -> dict[str, Any]:
+        """What is known of a finished node.
 
         Raises:
             KeyError: if it is not finished.
@@ -124,7 +137,15 @@ class Graph:
         manifest = read_manifest(self.folder(name))
         if manifest is None:
             raise KeyError(f"stage {name} is not finished")
-        return dict(manifest["result"])
+        return manifest
+
+    def result(self, name: str) -> dict[str, Any]:
+        """What a finished node returned.
+
+        Raises:
+            KeyError: if it is not finished.
+        """
+        return dict(self.manifest(name)["result"])
 
     def run(
         self, until: str | Sequence[str] = (), tracker: Tracker | None = None
@@ -138,7 +159,7 @@ class Graph:
         Raises:
             KeyError: if `until` names no node.
         """
-        wanted = self._needs(_names(until)) if until else set(self.nodes)
+        wanted = self.needs(until) if until else set(self.nodes)
         following = tracker or NullTracker()
         return {name: self._finished(name, following) for name in self.nodes if name in wanted}
 
@@ -146,6 +167,9 @@ class Graph:
         """The manifest of a node, after running it if need be."""
         folder = self.folder(name)
         manifest = read_manifest(folder)
+        if manifest is not None and name in self._met:
+            return manifest
+        self._met.add(name)
         if manifest is not None:
             check(folder, manifest)
             clear_checkpoints(folder)  # of a process that was killed right after the manifest was there
@@ -157,8 +181,8 @@ class Graph:
         tqdm.write(f"=== {name}{' (resumed)' if resumed else ''} -> {folder}")
         node = self.nodes[name]
         with WorkClock(folder) as clock, tracker.follow(name, folder):
-            result = run_stage(node.stage, name, self.cfg, folder, self.inputs(name))
-        read = sections(self.cfg, node.stage.reads_of(node.settings))
+            result = run_stage(node.stage, name, node.cfg, folder, self.inputs(name))
+        read = sections(node.cfg, node.stage.reads_of(node.settings))
         manifest = finish(folder, node.identity, read, clock.seconds, result)
         clear_checkpoints(folder)
         tqdm.write(f"    {name} took {clock.seconds:.0f} s {_brief(manifest['result'])}")
@@ -175,7 +199,13 @@ class Graph:
             return ""
         return self.nodes[name].identity.changed(older[-1]["identity"])
 
-    def _needs(self, names: Sequence[str]) -> set[str]:
+    def needs(self, until: str | Sequence[str]) -> set[str]:
+        """Names of nodes and of all that they build on.
+
+        Raises:
+            KeyError: if `until` names no node.
+        """
+        names = _names(until)
         unknown = [name for name in names if name not in self.nodes]
         if unknown:
             raise KeyError(f"no stage {unknown[0]}; this graph has {list(self.nodes)}")

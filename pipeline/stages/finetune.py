@@ -1,4 +1,4 @@
-"""Stages of `worldloop finetune`: a simulator and its state expert on recordings."""
+"""Stages of `worldloop finetune`: a simulator, its student and its state expert on recordings."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from learners.stages.state import train_state
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import TASK, Cfg, fit_options
+from pipeline.stages.world import distil
 
-_READS = ("seed", *TASK, "simulator", "microbatches")
+_READS = ("seed", "threads", *TASK, "simulator", "microbatches")
 
 
 @stage(reads=(*_READS, "finetune.simulator", "finetune.weights"), place=Place.LEARNERS)
@@ -29,12 +30,22 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     fit = fit_options(cfg, section.pop("fit"), "finetune.simulator.fit")
     how = options(SimulatorFitConfig, section, "finetune.simulator")
     store = open_clips(cfg, cfg["task"]["data"])
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg, Path(weights) if weights else None)
     fresh = not (weights or cfg["simulator"].get("checkpoint"))
     stats = train_simulator(model, store, torch.arange(len(store)), how, fit, folder, fresh=fresh)
     save_weights(model, folder)
     return dict(stats)
+
+
+@stage(reads=(*_READS, "distill.steps", "distill.method", "distill.first"), place=Place.LEARNERS)
+def student(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """The few-step student of that simulator, as section distill says.
+
+    Settings: fingerprint of the data.
+    """
+    store = open_clips(cfg, cfg["task"]["data"])
+    return distil(cfg, folder, inputs, "distill.first", store, torch.arange(len(store)))
 
 
 @stage(reads=(*_READS, "finetune.state"), place=Place.LEARNERS)
@@ -45,7 +56,7 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     section = cfg["finetune"]["state"]
     store = open_clips(cfg, cfg["task"]["data"])
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, model)
     fit = fit_options(cfg, section["fit"], "finetune.state.fit")

@@ -14,15 +14,19 @@ from actors.factory import build_judge, build_simulator, build_state_decoder, bu
 from actors.process import prepare_process
 from actors.weights import load
 from envs.episodes.clips import ClipStore
+from envs.judges.base import Judge
 from envs.rng import order_generator
 from envs.simulators.base import Simulator
+from envs.simulators.features import features_of_episodes
 from envs.targets import ConfigError, options
-from learners.stages.generated import generated_frames
+from learners.stages.distill.stage import train_student
+from learners.stages.generated import generated_frames, recorded_features
 from learners.stages.judge import calibrate, judge_recordings, train_judge
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
 from learners.stages.text_world import train_text_world
 from learners.stages.tokenizer import train_tokenizer
+from pipeline.acting import acting
 from pipeline.evaluation.judging import episode_success, labelled
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
@@ -37,15 +41,16 @@ from pipeline.stages.given import (
     newest_episodes,
     open_store,
 )
+from pipeline.stages.judge_cost import priced
 
-SIMULATOR = ("seed", *TASK, "simulator", "microbatches")
+SIMULATOR = ("seed", "threads", *TASK, "simulator", "microbatches")
 
 
 @stage(reads=(*SIMULATOR, "tokenizer_fit"), place=Place.LEARNERS)
 def tokenizer(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The video autoencoder of a simulator that works on latents."""
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg)
     fit = fit_options(cfg, cfg["tokenizer_fit"], "tokenizer_fit")
     stats = train_tokenizer(model, store, learning_episodes(store), fit, folder)
@@ -65,7 +70,7 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     how = options(SimulatorFitConfig, section, f"simulator_fit.{phase}")
     store = open_store(cfg, inputs)
     episodes = learning_episodes(store)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg, inputs.weights("warm"))
     stats = (
         train_simulator(
@@ -80,6 +85,46 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return {**stats, "parameters": sum(p.numel() for p in model.parameters())}
 
 
+@stage(reads=(*SIMULATOR, "distill.steps", "distill.method", "distill.{phase}"), place=Place.LEARNERS)
+def student(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """The few-step student of the role `simulator`, going on from the role `warm`, the student before, if
+    there is one. Later stages meet it by the config of `acting`.
+
+    Settings: phase, first or refresh.
+    """
+    phase = inputs.settings["phase"]
+    store = open_store(cfg, inputs)
+    episodes = learning_episodes(store)
+    newest = newest_episodes(store, episodes)
+    return distil(cfg, folder, inputs, f"distill.{phase}", store, episodes, newest)
+
+
+def distil(
+    cfg: Cfg,
+    folder: Path,
+    inputs: Inputs,
+    key: str,
+    store: ClipStore,
+    episodes: Tensor,
+    newest: Tensor | None = None,
+) -> dict[str, Any]:
+    """A student trained on some episodes as the section at `key`, such as distill.first, says."""
+    section = dict(cfg["distill"][key.rpartition(".")[2]])
+    fit = fit_options(cfg, section.pop("fit"), f"{key}.fit")
+    how = options(SimulatorFitConfig, section, key)
+    prepare_process(cfg["seed"], cfg["threads"])
+    teacher = build_simulator(cfg, inputs.weights("simulator"))
+    weights = inputs.weights("warm") or inputs.weights("simulator")
+    model = build_simulator(acting(cfg), weights)
+    method = dict(cfg["distill"]["method"])
+    try:
+        stats = train_student(teacher, model, method, store, episodes, how, fit, folder, newest)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    save_weights(model, folder)
+    return {**stats, "evaluations": cfg["distill"]["steps"]}
+
+
 @stage(reads=(*SIMULATOR, "state_fit.{phase}"), place=Place.LEARNERS)
 def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The state expert on the frozen simulator.
@@ -88,7 +133,7 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     phase = inputs.settings["phase"]
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, model, inputs.weights("warm"))
     section = cfg["state_fit"][phase]
@@ -99,7 +144,7 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return stats
 
 
-@stage(reads=(*ROBOT, "judge.text_world", "text_world_fit", "microbatches"), place=Place.LEARNERS)
+@stage(reads=(*ROBOT, "threads", "judge.text_world", "text_world_fit", "microbatches"), place=Place.LEARNERS)
 def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The text world of a judge that asks for one, with its tokenizer, going on from the role `warm` if there
     is one.
@@ -108,7 +153,7 @@ def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     phase, section = inputs.settings["phase"], cfg["text_world_fit"]
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_text_world(cfg, inputs.weights("warm"))
     fit = fit_options(cfg, section[phase], f"text_world_fit.{phase}")
     tokenizer = fit_options(cfg, section["tokenizer"], "text_world_fit.tokenizer")
@@ -121,6 +166,7 @@ def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 
 @stage(reads=(*WORLD, "judge_fit.{phase}", "rl.starts", "rl.chunks", "microbatches"), place=Place.LEARNERS)
+@priced
 def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The judge on recorded and on generated frames; its threshold on recorded video that no judge learns
     from. A judge without weights is only calibrated. One with a text world takes over what the role
@@ -131,11 +177,12 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     phase = inputs.settings["phase"]
     section = cfg["judge_fit"][phase]
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
-    model: Any = build_judge(cfg, inputs.weights("warm"))
+    prepare_process(cfg["seed"], cfg["threads"])
+    model, world = build_judge(cfg, inputs.weights("warm")), build_simulator(cfg, inputs.weights("simulator"))
     if golden := inputs.weights("text_world"):
         load(model.text_world, golden).requires_grad_(False)
     stats: dict[str, Any] = {}
+    bf16 = cfg["simulator"]["bf16"]
     if learns(model):
         train = labelled(store, store.split("train"))
         if not len(train):
@@ -145,14 +192,14 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
             )
         shuffled = torch.randperm(len(train), generator=order_generator(cfg["seed"]))
         pick = train[shuffled[: section["imagined"]]]
-        world = build_simulator(cfg, inputs.weights("simulator"))
         generated = _as_imagined(cfg, world, store, pick)
+        recorded = recorded_features(world, store, train, bf16) if model.reads_features else None
         fit = fit_options(cfg, section["fit"], f"judge_fit.{phase}.fit")
-        stats = dict(train_judge(model, store, train, fit, folder, generated))
+        stats = dict(train_judge(model, store, train, fit, folder, generated, recorded))
         stats["generated_frames"] = len(generated)
-    _calibrate(model, store)
+    _calibrate(model, store, world, bf16)
     save_weights(model, folder)
-    return {**stats, "threshold": float(model.threshold)}
+    return {**stats, "threshold": float(model.threshold), **model.facts()}
 
 
 def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor) -> TensorDict:
@@ -166,12 +213,17 @@ def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor)
     return torch.cat([near, generated_frames(world, store, episodes[1::2], bf16)])
 
 
-def _calibrate(model: Any, store: ClipStore) -> None:
-    """Set the judge's threshold on the calibration split, where its scores tell success."""
+def _calibrate(model: Judge, store: ClipStore, world: Simulator, bf16: bool) -> None:
+    """Set the judge's threshold on the calibration split, where its scores tell success; a judge that says
+    (judge.votes.calibrate=false) that its answers need none is not asked.
+    """
+    if not model.calibrates:
+        return
     unseen = labelled(store, store.split("calibration"))
     if not len(unseen):
         return
-    score = judge_recordings(model, store, unseen)
+    features = features_of_episodes(world, store, unseen, bf16) if model.reads_features else None
+    score = judge_recordings(model, store, unseen, features)
     succeeded = episode_success(store, unseen)
     if not calibrate(model, score, succeeded):
         tqdm.write(

@@ -45,7 +45,8 @@ def tiny_world(robot: str = "two_arms_poses") -> DiTSimulator:
     """An untrained world whose frames depend on seed, commands and history."""
     torch.manual_seed(0)
     net = {"layers": 3, "heads": 2, "head_dim": 24, "adaln_rank": 8, "patch": 2, "stem": 0}
-    denoising = {"prediction": "clean", "steps": 2, "shift": 2.0, "foreground": 0.0, "augment": 0.0}
+    denoising = {"prediction": "clean", "sampler": "euler", "steps": 2, "shift": 2.0}
+    denoising |= {"foreground": 0.0, "augment": 0.0}
     spec = world_spec(EMBODIMENTS[robot])
     world = DiTSimulator(spec, 3, net, {"channels": 8, "width": 16}, denoising)
     with torch.no_grad():

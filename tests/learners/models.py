@@ -9,8 +9,9 @@ import torch
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
-from envs.judges import LearnedJudge
+from envs.judges import Judge
 from envs.simulators.base import WORLD_OPTIONS, Simulator
+from envs.simulators.dit.engine import DiTSimulator
 from envs.simulators.state_experts.base import StateDecoder
 from envs.specs import ActionMode, WorldSpec
 from envs.targets import build
@@ -42,6 +43,13 @@ def simulator_of(name: str, spec: WorldSpec) -> Simulator:
     return build(own, "simulator", spec=spec)  # type: ignore[no-any-return]
 
 
+def distilled(spec: WorldSpec, steps: int = 2) -> Simulator:
+    """An untrained student of dit_small."""
+    section = section_of("simulator", "dit_small")
+    own = {key: value for key, value in section.items() if key not in WORLD_OPTIONS}
+    return build(DiTSimulator.student_section(own, steps), "simulator", spec=spec)  # type: ignore[no-any-return]
+
+
 def decoder_of(name: str, simulator: Simulator) -> StateDecoder:
     """The untrained state expert of a simulator."""
     torch.manual_seed(0)
@@ -49,8 +57,8 @@ def decoder_of(name: str, simulator: Simulator) -> StateDecoder:
     return build(section, "simulator.state_expert", simulator=simulator)  # type: ignore[no-any-return]
 
 
-def judge_of(spec: WorldSpec, hold: int = 2) -> LearnedJudge:
-    """An untrained learned judge."""
+def judge_of(spec: WorldSpec, hold: int = 2, name: str = "learned", **context: Any) -> Judge:
+    """An untrained judge; `context` is what the factory would add, such as feature_shape."""
     torch.manual_seed(0)
-    section = {k: v for k, v in section_of("judge", "learned").items() if k != "rewards"}
-    return build(section | {"hold": hold}, "judge", spec=spec)  # type: ignore[no-any-return]
+    section = {k: v for k, v in section_of("judge", name).items() if k != "rewards"}
+    return build(section | {"hold": hold}, "judge", spec=spec, **context)  # type: ignore[no-any-return]

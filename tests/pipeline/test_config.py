@@ -50,6 +50,13 @@ from pipeline.loop import build_loop
         (["launch.device=gpu"], r"launch\.device='gpu' should be auto, cpu, cuda or"),
         (["policy.head.mode=sideways"], r"policy\.head\.mode='sideways' should be 'relative' or"),
         (["simulator=dit", "simulator.denoising.prediction=noise"], r"denoising\.prediction='noise' should"),
+        (
+            ["distill.steps=2"],
+            r"distill\.steps=2, but UNetSimulator does not denoise in steps.*simulator=dit",
+        ),
+        (["simulator=dit", "distill.steps=5"], r"more than the teacher's simulator\.denoising\.steps=4"),
+        (["simulator=gesim", "task=lerobot", "task.data=[x]", "distill.steps=5"], r"distilled sampler has 4"),
+        (["distill.method.critic_lr=0"], r"distill\.method\.critic_lr=0"),
         (["task=tabletop", "task.suite.scenes=3"], r"task\.suite\.scenes=3"),
         (["task=tabletop", "+task.variants.x={scene: a}"], r"task\.variants\.x\.scene is not an option"),
     ],
@@ -75,7 +82,11 @@ WRONG: dict[type, list[Any]] = {
     dict: [3, None, "none", [1]],
 }
 # other packages' options; where null has a meaning
-FREE, NULLABLE = ("simulator.scratch", "policy.policy"), ("rl.chunks", "task.suite", "finetune.weights")
+FREE = ("simulator.scratch", "policy.policy", "judge.chat.body")
+NULLABLE = ("rl.chunks", "task.suite", "finetune.weights", "judge.chat.key")
+
+
+SECTIONS = {"distiller": "distill"}  # of groups that fill a part of one
 
 
 @pytest.mark.parametrize("word", [f"{group}={name}" for group in groups() for name in choices(group)])
@@ -84,10 +95,11 @@ def test_hundreds_of_wrong_values_are_all_found(word: str) -> None:
     found and named.
     """
     group = word.partition("=")[0]
+    section = SECTIONS.get(group, group)
     cfg = load_config([word, "task.data=[recordings]"] if word == "task=lerobot" else [word])
     tried, missed = 0, []
     # an experiment is the whole config
-    for path, value in leaves(cfg if group == "experiment" else {group: cfg[group]}):
+    for path, value in leaves(cfg if group == "experiment" else {section: cfg[section]}):
         if value is None or path.startswith(FREE):
             continue
         for wrong in WRONG[type(value)]:

@@ -11,12 +11,14 @@ from safetensors.torch import load_file
 
 from actors.factory import build_simulator, build_state_decoder
 from envs.simulators.dit.shape import DiTShape
+from envs.simulators.samplers import DISTILLED, Distilled
 from envs.targets import ConfigError
 from pipeline.benches.gesim import FULL
 from pipeline.benches.gesim_floor import count_flops
 from pipeline.cli import tools
 from pipeline.commands.finetune import build_finetune
 from pipeline.commands.serving import build_session_host
+from pipeline.commands.verify import verify_run
 from pipeline.config import load_config
 from tests.actors.serving import serve_config
 from tests.envs.simulators.gesim_tiny import write_checkpoint
@@ -39,7 +41,9 @@ def test_convert_and_inspect(shared: Path, tmp_path: Path, capsys: pytest.Captur
         tools.convert(["only-one"])
 
 
-def test_finetune_a_checkpoint_and_serve_what_came_of_it(shared: Path, tmp_path: Path) -> None:
+def test_finetune_a_checkpoint_distil_it_again_and_serve_what_came_of_it(
+    shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     tools.convert([str(shared / "data/gesim_v2"), str(tmp_path / "data"), "frames=12", "size=[32,48]"])
     checkpoint = write_checkpoint(tmp_path / "released")
     words = [
@@ -52,6 +56,10 @@ def test_finetune_a_checkpoint_and_serve_what_came_of_it(shared: Path, tmp_path:
         "finetune.simulator.fit.steps=2",
         "finetune.simulator.fit.batch=2",
         "finetune.simulator.lora=2",
+        "distill.steps=2",
+        "distiller=dmd2_gesim",
+        "distill.first={lora: 2, fit: {steps: 2, batch: 2, lr: 1e-2, warmup: 1}}",
+        "distill.method={critic_updates: 1, critic_lr: 1e-2}",
         "finetune.state.fit.steps=2",
         "finetune.state.fit.batch=2",
         "simulator.state_expert.checkpoint=null",  # bundles have head and waist joints, the released one not
@@ -59,12 +67,22 @@ def test_finetune_a_checkpoint_and_serve_what_came_of_it(shared: Path, tmp_path:
     cfg = load_config(words)
     graph = build_finetune(cfg, tmp_path / "runs/default")
     done = graph.run()
-    assert set(done) == {"simulator", "state"}
-    simulator = build_simulator(graph.cfg, graph.folder("simulator") / "weights.safetensors")
+    assert set(done) == {"simulator", "student", "state"}
+    assert (
+        "these weights sample in 4 distilled steps, and flow matching takes that out"
+        in capsys.readouterr().out
+    )
+    tuned, distilled = (
+        load_file(graph.folder(name) / "weights.safetensors") for name in ("simulator", "student")
+    )
+    assert any(not torch.equal(value, distilled[name]) for name, value in tuned.items())
+    simulator = build_simulator(graph.cfg, graph.folder("student") / "weights.safetensors")
+    assert simulator.sampler == Distilled(DISTILLED[:2])
     build_state_decoder(graph.cfg, simulator, graph.folder("state") / "weights.safetensors")
+    assert verify_run(tmp_path / "runs/default").startswith("2 stages of")
     host = build_session_host(cfg, tmp_path / "runs/default", serve_config())
     assert host.simulator.spec.chunk == 5
-    for served, stage in ((host.simulator, "simulator"), (host.decoder, "state")):
+    for served, stage in ((host.simulator, "student"), (host.decoder, "state")):
         tuned = load_file(graph.folder(stage) / "weights.safetensors")
         for name, value in served.named_parameters():  # buffers of the mix are handed over by the decoder
             assert torch.equal(value, tuned[name].to(value.dtype)), (stage, name)

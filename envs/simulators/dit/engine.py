@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -12,11 +13,12 @@ from torch import Tensor
 
 from envs.conditioning import ActionVector, render_ray_map
 from envs.ranges import Count, Natural, NonNegative, Positive, Share
-from envs.simulators.dit.latent_world import Diffusion, LatentWorld
+from envs.simulators.dit.diffusion import Diffusion
+from envs.simulators.dit.latent_world import LatentWorld
 from envs.simulators.dit.network import MultiViewDiT
 from envs.simulators.dit.prediction import PREDICTIONS
 from envs.simulators.dit.shape import DiTShape
-from envs.simulators.samplers import Euler
+from envs.simulators.samplers import Distilled, Euler, Sampler, shifted_levels
 from envs.simulators.tokenizers.autoencoder import STRIDE, Autoencoder
 from envs.specs import WorldSpec
 from envs.targets import OptionsOf, options
@@ -68,13 +70,15 @@ class Denoising:
 
     Args:
         prediction: "velocity", or "clean" for the clean latents (see prediction.py).
-        steps: Euler steps per chunk.
+        sampler: "euler", or "distilled" for the jumps of a few-step student (see samplers.py).
+        steps: of the sampler, per chunk.
         shift: of the noise levels in training and sampling; above 1 favours noise.
         foreground: extra loss weight of what differs from the picture's median colour.
         augment: chance that a clip's memory is augmented in training.
     """
 
     prediction: Literal["velocity", "clean"]
+    sampler: Literal["euler", "distilled"]
     steps: Count
     shift: Positive
     foreground: NonNegative
@@ -82,8 +86,18 @@ class Denoising:
 
     def diffusion(self) -> Diffusion:
         """The same for LatentWorld."""
-        sampler, prediction = Euler(self.steps, self.shift), PREDICTIONS[self.prediction]
+        prediction = PREDICTIONS[self.prediction]
+        sampler: Sampler = Euler(self.steps, self.shift)
+        if self.sampler == "distilled":
+            sampler = few_steps(self.steps, self.shift)
         return Diffusion(sampler, prediction, TIME_SCALE, self.shift, self.foreground, self.augment)
+
+
+def few_steps(steps: int, shift: float) -> Distilled:
+    """The sampler of a student of so many steps: jumps from the levels at which Euler steps would begin. The
+    released student's are four of shift 5.
+    """
+    return Distilled(tuple(shifted_levels(steps, shift)[:-1]))
 
 
 class DiTSimulator(LatentWorld):
@@ -122,6 +136,21 @@ class DiTSimulator(LatentWorld):
         with torch.no_grad():
             # It starts from no change, or no flow: random output takes long to unlearn.
             trunk.proj_out.weight.mul_(0.05)
+
+    @classmethod
+    def student_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
+        """See Simulator.student_section."""
+        own = section["denoising"]
+        if steps > own["steps"]:
+            raise ValueError(
+                f"distill.steps={steps} are more than the teacher's simulator.denoising.steps={own['steps']};"
+                " a student takes fewer"
+            )
+        return {**section, "denoising": {**own, "sampler": "distilled", "steps": steps}}
+
+    def few_steps(self, steps: int) -> Distilled:
+        """See Stepwise."""
+        return few_steps(steps, self.diffusion.shift)
 
     def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
         """See Simulator.normalise; action vectors take their units."""

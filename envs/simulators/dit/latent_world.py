@@ -7,8 +7,6 @@ clean, the future is denoised along the flow.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
@@ -16,40 +14,21 @@ from torch import Tensor
 
 from envs.simulators.base import Simulator, noise_generator, to_bytes
 from envs.simulators.dit.augment import augment_memory_frames, augment_memory_latents, chosen_clips
+from envs.simulators.dit.diffusion import Diffusion, Given
 from envs.simulators.dit.network import MultiViewDiT
-from envs.simulators.dit.prediction import Prediction
 from envs.simulators.foreground import foreground_weight
 from envs.simulators.inputs import own_frames
-from envs.simulators.samplers import Sampler
+from envs.simulators.samplers import Distilled, Sampler
 from envs.simulators.tokenizers.autoencoder import STRIDE, Codec
 from envs.specs import WorldSpec
 
 MEMORY_NOISE = 1e-4 / (1 + 1e-4)  # the noise level at which memory stands, as released
 
 
-@dataclass(frozen=True)
-class Diffusion:
-    """How latents are noised and denoised.
-
-    Args:
-        sampler: how the flow is followed.
-        prediction: what the network says.
-        time_scale: what levels are multiplied with for the network.
-        shift: of the levels drawn in training; above 1 favours noise.
-        foreground: extra loss weight of what differs from the picture's median colour.
-        augment: chance that a clip's memory is augmented in training.
-    """
-
-    sampler: Sampler
-    prediction: Prediction
-    time_scale: float
-    shift: float
-    foreground: float
-    augment: float
-
-
 class LatentWorld(Simulator):
     """Diffusion-transformer video world; see the module's docstring. A subclass says how it is conditioned.
+
+    It denoises in steps (stepwise.py), so a few-step student can be made of it.
 
     Args:
         spec: what it shows; sizes must be multiples of the autoencoder's stride times the patch.
@@ -104,6 +83,10 @@ class LatentWorld(Simulator):
         """Action vectors [B, M + T', action_size] of all latent frames, of a network that reads them."""
         return None
 
+    def few_steps(self, steps: int) -> Distilled:
+        """See Stepwise."""
+        raise NotImplementedError
+
     # -- latents
     def encode_stills(self, frames: Tensor) -> Tensor:
         """Latents [B, V, C, M, h, w] of memory frames, float [B, M, V, 3, H, W] in 0..1, each encoded on its
@@ -148,9 +131,7 @@ class LatentWorld(Simulator):
         """Loss of the future latents of one chunk (memory has none), any of the clip's; the frames of those
         before it are the model's own.
         """
-        chosen, inputs = own_frames(self, clip, generator)
-        part = slice(chosen * self.spec.chunk, (chosen + 1) * self.spec.chunk)
-        truth, valid = unit(clip["future", "frames"][:, part]), clip["future", "valid"][:, part]
+        inputs, truth, valid = self._drawn(clip, generator)
         augmented = chosen_clips(len(truth), self.diffusion.augment, generator)
         remembered = augment_memory_frames(unit(inputs["memory", "frames"]), augmented, generator)
         memory = augment_memory_latents(self.encode_stills(remembered), augmented, generator)
@@ -159,18 +140,64 @@ class LatentWorld(Simulator):
         level = self.diffusion.shift * draw / (1 + (self.diffusion.shift - 1) * draw)
         noise = torch.randn(clean.shape, generator=generator).to(clean.device)
         mixed = level[:, None, None, None, None, None]
-        output, _ = self._run(
-            (1 - mixed) * clean + mixed * noise, memory, level, self._channels(inputs, memory)
-        )
+        output, _ = self._run((1 - mixed) * clean + mixed * noise, level, self._given(inputs, memory))
         error = self.diffusion.prediction.error(output, clean, noise, memory[:, :, :, -1:])
         weight = self._weight(truth, valid)
         value = (error.square() * weight).sum() / (weight.sum() * clean.shape[2]).clamp(min=1)
         return value, {}
 
+    @property
+    def lost_in_training(self) -> str:
+        """See Simulator: flow matching knows nothing of jumps."""
+        if not self.sampler.jumps:
+            return ""
+        return (
+            f"these weights sample in {self.sampler.evaluations} distilled steps, and flow matching takes"
+            " that out of them: what they learn here is right in many steps, and blurred in few. Distil again"
+            f" (distill.steps={self.sampler.evaluations}), or sample undistilled"
+        )
+
+    # -- in steps
+    @property
+    def sampler(self) -> Sampler:
+        """See Stepwise."""
+        return self.diffusion.sampler
+
+    def chunk_of(self, clip: TensorDict, generator: torch.Generator) -> tuple[TensorDict, Tensor]:
+        """See Stepwise; weights [B, V, 1, T', h, w] are those of `loss`."""
+        inputs, truth, valid = self._drawn(clip, generator)
+        return inputs, self._weight(truth, valid)
+
+    def prepare(self, inputs: TensorDict) -> Given:
+        """See Stepwise."""
+        return self._given(inputs, self.encode_stills(unit(inputs["memory", "frames"])))
+
+    def noise(self, inputs: TensorDict, given: Given) -> Tensor:
+        """Noise [B, V, C, T', h, w], row by row from its own generator, the same in any batch."""
+        _, views, channels, _, height, width = given.memory.shape
+        rows = []
+        for s, c in zip(inputs["seed"].tolist(), inputs["chunk_index"].tolist(), strict=True):
+            rows.append(
+                torch.randn(views, channels, self.ahead, height, width, generator=noise_generator(s, c))
+            )
+        return torch.stack(rows).to(given.memory.device)
+
+    def velocity(self, z: Tensor, level: Tensor, given: Given) -> Tensor:
+        """See Stepwise."""
+        return self._velocity(z, level, given)[0]
+
     # -- parts
-    def _channels(self, inputs: TensorDict, memory: Tensor) -> tuple[Tensor, Tensor | None]:
-        """What stays the same at every step: conditioning channels and action vectors."""
-        return self.conditioning(inputs, (memory.shape[-2], memory.shape[-1])), self.actions(inputs)
+    def _drawn(self, clip: TensorDict, generator: torch.Generator) -> tuple[TensorDict, Tensor, Tensor]:
+        """Any chunk of a clip: its inputs, after own predictions of the chunks before, its true frames float
+        [B, K, V, 3, H, W] in 0..1, and which are valid [B, K].
+        """
+        chosen, inputs = own_frames(self, clip, generator)
+        part = slice(chosen * self.spec.chunk, (chosen + 1) * self.spec.chunk)
+        return inputs, unit(clip["future", "frames"][:, part]), clip["future", "valid"][:, part]
+
+    def _given(self, inputs: TensorDict, memory: Tensor) -> Given:
+        latent_hw = (memory.shape[-2], memory.shape[-1])
+        return Given(memory, self.conditioning(inputs, latent_hw), self.actions(inputs))
 
     def _weight(self, truth: Tensor, valid: Tensor) -> Tensor:
         """Loss weights [B, V, 1, T', h, w] of true frames [B, K, V, 3, H, W] and valid [B, K]."""
@@ -179,18 +206,13 @@ class LatentWorld(Simulator):
         return pooled.unflatten(0, (len(truth), self.ahead, -1)).permute(0, 2, 3, 1, 4, 5)
 
     def _run(
-        self,
-        future: Tensor,
-        memory: Tensor,
-        level: Tensor,
-        conditions: tuple[Tensor, Tensor | None],
-        layers: list[Tensor] | None = None,
+        self, future: Tensor, level: Tensor, given: Given, layers: list[Tensor] | None = None
     ) -> tuple[Tensor, Tensor]:
         """The network's output for future latents [B, V, C, T', h, w] at noise level [B], and features [B, V,
         tokens, width].
         """
-        channels, actions = conditions
-        latents = torch.cat([torch.cat([memory, future], 3), channels], 2)
+        actions = given.actions
+        latents = torch.cat([torch.cat([given.memory, future], 3), given.channels], 2)
         steps = torch.full((len(future), latents.shape[3]), MEMORY_NOISE, device=future.device)
         steps[:, self.memory_frames :] = level[:, None]
         views = self.spec.views
@@ -205,32 +227,27 @@ class LatentWorld(Simulator):
         ahead = output.unflatten(0, (-1, views))[:, :, :, self.memory_frames :].float()
         return ahead, fused.unflatten(0, (-1, views))
 
+    def _velocity(
+        self, z: Tensor, level: Tensor, given: Given, layers: list[Tensor] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The velocity at z [B, V, C, T', h, w] and noise level [B], and features [B, V, tokens, width]."""
+        output, features = self._run(z, level, given, layers)
+        at, base = level[:, None, None, None, None, None], given.memory[:, :, :, -1:]
+        return self.diffusion.prediction.velocity(output, z, at, base), features
+
     def _denoise(self, inputs: TensorDict, layers: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """Future latents [B, V, C, T', h, w] and the features of the last step."""
-        memory = self.encode_stills(unit(inputs["memory", "frames"]))
-        conditions, base = self._channels(inputs, memory), memory[:, :, :, -1:]
+        given = self.prepare(inputs)
         kept: list[Tensor] = []
 
         def velocity(z: Tensor, level: float) -> Tensor:
             if layers is not None:
                 layers.clear()
-            levels = torch.full((len(z),), level, device=z.device)
-            output, features = self._run(z, memory, levels, conditions, layers)
+            found, features = self._velocity(z, torch.full((len(z),), level, device=z.device), given, layers)
             kept[:] = [features]
-            return self.diffusion.prediction.velocity(output, z, level, base)
+            return found
 
-        noise = self._noise(inputs["seed"], inputs["chunk_index"], memory)
-        return self.diffusion.sampler(velocity, noise), kept[0]
-
-    def _noise(self, seed: Tensor, chunk_index: Tensor, like: Tensor) -> Tensor:
-        """Noise [B, V, C, T', h, w], row by row from its own generator, the same in any batch."""
-        _, views, channels, _, height, width = like.shape
-        rows = []
-        for s, c in zip(seed.tolist(), chunk_index.tolist(), strict=True):
-            rows.append(
-                torch.randn(views, channels, self.ahead, height, width, generator=noise_generator(s, c))
-            )
-        return torch.stack(rows).to(like.device)
+        return self.sampler(velocity, self.noise(inputs, given)), kept[0]
 
 
 def unit(frames: Tensor) -> Tensor:

@@ -10,12 +10,16 @@ from typing import Protocol
 
 from torch import Tensor
 
+Level = float | Tensor
+
 
 class Prediction(Protocol):
     """How the network's output is meant."""
 
-    def velocity(self, output: Tensor, z: Tensor, level: float, base: Tensor) -> Tensor:
-        """The velocity e - x at z, which samplers follow; `base` is the newest remembered latent."""
+    def velocity(self, output: Tensor, z: Tensor, level: Level, base: Tensor) -> Tensor:
+        """The velocity e - x at z, which samplers follow; `level` is one, or [B, 1, 1, 1, 1, 1], `base` the
+        newest remembered latent.
+        """
 
     def error(self, output: Tensor, clean: Tensor, noise: Tensor, base: Tensor) -> Tensor:
         """What training squares."""
@@ -24,7 +28,7 @@ class Prediction(Protocol):
 class Velocity:
     """The velocity e - x, as released."""
 
-    def velocity(self, output: Tensor, z: Tensor, level: float, base: Tensor) -> Tensor:
+    def velocity(self, output: Tensor, z: Tensor, level: Level, base: Tensor) -> Tensor:
         """See Prediction."""
         return output
 
@@ -42,7 +46,7 @@ class Clean:
     as any other.
     """
 
-    def velocity(self, output: Tensor, z: Tensor, level: float, base: Tensor) -> Tensor:
+    def velocity(self, output: Tensor, z: Tensor, level: Level, base: Tensor) -> Tensor:
         """See Prediction."""
         return (z - base - output) / level
 

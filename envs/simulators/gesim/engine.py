@@ -8,6 +8,7 @@ loads them.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,7 +21,8 @@ from torch import Tensor
 
 from envs.conditioning import render_ray_map
 from envs.ranges import Count, Natural, NonNegative, Positive, Share
-from envs.simulators.dit.latent_world import Diffusion, LatentWorld
+from envs.simulators.dit.diffusion import Diffusion
+from envs.simulators.dit.latent_world import LatentWorld
 from envs.simulators.dit.network import MultiViewDiT
 from envs.simulators.dit.prediction import Velocity
 from envs.simulators.dit.shape import DiTShape
@@ -151,6 +153,26 @@ class GESimulator(LatentWorld):
         diffusion = Diffusion(sampler, Velocity(), 1.0, options.shift, options.foreground, options.augment)
         super().__init__(spec, memory_frames, net, codec, diffusion, prompt)
         self.parity, net.checkpointing = PARITY[parity], options.checkpointing
+
+    @classmethod
+    def student_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
+        """See Simulator.student_section; the levels are the released student's first ones."""
+        if steps > len(DISTILLED):
+            raise ValueError(
+                f"distill.steps={steps}, but GE-Sim's distilled sampler has {len(DISTILLED)} levels;"
+                f" set distill.steps={len(DISTILLED)} or fewer"
+            )
+        own = section["sampling"]
+        if own["steps"] and steps > own["steps"]:
+            raise ValueError(
+                f"distill.steps={steps} are more than the teacher's simulator.sampling.steps={own['steps']};"
+                " a student takes fewer"
+            )
+        return {**section, "sampling": {"kind": "distilled", "steps": steps}}
+
+    def few_steps(self, steps: int) -> Distilled:
+        """See Stepwise."""
+        return Distilled(DISTILLED[:steps])
 
     def conditioning(self, inputs: TensorDict, latent_hw: tuple[int, int]) -> Tensor:
         """See LatentWorld: full-size pose and ray maps, memory resized frame by frame, the future in time

@@ -1,4 +1,4 @@
-"""In which order the tokens of a frame are decided: all at once in a few steps, or one place after another."""
+"""In which order the tokens of a frame are decided: all at once in a few steps, or place after place."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Decoding(Protocol):
         """Whether places see only those before them, and themselves."""
 
     def shown(self, tokens: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """What training gives of frames int64 [B, T, P, F], and where it counts what is said, bool [B, T, P]."""
+        """What training gives of frames int64 [B, T, P, F], and where answers count, bool [B, T, P]."""
 
     def decide(self, ask: Asker, places: int, factors: int, draws: Draws) -> Tensor:
         """Tokens int64 [B, P, F] of a frame."""

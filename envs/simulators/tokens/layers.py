@@ -66,8 +66,8 @@ class TokenAttention(nn.Module):
 def _attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None) -> Tensor:
     """Attention of queries [..., L, size] to keys and values [..., N, size]; sizes before that may broadcast.
 
-    On a CPU by two products: over so few keys they take a half to a quarter of the time of torch's fused kernel,
-    most of all backwards in bfloat16 (8.8 against 35 ms for 40 queries of 88 keys in 192 heads).
+    On a CPU by two products: over so few keys they take a half to a quarter of the time of torch's fused
+    kernel, most of all backwards in bfloat16 (8.8 against 35 ms for 40 queries of 88 keys in 192 heads).
     """
     if q.is_cuda:
         lead = q.shape[:-2]

@@ -20,6 +20,7 @@ from tests.envs.simulators.clips import clip, first_of, future_of
 NET = {"layers": 3, "heads": 2, "head_dim": 24, "adaln_rank": 8, "patch": 2, "stem": 8}
 DENOISING: dict[str, Any] = {
     "prediction": "clean",
+    "sampler": "euler",
     "steps": 2,
     "shift": 2.0,
     "foreground": 4.0,

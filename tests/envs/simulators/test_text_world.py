@@ -1,4 +1,4 @@
-"""The text world: it stops where it says done, or does not finish; the instruction tells; encoders refuse texts."""
+"""The text world: it stops where it says done, or does not finish; words decide; encoders refuse texts."""
 
 from __future__ import annotations
 
@@ -139,7 +139,10 @@ def test_texts_that_would_be_cut_are_refused() -> None:
     [
         ({"window": 1}, r"judge\.text_world\.window=1"),
         ({"ending": {"threshold": 1.5}}, r"text_world\.ending\.threshold=1\.5"),
-        ({"words": {"_target_": f"{TOKENS}.words.T5Words", "folder": "/none", "max_tokens": 8}}, "holds no T5"),
+        (
+            {"words": {"_target_": f"{TOKENS}.words.T5Words", "folder": "/none", "max_tokens": 8}},
+            "holds no T5",
+        ),
     ],
 )
 def test_options_that_cannot_work_are_named(changes: dict[str, Any], said: str) -> None:

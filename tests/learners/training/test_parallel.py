@@ -16,14 +16,16 @@ from torch import Tensor, nn
 from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
 from envs.specs import ActionMode
+from learners.stages.distill.stage import train_student
 from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.judge import train_judge
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
 from learners.training.fit import FitConfig, fit
 from tests.embodiments import ARM_DELTAS, world_spec
-from tests.learners.models import decoder_of, judge_of, policy_of, simulator_of
+from tests.learners.models import decoder_of, distilled, judge_of, policy_of, simulator_of
 from tests.moving_square import SIZE
+from tests.sections import section
 
 STEPS = 8
 
@@ -120,9 +122,13 @@ def stages(folder: Path, dataset: Path) -> list[float]:
     train_simulator(simulator, store, every, clips, options, folder / "simulator")
     train_state(decoder, simulator, store, every, options, folder / "state")
     train_judge(judge, store, every, options, folder / "judge")
+    teacher, student = simulator_of("dit_small", spec), distilled(spec)
+    student.load_state_dict(teacher.state_dict())
+    method = section("distiller/dmd2", critic_updates=2)
+    train_student(teacher, student, method, store, every, clips, options, folder / "distill")
     return [
         json.loads(line)[f"{name}/loss"]
-        for name in ("imitation", "simulator", "state", "judge")
+        for name in ("imitation", "simulator", "state", "judge", "distill")
         for line in (folder / name / "metrics.jsonl").read_text().splitlines()
     ]
 
@@ -166,7 +172,7 @@ def test_two_workers_follow_one_in_every_supervised_stage(
 ) -> None:
     dataset = tiny_data(ARM_DELTAS)
     alone = stages(tmp_path / "alone", dataset)
-    assert len(alone) == 12 and two(stages, tmp_path / "two", dataset)[0] == pytest.approx(alone, rel=1e-3)
+    assert len(alone) == 15 and two(stages, tmp_path / "two", dataset)[0] == pytest.approx(alone, rel=1e-3)
 
 
 def test_microbatches_that_cannot_be_shared_out_are_refused() -> None:

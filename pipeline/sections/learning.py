@@ -1,8 +1,4 @@
-"""What every section of configs/ may hold: names, types and ranges.
-
-Sections that describe an object (`_target_`) are checked against what its class says at its options; those
-that become a dataclass elsewhere, against that.
-"""
+"""Sections of the loop: the task, the imagined world, and what learns."""
 
 from __future__ import annotations
 
@@ -10,14 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from annotated_types import Ge, MinLen, MultipleOf
+from annotated_types import Gt, Lt, MinLen
 
-from envs.ranges import Count, Discount, Natural, NonNegative, Positive, Seed, Share
-
-Side = Annotated[int, Ge(16), MultipleOf(16)]
-Name = Annotated[str, MinLen(1)]
-Fit = Mapping[str, Any]  # learners.training.fit.FitConfig; checked by itself
-Choice = Mapping[str, Any]  # `_target_` and its options; checked by itself
+from envs.ranges import Count, Discount, Natural, Share
+from pipeline.sections.kinds import Choice, Fit, Name, Side
 
 
 @dataclass(frozen=True)
@@ -93,6 +85,16 @@ class RoundsSection:
 
 
 @dataclass(frozen=True)
+class ExtraStartsSection:
+    """Section extra_starts."""
+
+    variants: Sequence[Name]
+    episodes: Count
+    data: Sequence[str] | str
+    share: Annotated[float, Gt(0), Lt(1)]
+
+
+@dataclass(frozen=True)
 class CloneSection:
     """Section clone."""
 
@@ -138,78 +140,10 @@ class FinetuneSection:
 
 
 @dataclass(frozen=True)
-class ChaosSection:
-    """Section chaos."""
+class DistillSection:
+    """Section distill."""
 
-    events: Natural
-    patience: Positive
-    seconds: NonNegative
-    every: Positive
-    learner_every: Positive
-    actors: Count
-
-
-@dataclass(frozen=True)
-class EvaluateSection:
-    """Section evaluate."""
-
-    episodes: Count
-    envs: Count
-    imagined: Count
-
-
-@dataclass(frozen=True)
-class MeasureSection:
-    """Section measure."""
-
-    videos: Natural
-    worst: Natural
-    starts: Count
-    speed_chunks: Count
-
-
-@dataclass(frozen=True)
-class TrackSection:
-    """Section track."""
-
-    wandb: Literal["offline", "online", "disabled"]
-    project: Name
-
-
-@dataclass(frozen=True)
-class LocalSection:
-    """Section launch, everything in one process."""
-
-    backend: Literal["local"]
-    device: Annotated[str, MinLen(1)]
-    workers: Natural
-
-
-@dataclass(frozen=True)
-class RaySection:
-    """Section launch, on Ray."""
-
-    backend: Literal["ray"]
-    device: Annotated[str, MinLen(1)]
-    workers: Natural
-    address: Name
-    cpus: Natural
-    object_store_mb: Annotated[int, Ge(80)]
-    actors: Count
-    learners: Count
-    strategy: Literal["collocated", "disaggregated", "hybrid"]
-    place: Mapping[str, Mapping[Literal["num_cpus", "num_gpus"], NonNegative]]
-    judge_service: bool
-    service: Mapping[str, Any]
-    patience: Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class Top:
-    """Keys that stand by themselves."""
-
-    name: Name
-    seed: Seed
-    runs: Name
-    cameras: Literal["all", "main"] | Annotated[Sequence[str], MinLen(1)]
-    microbatches: Count
+    steps: Natural
+    method: Choice
+    first: Mapping[str, Any]
+    refresh: Mapping[str, Any]

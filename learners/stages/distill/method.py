@@ -1,0 +1,109 @@
+"""What every way to make a few-step student shares: teacher and student side by side, and how the student is
+asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from envs.simulators.stepwise import Stepwise
+from learners.training.fit import FitConfig
+from learners.training.optimisers import OPTIMISERS, Parameters
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A microbatch, and whose turn it is.
+
+    Args:
+        clip: [B], see ClipStore.clips.
+        step: of training.
+    """
+
+    clip: TensorDict
+    step: int
+
+    def to(self, device: torch.device | str) -> Turn:
+        """The same on a device."""
+        return Turn(self.clip.to(device), self.step)
+
+
+class Method(nn.Module):
+    """A teacher that stays as it is and a student that learns from it; a subclass says how.
+
+    Args:
+        teacher: denoises in many steps.
+        student: of the same architecture and conditioning, with the teacher's weights to begin with.
+        config: of the training loop.
+    """
+
+    teacher: Any
+    student: Any
+
+    def __init__(self, teacher: Stepwise[Any], student: Stepwise[Any], config: FitConfig):
+        super().__init__()
+        teacher.codec = student.codec  # frozen in both
+        self.teacher, self.student = teacher, student
+        self.teacher.requires_grad_(False)
+        self.steps, self.config = student.sampler.evaluations, config
+
+    @property
+    def learners(self) -> Sequence[nn.Module]:
+        """Whose weights learn, all of them or their adapters."""
+        return (self.student,)
+
+    def loss(self, turn: Turn, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
+        """What whoever's turn it is learns from, and figures to log."""
+        raise NotImplementedError
+
+    def optimise(self, trained: Parameters, lr: float, weight_decay: float) -> list[Optimizer]:
+        """The optimisers of what learns, as `fit` takes them."""
+        return OPTIMISERS[self.config.optimiser](trained, lr, weight_decay)
+
+    def generated(self, inputs: TensorDict, generator: torch.Generator) -> Generated:
+        """What the student makes of a chunk.
+
+        Of a random number of steps, one to all of its own, it learns at a random one: what this step sees
+        comes from the student's own steps before, with the same noise each time, as when it samples (DMD2's
+        backward simulation). Only the last of these calls keeps gradients.
+        """
+        student = self.student
+        steps = 1 + int(torch.randint(self.steps, (1,), generator=generator))
+        number = int(torch.randint(steps, (1,), generator=generator))
+        sampler, given = student.few_steps(steps), student.prepare(inputs)
+        noise = student.noise(inputs, given)
+
+        def velocity(z: Tensor, level: float) -> Tensor:
+            return student.velocity(z, torch.full((len(z),), level, device=z.device), given)
+
+        with torch.no_grad():
+            seen = sampler.before(number, velocity, noise)
+        level = sampler.sigmas[number]
+        return Generated(seen - level * velocity(seen, level), noise, given)
+
+
+@dataclass(frozen=True)
+class Generated:
+    """Latents that the student made.
+
+    Args:
+        latents: of the chunk, float32 [B, ...].
+        noise: that they were made from, like latents.
+        given: what all steps shared.
+    """
+
+    latents: Tensor
+    noise: Tensor
+    given: Any
+
+
+def spread(level: Tensor, like: Tensor) -> Tensor:
+    """Levels [B] so that they broadcast over latents [B, ...]."""
+    return level.reshape(-1, *[1] * (like.ndim - 1))

@@ -1,0 +1,93 @@
+"""Stage: make a student of few steps of a simulator that denoises in many."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from envs.episodes.clips import ClipStore
+from envs.simulators.base import Simulator
+from envs.simulators.stepwise import Stepwise
+from envs.targets import build
+from learners.stages.distill.method import Method, Turn
+from learners.stages.simulator import ClipBatches, SimulatorFitConfig
+from learners.training.fit import FitConfig, fit
+from learners.training.lora import low_rank
+
+
+def train_student(
+    teacher: Simulator,
+    student: Simulator,
+    method: dict[str, Any],
+    store: ClipStore,
+    episodes: Tensor,
+    config: SimulatorFitConfig,
+    options: FitConfig,
+    folder: Path,
+    newest: Tensor | None = None,
+) -> dict[str, float]:
+    """Train `student` in place, whose weights are the teacher's or those of an earlier student.
+
+    Args:
+        method: section distill.method.
+        newest: episodes that config.recent_fraction speaks of.
+
+    Raises:
+        ValueError: if the two do not belong together, naming the keys.
+        ConfigError: if the method cannot be built.
+    """
+    check_pair(teacher, student)
+    made: Method = build(method, "distill.method", teacher=teacher, student=student, config=options)
+    clips = ClipBatches(student, store, episodes, config, options, newest)
+
+    def batch(step: int, generator: torch.Generator) -> Turn:
+        return Turn(clips(step, generator), step)
+
+    with ExitStack() as adapted:
+        for learner in made.learners:
+            adapted.enter_context(low_rank(learner, config.lora))
+        return fit("distill", made, batch, made.loss, options, folder, optimise=made.optimise)
+
+
+def check_pair(teacher: Simulator, student: Simulator) -> None:
+    """See that a student can be made of a teacher.
+
+    Raises:
+        ValueError: naming the keys in which they differ, or by which a simulator has no steps.
+    """
+    for role, world in (("teacher", teacher), ("student", student)):
+        if not isinstance(world, Stepwise):
+            raise ValueError(
+                f"the {role}, {type(world).__name__}, does not denoise in steps; set distill.steps=0, or"
+                " choose simulator=dit or gesim"
+            )
+    assert isinstance(teacher, Stepwise) and isinstance(student, Stepwise)
+    pairs = {
+        "task (its robot)": (teacher.spec.embodiment, student.spec.embodiment),
+        "task.size": (teacher.spec.size, student.spec.size),
+        "task.chunk": (teacher.spec.chunk, student.spec.chunk),
+        "simulator.pose_map": (teacher.spec.pose_map, student.spec.pose_map),
+        "simulator.ray_map": (teacher.spec.ray_map, student.spec.ray_map),
+        "simulator.memory_frames": (teacher.memory_frames, student.memory_frames),
+        "simulator._target_": (type(teacher).__name__, type(student).__name__),
+    }
+    odd = [f"{key}: {a!r} and {b!r}" for key, (a, b) in pairs.items() if a != b]
+    if odd:
+        raise ValueError(
+            f"teacher and student are conditioned differently: {'; '.join(odd)}; make them alike"
+        )
+    if not student.sampler.jumps:
+        raise ValueError(
+            "a student samples in distilled steps; set simulator.denoising.sampler=distilled (dit) or"
+            " simulator.sampling.kind=distilled (gesim)"
+        )
+    many, few = teacher.sampler.evaluations, student.sampler.evaluations
+    if few > many:
+        raise ValueError(
+            f"distill.steps={few} are more than the teacher's {many}; lower distill.steps, or raise"
+            " simulator.denoising.steps (dit) or simulator.sampling.steps (gesim)"
+        )
