@@ -1,11 +1,10 @@
-"""The stage that teaches a text world: successes alone, tokenizer first, and its place in the graph."""
+"""Teaching a text world: from successes alone, the tokenizer first."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -14,10 +13,8 @@ from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
 from learners.stages.text_world import SuccessfulClips, train_text_world
 from learners.training.fit import FitConfig
-from pipeline.config import load_config
-from pipeline.loop import build_loop
 from tests.embodiments import ARM_DELTAS
-from tests.envs.simulators.test_text_world import section, world
+from tests.envs.simulators.test_text_world import world
 from tests.moving_square import INSTRUCTION
 
 Stores = Callable[[Embodiment], ClipStore]
@@ -26,12 +23,13 @@ Stores = Callable[[Embodiment], ClipStore]
 def test_it_learns_from_successes_and_then_goes_where_they_go(tiny_store: Stores, tmp_path: Path) -> None:
     store, model = tiny_store(ARM_DELTAS), world(window=6, ending={"max_frames": 3})
     every = torch.arange(len(store))
-    short = FitConfig(60, 8, 5e-3, warmup=5, ema=0.9, bf16=False)
+    short = FitConfig(30, 8, 5e-3, warmup=3, ema=0.8, bf16=False)
     stats = train_text_world(model, store, every, 2, short, tmp_path, tokenizer=short)
     assert stats["successes"] == len(store.select(succeeded=True)) < len(store)
-    assert stats["tokenizer_psnr"] > 15 and stats["tokenizer_alarm"] == ""
+    assert stats["tokenizer_alarm"] == "" and stats["tokenizer_perplexity"] > 1
+    kept = [json.loads(line)["tokenizer/psnr"] for line in (tmp_path / "tokenizer/metrics.jsonl").open()]
     rows = [json.loads(line)["text_world/loss"] for line in (tmp_path / "metrics.jsonl").open()]
-    assert sum(rows[-5:]) < 0.7 * sum(rows[:5])
+    assert sum(kept[-5:]) > sum(kept[:5]) + 10 and sum(rows[-5:]) < 0.8 * sum(rows[:5])
     first = store.frames(store.start[:2])
     golden = model.imagine(first, [INSTRUCTION] * 2, torch.arange(2))
     assert golden.frames.shape[0] == 2 and golden.frames.shape[1] <= 3
@@ -51,17 +49,3 @@ def test_data_without_successes_are_refused(tiny_store: Stores, tmp_path: Path) 
     failed = store.select(succeeded=False)
     with pytest.raises(ValueError, match="no episode of the data is labelled a success"):
         train_text_world(world(), store, failed, 1, FitConfig(1, 1, 1e-3), tmp_path)
-
-
-def test_the_graph_has_it_where_the_judge_asks_for_one(tmp_path: Path) -> None:
-    cfg: dict[str, Any] = dict(load_config(["experiment=smoke"]))
-    assert not [name for name in build_loop(cfg, tmp_path).nodes if name.startswith("text_world")]
-    cfg["judge"] = {**cfg["judge"], "text_world": section()}
-    graph = build_loop(cfg, tmp_path)
-    assert [name for name in graph.nodes if name.startswith("text_world")] == ["text_world-1", "text_world-2"]
-    roles = {name: graph.nodes[name].identity.roles for name in graph.nodes}
-    assert roles["judge-2"]["text_world"] == ["text_world-2"] and roles["text_world-2"]["warm"] == [
-        "text_world-1"
-    ]
-    users = [name for name in roles if "text_world" in roles[name]]
-    assert users == ["judge-1", "judge-2"]
