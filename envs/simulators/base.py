@@ -82,6 +82,15 @@ class Simulator(nn.Module):
         raise NotImplementedError
 
     @classmethod
+    def stepped_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
+        """A config section with so many undistilled steps a chunk.
+
+        Raises:
+            ValueError: of an engine that does not denoise in steps.
+        """
+        raise ValueError(f"{cls.__name__} does not denoise in steps; choose simulator=dit or gesim")
+
+    @classmethod
     def student_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
         """The config section of a student that takes so many steps, where `section` is the teacher's.
 

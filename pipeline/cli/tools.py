@@ -92,7 +92,7 @@ def inspect(words: Words) -> None:
 
 def bench(words: Words) -> None:
     """measure performance: worldloop bench
-    conditioning|collection|experts|world|actors|learning|serving|gesim|overfit|pretrained
+    conditioning|collection|experts|world|actors|learning|serving|gesim|distil|overfit|pretrained
     """
     from pipeline.benches.bench import run_bench
 
