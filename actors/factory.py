@@ -25,6 +25,7 @@ from envs.physics.pool import TaskPool, available_cores
 from envs.physics.suite import SuiteError
 from envs.simulators.base import WORLD_OPTIONS, Simulator
 from envs.simulators.state_experts.base import StateDecoder
+from envs.simulators.tokens.text_world import TextWorld
 from envs.specs import ActionMode
 from envs.targets import ConfigError, build
 from envs.transforms import world_transforms
@@ -62,14 +63,32 @@ def build_judge(cfg: Mapping[str, Any], weights: Path | None = None) -> Judge:
     return load(judge, weights).to(device_of(cfg))
 
 
+def build_text_world(cfg: Mapping[str, Any], weights: Path | None = None) -> TextWorld:
+    """The text world of a judge that asks for one, judge.text_world; see tokens/text_world.py."""
+    world: TextWorld = build(cfg["judge"]["text_world"], "judge.text_world", spec=world_spec(cfg))
+    return load(world, weights).to(device_of(cfg))
+
+
 def build_policy(cfg: Mapping[str, Any], weights: Path | None = None) -> TensorDictModuleBase:
     """The policy of the policy section; see actors/policies/contract.py."""
     policy: TensorDictModuleBase = build(cfg["policy"], "policy", spec=world_spec(cfg))
     return load(policy, weights).to(device_of(cfg))
 
 
-def build_physics(cfg: Mapping[str, Any], batch: int, record: bool = False, seed: int = 0) -> PhysicsEnv:
+def build_physics(
+    cfg: Mapping[str, Any],
+    batch: int,
+    record: bool = False,
+    seed: int = 0,
+    changes: Mapping[str, Any] | None = None,
+) -> PhysicsEnv:
     """The true world.
+
+    Args:
+        batch: episodes side by side.
+        record: keep every frame, for PhysicsEnv.pop_tracks.
+        seed: of the stream of episode seeds.
+        changes: options of the suite that are other than the config says, as one of task.variants is.
 
     Raises:
         ConfigError: if the task has no suite, or no task of that name.
@@ -78,17 +97,26 @@ def build_physics(cfg: Mapping[str, Any], batch: int, record: bool = False, seed
     if task.get("suite") is None:
         raise ConfigError("task.suite is empty: this task is known from data alone and has no physics")
     try:
-        pool = TaskPool(task["suite"], task["name"], batch, task["horizon"], cfg["launch"]["workers"])
+        suite = {**task["suite"], **(changes or {})}
+        pool = TaskPool(suite, task["name"], batch, task["horizon"], cfg["launch"]["workers"])
         return PhysicsEnv(pool, world_spec(cfg), ActionMode(task["mode"]), rewards_of(cfg), record, seed)
     except (SuiteError, EmbodimentError) as error:
         raise ConfigError(str(error)) from error
 
 
-def build_pool(cfg: Mapping[str, Any]) -> TaskPool:
-    """Worker processes that run scripted episodes of the task, one slot each."""
+def build_pool(
+    cfg: Mapping[str, Any], changes: Mapping[str, Any] | None = None, horizon: int | None = None
+) -> TaskPool:
+    """Worker processes that run scripted episodes of the task, one slot each.
+
+    Args:
+        changes: see build_physics.
+        horizon: actions of an episode, the task's by default; 0 only lays it out.
+    """
     task, workers = cfg["task"], cfg["launch"]["workers"] or available_cores()
+    actions = task["horizon"] if horizon is None else horizon
     try:
-        return TaskPool(task["suite"], task["name"], workers, task["horizon"], workers)
+        return TaskPool({**task["suite"], **(changes or {})}, task["name"], workers, actions, workers)
     except (SuiteError, EmbodimentError) as error:
         raise ConfigError(str(error)) from error
 

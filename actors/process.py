@@ -17,6 +17,11 @@ from envs.targets import ConfigError
 def prepare_process(seed: int, threads: int = 0) -> None:
     """Settings every process needs before heavy work: seeds, threads, and an allocator that keeps its memory.
 
+    Args:
+        seed: of the global generators.
+        threads: of torch on the CPU, which decide the order of sums and so their last bits; what must be
+            equal on any machine fixes them. 0 for one per core.
+
     Video batches are tens of megabytes; glibc would map and unmap them at every operation, and page faults
     then cost a third more time per training step (8.4 ms a sample with this, 11.3 without).
     """
@@ -29,11 +34,7 @@ def prepare_process(seed: int, threads: int = 0) -> None:
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     torch.use_deterministic_algorithms(True, warn_only=True)
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
-    # Processes that train together on a machine share its cores; Ray Train and torchrun say how many they
-    # are.
-    torch.set_num_threads(
-        threads or max(1, available_cores() // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
-    )
+    torch.set_num_threads(threads or available_cores())
     try:
         libc = ctypes.CDLL("libc.so.6")
     except OSError:

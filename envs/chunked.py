@@ -73,6 +73,11 @@ class ChunkedEnv(EnvBase):
         """Actions per step, K."""
         return self.spec.chunk
 
+    @property
+    def elapsed(self) -> torch.Tensor:
+        """Actions that each episode has seen, int64 [B]."""
+        return self._steps
+
     def _set_specs(self) -> None:
         spec, shape = self.spec, tuple(self.batch_size)
         views = spec.views

@@ -32,7 +32,8 @@ class MultiViewEncoder(nn.Module):
     """One convolutional trunk for all views; each view has its own embedding and its own key-points.
 
     It says three things of every view: where soft key-points are (spatial soft-argmax, Finn et al. 2016),
-    what the features look like there, and a coarse grid of features.
+    what the features look like there, and a coarse grid of features. What some key-points look for may hang
+    on the words: where many things lie about, they find the one that is spoken of.
 
     Args:
         spec: what the world shows.
@@ -43,9 +44,11 @@ class MultiViewEncoder(nn.Module):
         grid: rows and columns of the coarse grid.
         look: features said of each key-point.
         cameras: which are looked through (Embodiment.views_of); the others cost nothing.
+        asked: key-points per view that look for what the words say, beside `points`.
+        words: numbers that an instruction is encoded as, of `asked` key-points.
 
-    Forward takes uint8, or float in -1..1, [B, V, 3 * pictures, H, W] of all cameras and returns float32
-    [B, out_features].
+    Forward takes uint8, or float in -1..1, [B, V, 3 * pictures, H, W] of all cameras, and with `asked`
+    key-points float32 [B, words]; it returns float32 [B, out_features].
     """
 
     def __init__(
@@ -58,6 +61,8 @@ class MultiViewEncoder(nn.Module):
         grid: int = 4,
         look: int = 4,
         cameras: str | Sequence[str] = "all",
+        asked: int = 0,
+        words: int = 0,
     ):
         super().__init__()
         self.chosen = list(spec.embodiment.views_of(cameras))
@@ -76,15 +81,19 @@ class MultiViewEncoder(nn.Module):
         self.lift = nn.Conv2d(deep, width, 1)
         self.heat = nn.Parameter(torch.randn(views, points, width) / width**0.5)
         # Sharp from the start: over a near-uniform softmax, key-points sit in the middle and hardly learn.
-        self.temperature = nn.Parameter(torch.full((views, points, 1), 2.3))
-        self.look = nn.Parameter(torch.randn(views, points, width, look) / width**0.5)
+        self.temperature = nn.Parameter(torch.full((views, points + asked, 1), 2.3))
+        self.look = nn.Parameter(torch.randn(views, points + asked, width, look) / width**0.5)
+        if asked:
+            self.ask = nn.Sequential(
+                nn.Linear(words, words), nn.SiLU(), nn.Linear(words, views * asked * width)
+            )
         # Pooled before it is convolved, which is the same and sixteen times cheaper.
         self.grid = nn.Sequential(
             nn.AdaptiveAvgPool2d(grid), nn.Conv2d(deep, width, 1), nn.SiLU(), nn.Flatten()
         )
-        self.out_features = views * (points * (2 + look) + width * grid * grid)
+        self.out_features = views * ((points + asked) * (2 + look) + width * grid * grid)
 
-    def forward(self, pictures: Tensor) -> Tensor:
+    def forward(self, pictures: Tensor, words: Tensor | None = None) -> Tensor:
         pictures = pictures[:, self.chosen]
         batch, views = pictures.shape[:2]
         flat = to_signed(pictures).flatten(0, 1).contiguous(memory_format=torch.channels_last)
@@ -95,7 +104,7 @@ class MultiViewEncoder(nn.Module):
         x = F.silu(self.fine(x) + F.interpolate(self.lift(y), size=x.shape[-2:], mode="nearest"))
         height, width = x.shape[-2:]
         places = x.flatten(2).unflatten(0, (batch, views)).float()  # [B, V, C, H * W]
-        share = ((self.heat @ places) * self.temperature.exp()).softmax(-1)  # [B, V, P, H * W]
+        share = ((self._sought(words) @ places) * self.temperature.exp()).softmax(-1)  # [B, V, P, H * W]
         looks = torch.einsum("bvpc,vpcl->bvpl", share @ places.transpose(-1, -2), self.look)
         said = (
             centres(share.unflatten(-1, (height, width))).flatten(1),
@@ -103,6 +112,14 @@ class MultiViewEncoder(nn.Module):
             self.grid(y).float().unflatten(0, (batch, views)).flatten(1),
         )
         return torch.cat(said, -1)
+
+    def _sought(self, words: Tensor | None) -> Tensor:
+        """What key-points look for, [V, P, C] or, with words [B, words], [B, V, P, C]."""
+        if words is None:
+            return self.heat
+        views, _, width = self.heat.shape
+        spoken = self.ask(words).reshape(len(words), views, -1, width)
+        return torch.cat((self.heat.expand(len(words), -1, -1, -1), spoken), 2)
 
 
 def pixel_centres(count: int, device: torch.device) -> Tensor:

@@ -62,11 +62,15 @@ class DecisionPoints(InitialStates):
     Args:
         store: that holds the episodes; pictures stay on disk until they are asked for.
         episodes: int64 [E].
+        first: int64 [F], episodes of which the first frames alone stand after those moments.
     """
 
-    def __init__(self, store: ClipStore, episodes: Tensor):
+    def __init__(self, store: ClipStore, episodes: Tensor, first: Tensor | None = None):
         self.store = store
-        self.episode, self.frame = decision_points(store, episodes)
+        more = torch.zeros(0, dtype=torch.int64) if first is None else first
+        episode, frame = decision_points(store, episodes)
+        self.episode = torch.cat((episode, more))
+        self.frame = torch.cat((frame, torch.zeros_like(more)))
         self.instructions = [store.instructions[n] for n in self.episode.tolist()]
 
     @property
@@ -83,6 +87,15 @@ class DecisionPoints(InitialStates):
         """See InitialStates.past; pictures beyond a moment hold anything."""
         now = self.frame[which]
         return self.store.until(self.episode[which], now, capacity), now + 1
+
+
+def shared_out(inside: int, extra: int, share: float) -> list[int]:
+    """Numbers of starts, `inside` ones and then `extra` ones, each as often as makes the extra ones about
+    `share` of them all.
+    """
+    odds = share / (1 - share) * inside / extra
+    often, rare = max(1, round(1 / odds)), max(1, round(odds))
+    return list(range(inside)) * often + list(range(inside, inside + extra)) * rare
 
 
 def decision_points(store: ClipStore, episodes: Tensor) -> tuple[Tensor, Tensor]:

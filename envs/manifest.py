@@ -8,13 +8,14 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from envs.files import write_text
+from envs.files import remove, write_json, write_text
 
 MANIFEST = "manifest.json"
+_WHOLE = ".whole.json"  # of an unfinished folder: hashes of what is whole in it
 
 
 class DamagedArtefact(RuntimeError):
@@ -41,11 +42,52 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """Write a manifest with the hashes of what lies beside it, and its own; returns it."""
+    """Write a manifest with the hashes of what lies beside it, and its own; returns it.
+
+    Raises:
+        DamagedArtefact: if a file has changed since it was whole.
+    """
+    check_whole(folder)
     plain = json.loads(json.dumps({**manifest, "files": hashes(folder)}, default=float))
     plain["seal"] = _seal(plain)
     write_text(folder / MANIFEST, json.dumps(plain, indent=1))
+    remove(folder / _WHOLE)
     return dict(plain)
+
+
+def keep_whole(folder: Path, files: Iterable[Path]) -> None:
+    """Remember the hashes of files that are whole long before their stage ends; of those already remembered
+    nothing is read.
+    """
+    known = whole_files(folder)
+    new = {path.relative_to(folder).as_posix(): path for path in files}
+    new = {name: path for name, path in new.items() if name not in known}
+    if new:
+        write_json(folder / _WHOLE, {**known, **{name: digest_of(path) for name, path in new.items()}})
+
+
+def whole_files(folder: Path) -> dict[str, str]:
+    """Hashes, by path, of those files of an unfinished artefact that are whole.
+
+    Raises:
+        DamagedArtefact: if the list cannot be read.
+    """
+    path = folder / _WHOLE
+    if not path.exists():
+        return {}
+    try:
+        return dict(json.loads(path.read_text()))
+    except (ValueError, TypeError):
+        _refuse(folder, [_WHOLE])
+
+
+def check_whole(folder: Path) -> None:
+    """See that those files of an unfinished artefact that are whole are what they were.
+
+    Raises:
+        DamagedArtefact: if one has changed or is missing.
+    """
+    check(folder, {"files": whole_files(folder)})
 
 
 def _seal(manifest: Mapping[str, Any]) -> str:

@@ -18,7 +18,9 @@ def computes_bf16(device: torch.device) -> bool:
 
 def working_dtype(device: torch.device, otherwise: torch.dtype) -> torch.dtype:
     """What matrices are multiplied in on a device: autocast's type within it, or `otherwise`."""
-    return torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else otherwise
+    if not torch.amp.is_autocast_available(device.type) or not torch.is_autocast_enabled(device.type):
+        return otherwise
+    return torch.get_autocast_dtype(device.type)
 
 
 def mixed_precision(device: torch.device, wanted: bool) -> torch.autocast:

@@ -37,6 +37,7 @@ C2W = ("camera", "c2w")  # float32 [B, V, 4, 4] camera to world, OpenCV conventi
 EPISODE = "episode_seed"  # int64 [B, 1]: episodes with equal seeds start from the same frame
 SUCCESS = "success"  # bool [B, 1]
 PROGRESS = "progress"  # float32 [B, 1] in 0..1
+LOST = "lost"  # bool [B, 1], in physics only: it crashes in this episode, which nobody learns from or counts
 JUDGE_STATUS = "judge_status"  # int64 [B, 1], see Status
 COMMANDS = "commands"  # float32 [B, K, A], what a chunk comes to, on the inverse path only
 POSE_MAP = "pose_map"  # uint8 [B, K, V, 3, H, W], on the inverse path only
@@ -157,6 +158,14 @@ def memory_indices(length: Tensor, count: int) -> Tensor:
     """Which of the first `length` [...] frames are remembered, [..., count]: evenly spread, both ends too."""
     share = torch.linspace(0, 1, count, dtype=torch.float64, device=length.device)
     return ((length.unsqueeze(-1) - 1) * share).round().long()
+
+
+def recent_indices(length: Tensor, count: int) -> Tensor:
+    """The last `count` of the first `length` [...] frames, [..., count]; the first repeats where there are
+    fewer.
+    """
+    back = torch.arange(count - 1, -1, -1, device=length.device)
+    return (length.unsqueeze(-1) - 1 - back).clamp(min=0)
 
 
 def text_to_bytes(texts: Sequence[str]) -> Tensor:

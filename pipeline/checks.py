@@ -29,9 +29,11 @@ _SECTIONS = {
     "collect": sections.CollectSection,
     "imitation": sections.ImitationSection,
     "rounds": sections.RoundsSection,
+    "extra_starts": sections.ExtraStartsSection,
     "clone": sections.CloneSection,
     "judge_fit.first": sections.JudgeFitSection,
     "judge_fit.refresh": sections.JudgeFitSection,
+    "text_world_fit": sections.TextWorldFitSection,
     "state_fit.first": sections.StateFitSection,
     "state_fit.refresh": sections.StateFitSection,
     "finetune": sections.FinetuneSection,
@@ -39,6 +41,12 @@ _SECTIONS = {
     "chaos": sections.ChaosSection,
     "evaluate": sections.EvaluateSection,
     "measure": sections.MeasureSection,
+    "study": sections.StudySection,
+    "imagined": sections.ImaginedSection,
+    "policy_value": sections.PolicyValueSection,
+    "fidelity": sections.FidelitySection,
+    "fidelity.long": sections.LongSection,
+    "sweep": sections.SweepSection,
     "track": sections.TrackSection,
     "serve": ServeConfig,
     "judge.rewards": Rewards,
@@ -47,6 +55,7 @@ _SECTIONS = {
 _FITS = (
     *("imitation.perception", "imitation.fit", "clone.perception", "clone.fit", "tokenizer_fit"),
     *(f"{stage}.{phase}.fit" for stage in ("state_fit", "judge_fit") for phase in ("first", "refresh")),
+    *(f"text_world_fit.{part}" for part in ("tokenizer", "first", "refresh")),
     "finetune.state.fit",
 )
 _SIMULATOR_FITS = (
@@ -60,6 +69,8 @@ _TARGETS = {
     "policy": (),
     "algorithm": (),
     "task.suite": (),
+    "fidelity.frames_extractor": (),
+    "fidelity.clips_extractor": (),
 }
 _TOP = {key.partition(".")[0] for key in (*_SECTIONS, *_FITS, *_SIMULATOR_FITS, *_TARGETS, "rl", "launch")}
 
@@ -105,6 +116,11 @@ def _alone(cfg: Cfg) -> Iterator[str]:
         for name, changes in variants.items():
             if isinstance(changes, Mapping):
                 yield from section_faults({**suite, **changes}, f"task.variants.{name}")
+    yield from _study(cfg["study"])
+    others = _at(cfg, "policy_value.others")
+    for name, section in others.items() if isinstance(others, Mapping) else ():
+        if isinstance(section, Mapping):
+            yield from section_faults(section, f"policy_value.others.{name}", ("weights",))
     world = {name: value for name, value in cfg["simulator"].items() if name in WORLD_OPTIONS}
     yield from _of(sections.WorldSection, world, "simulator")
 
@@ -122,6 +138,20 @@ def _of(kind: type[Any], section: Any, key: str, given: tuple[str, ...] = ()) ->
     ]
     yield from (f"{key}.{name} is missing" for name in needed if name not in section)
     yield from value_faults(kind, section, key)
+
+
+def _study(section: Any) -> Iterator[str]:
+    """What is wrong with single rows and columns of a study."""
+    rows, columns = (
+        section.get(key) if isinstance(section, Mapping) else None for key in ("methods", "measures")
+    )
+    for name, row in rows.items() if isinstance(rows, Mapping) else ():
+        yield from _of(sections.RowSection, row, f"study.methods.{name}")
+        if isinstance(row, Mapping) and isinstance(row.get("policy"), Mapping):
+            yield from section_faults(row["policy"], f"study.methods.{name}.policy")
+    for name, column in columns.items() if isinstance(columns, Mapping) else ():
+        if isinstance(column, Mapping):
+            yield from section_faults(column, f"study.measures.{name}")
 
 
 def _launch(launch: Cfg) -> Iterator[str]:
@@ -149,6 +179,16 @@ def _together(cfg: Cfg) -> Iterator[str]:
             "task has neither a suite (physics) nor data (recordings): task.data=[folder of a LeRobot data"
             " set], or another task"
         )
+    variants = task.get("variants", {})
+    for name in cfg["extra_starts"]["variants"]:
+        if name not in variants:
+            yield f"extra_starts.variants holds {name!r}, no key of task.variants{nearest(name, variants)}"
+    study = cfg["study"]
+    known = {"rows": "methods", "columns": "measures", "only": "rows", "against": "rows"}
+    for key, among in known.items():
+        for name in study[key]:
+            if name not in study[among]:
+                yield f"study.{key} holds {name!r}, which study.{among} has not{nearest(name, study[among])}"
     if abs(sum(cfg["collect"]["mix"].values()) - 1) > 1e-6:
         yield f"collect.mix={cfg['collect']['mix']} must add up to 1"
     low, high = cfg["collect"]["noise_level"]

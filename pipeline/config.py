@@ -45,6 +45,17 @@ def choices(group: str) -> list[str]:
     return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
 
 
+def offered(group: str, choice: str, overrides: Sequence[str]) -> bool:
+    """Whether a group has a choice: in configs/, or in a folder that hydra.searchpath names."""
+    if choice in choices(group):
+        return True
+    elsewhere = [word for word in overrides if word.startswith("hydra.searchpath=")]
+    try:
+        return bool(elsewhere) and bool(composed([*elsewhere, f"{group}={choice}"]))
+    except Exception:  # Hydra has an error of its own for each way of not finding it
+        return False
+
+
 def composed(overrides: Sequence[str]) -> dict[str, Any]:
     """The resolved config, unchecked."""
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):

@@ -31,6 +31,7 @@ class World:
     simulator: str = ""
     state: str = ""
     judge: str = ""
+    text_world: str = ""  # whose weights are the judge's, once it has learned
 
     def roles(self) -> dict[str, str]:
         """Inputs of whatever runs in it."""
@@ -73,9 +74,23 @@ def of_round(values: Sequence[T], number: int) -> T:
     return values[min(number, len(values)) - 1]
 
 
+def deployed_episodes(cfg: Cfg) -> int:
+    """Physics episodes of all deployments; the last one is of what the last round has learned."""
+    return sum(of_round(cfg["rounds"]["deploy"], n) for n in range(1, last_round(cfg) + 2))
+
+
+def imagined_iterations(cfg: Cfg) -> int:
+    """Iterations of RL whose episodes, if they were whole, would take as many steps as all rounds imagine."""
+    iterations = sum(of_round(cfg["rounds"]["iterations"], n) for n in range(1, last_round(cfg) + 1))
+    whole = cfg["task"]["horizon"] // cfg["task"]["chunk"]
+    share = min(1.0, (cfg["rl"]["chunks"] or whole) / whole)  # of a whole episode, has an imagined one
+    return max(1, round(iterations * share))
+
+
 def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
     data: list[str] = [graph.add("collect", collect.collect)]
     first = policy = best = graph.add("imitation", imitation.imitation, {"data": data})
+    starts = _extra_starts(graph, cfg) if with_rl else []
     made, known = World(), ""
     for number in range(1, last_round(cfg) + 1):
         deployed = _deploy(graph, cfg, policy, number)
@@ -93,7 +108,7 @@ def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
                 number=number,
             )
         if with_rl:
-            policy = _learn(graph, cfg, data, made, policy, number)
+            policy = _learn(graph, cfg, data, made, policy, number, starts)
     last = last_round(cfg) + 1
     policy, _ = _keep(graph, policy, _deploy(graph, cfg, policy, last), best, known, last)
     before = graph.add("evaluate-before", prove.evaluate_physics, {"policy": first})
@@ -115,12 +130,26 @@ def _keep(graph: Graph, policy: str, deployed: str, best: str, known: str, numbe
     return kept, kept
 
 
+def _extra_starts(graph: Graph, cfg: Cfg) -> list[str]:
+    """The stages that hold the first frames of which nothing more was recorded."""
+    section = cfg["extra_starts"]
+    out = [
+        graph.add(f"starts-{variant}", collect.first_frames, variant=variant)
+        for variant in section["variants"]
+    ]
+    if section["data"]:
+        mark = collect.fingerprint(section["data"], "extra_starts.data")
+        out.append(graph.add("starts-recorded", collect.recorded_starts, fingerprint=mark))
+    return out
+
+
 def _data_loop(graph: Graph, cfg: Cfg) -> None:
     mark = collect.fingerprint(cfg["task"]["data"])
     data = [graph.add("recordings", collect.recordings, fingerprint=mark)]
     made = _refresh(graph, cfg, data, World(), 1)
     first = graph.add("imitation", imitation.imitation, {"data": data})
-    policy = _learn(graph, cfg, data, made, first, 1, deployed=0)
+    starts = _extra_starts(graph, cfg)
+    policy = _learn(graph, cfg, data, made, first, 1, starts, deployed=0)
     _conclude(graph, data, made, first, policy, {})
 
 
@@ -137,8 +166,13 @@ def _refresh(graph: Graph, cfg: Cfg, data: list[str], before: World, number: int
         simulator = learning.add(f"student-{number}", world.student, roles, phase=phase)
     inputs = {"data": data, "simulator": simulator}
     state = graph.add(f"state-{number}", world.state, {**inputs, "warm": before.state}, phase=phase)
-    judge = graph.add(f"judge-{number}", world.judge, {**inputs, "warm": before.judge}, phase=phase)
-    return World(teacher, simulator, state, judge)
+    golden = ""
+    if "text_world" in cfg["judge"]:
+        roles = {"data": data, "warm": before.text_world}
+        golden = graph.add(f"text_world-{number}", world.text_world, roles, phase=phase)
+    roles = {**inputs, "warm": before.judge, "text_world": golden}
+    judge = graph.add(f"judge-{number}", world.judge, roles, phase=phase)
+    return World(teacher, simulator, state, judge, golden)
 
 
 def _learn(
@@ -148,13 +182,14 @@ def _learn(
     made: World,
     policy: str,
     number: int,
+    starts: list[str],
     deployed: int | None = None,
 ) -> str:
     """RL in the imagined world; `deployed` is the round whose successes anchor it, this one by default."""
     return graph.add(
         f"rl-{number}",
         rl.rl,
-        {"data": data, **made.roles(), "policy": policy},
+        {"data": data, "starts": starts, **made.roles(), "policy": policy},
         number=number,
         deployed=number if deployed is None else deployed,
         iterations=of_round(cfg["rounds"]["iterations"], number),

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from annotated_types import Ge, MinLen, MultipleOf
+from annotated_types import Ge, Gt, Lt, MinLen, MultipleOf
 
 from envs.ranges import Count, Discount, Natural, NonNegative, Positive, Seed, Share
 
@@ -93,6 +93,16 @@ class RoundsSection:
 
 
 @dataclass(frozen=True)
+class ExtraStartsSection:
+    """Section extra_starts."""
+
+    variants: Sequence[Name]
+    episodes: Count
+    data: Sequence[str] | str
+    share: Annotated[float, Gt(0), Lt(1)]
+
+
+@dataclass(frozen=True)
 class CloneSection:
     """Section clone."""
 
@@ -107,6 +117,16 @@ class JudgeFitSection:
 
     imagined: Natural
     fit: Fit
+
+
+@dataclass(frozen=True)
+class TextWorldFitSection:
+    """Section text_world_fit."""
+
+    stride: Count
+    tokenizer: Fit
+    first: Fit
+    refresh: Fit
 
 
 @dataclass(frozen=True)
@@ -169,6 +189,85 @@ class MeasureSection:
 
 
 @dataclass(frozen=True)
+class StudySection:
+    """Section study."""
+
+    rows: Annotated[Sequence[Name], MinLen(1)]
+    columns: Annotated[Sequence[Name], MinLen(1)]
+    seeds: Annotated[Sequence[Seed], MinLen(1)]
+    against: Sequence[Name]
+    only: Sequence[Name]
+    minutes: NonNegative | None
+    methods: Mapping[str, Mapping[str, Any]]
+    measures: Mapping[str, Choice]
+
+
+@dataclass(frozen=True)
+class RowSection:
+    """A section of study.methods."""
+
+    title: Name
+    changes: Sequence[Name]
+    seeds: Natural
+    policy: Choice
+
+
+@dataclass(frozen=True)
+class ImaginedSection:
+    """Section imagined."""
+
+    simulator: Name | None
+    state: Name | None
+    judge: Name | None
+    data: Sequence[str]
+
+
+@dataclass(frozen=True)
+class PolicyValueSection:
+    """Section policy_value."""
+
+    policies: Sequence[Name]
+    others: Mapping[Name, Choice] | None
+    noise: Sequence[Positive]
+    experts: Sequence[Share]
+    starts: Annotated[int, Ge(2)]
+    repeats: Count
+    stochastic: bool
+
+
+@dataclass(frozen=True)
+class LongSection:
+    """Section fidelity.long."""
+
+    frames: Natural
+    episodes: Count
+    noise_level: Share
+
+
+@dataclass(frozen=True)
+class FidelitySection:
+    """Section fidelity."""
+
+    episodes: Count
+    masks: Name | None
+    clip: Annotated[int, Ge(2)]
+    frames_extractor: Choice
+    clips_extractor: Choice
+    long: Mapping[str, Any]
+    grid: Mapping[Name, Annotated[Sequence[Any], MinLen(1)]] | None
+
+
+@dataclass(frozen=True)
+class SweepSection:
+    """Section sweep."""
+
+    episode: Natural
+    levels: Annotated[Sequence[float], MinLen(1)]
+    chunks: Count
+    pictures: Annotated[int, Ge(2)]
+
+
+@dataclass(frozen=True)
 class TrackSection:
     """Section track."""
 
@@ -210,6 +309,7 @@ class Top:
 
     name: Name
     seed: Seed
+    threads: Count
     runs: Name
     cameras: Literal["all", "main"] | Annotated[Sequence[str], MinLen(1)]
     microbatches: Count

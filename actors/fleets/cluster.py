@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import signal
 import socket
@@ -183,20 +184,37 @@ def _start(launch: Mapping[str, Any]) -> None:
 @contextmanager
 def _our_sigterm() -> Iterator[None]:
     """Within, Ray starts; it takes SIGTERM for itself, and would end a driver with status 15 where shells and
-    schedulers expect 143.
+    schedulers expect 143, or, where its C++ turns that end into an error, with 1. Whatever became of it, a
+    SIGTERM that came ends the process with 143.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.getsignal(signal.SIGTERM)
+    before, (told, tell) = signal.getsignal(signal.SIGTERM), os.pipe()
+    for end in (told, tell):
+        os.set_blocking(end, False)
+    listening = signal.set_wakeup_fd(tell, warn_on_full_buffer=False)  # told of signals, whoever handles them
+
+    def asked() -> bool:
+        try:
+            return signal.SIGTERM in os.read(told, 4096)
+        except BlockingIOError:  # none came
+            return False
+
     try:
         yield
-    except SystemExit as asked:
-        if asked.code == signal.SIGTERM:
-            raise SystemExit(128 + signal.SIGTERM) from None
+    except (SystemExit, Exception) as error:
+        if asked():
+            raise SystemExit(128 + signal.SIGTERM) from error
         raise
+    else:
+        if asked():
+            raise SystemExit(128 + signal.SIGTERM)
     finally:
+        signal.set_wakeup_fd(listening)
         signal.signal(signal.SIGTERM, before)
+        os.close(told)
+        os.close(tell)
 
 
 def _knock(address: str) -> None:

@@ -19,12 +19,13 @@ from actors.policies.contract import POLICY_FEATURES, VISUAL_FEATURES
 from actors.policies.heads import RESOLUTION, Head, varying
 from envs.encoders import MultiViewEncoder
 from envs.language import TextEncoder
-from envs.ranges import Count
+from envs.ranges import Count, Natural
 from envs.specs import CHUNK, IMAGE, INSTRUCTION_UTF8, LOG_PROB, STATE, WorldSpec
 from envs.targets import build
 
 _TEXT_FEATURES = 32
 _STATE_FEATURES = 64
+_WORDS = 64  # numbers that say what key-points shall look for
 
 
 class Perception(nn.Module):
@@ -32,13 +33,14 @@ class Perception(nn.Module):
 
     Args:
         spec: what the world shows.
-        points, width, cameras: of MultiViewEncoder.
+        points, width, cameras, asked: of MultiViewEncoder.
     """
 
-    def __init__(self, spec: WorldSpec, points: int, width: int, cameras: str | Sequence[str]):
+    def __init__(self, spec: WorldSpec, points: int, width: int, cameras: str | Sequence[str], asked: int):
         super().__init__()
-        self.views = MultiViewEncoder(spec, points, width, cameras=cameras)
+        self.views = MultiViewEncoder(spec, points, width, cameras=cameras, asked=asked, words=_WORDS)
         self.text = TextEncoder(_TEXT_FEATURES)
+        self.words = TextEncoder(_WORDS) if asked else None
         self.out_features = self.views.out_features + _TEXT_FEATURES
 
     def forward(self, image: Tensor, text: Tensor) -> Tensor:
@@ -46,8 +48,10 @@ class Perception(nn.Module):
         out_features].
         """
         lead = image.shape[:-4]
-        seen = self.views(image.reshape(-1, *image.shape[-4:]))
-        said = self.text(text.reshape(-1, text.shape[-1]))
+        flat = text.reshape(-1, text.shape[-1])
+        words = self.words(flat) if self.words is not None else None
+        seen = self.views(image.reshape(-1, *image.shape[-4:]), words)
+        said = self.text(flat)
         return torch.cat((seen, said), -1).reshape(*lead, -1)
 
 
@@ -90,6 +94,7 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         width: of the hidden vector.
         points, channels: key-points per view and width of the encoder.
         cameras: which it looks through: "all", "main", or names.
+        asked: key-points per view that look for what the instruction says.
 
     Reads image, state and the instruction's bytes; writes ("vla_action", "chunk") and its log-probability.
 
@@ -106,8 +111,9 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         points: Count,
         channels: Count,
         cameras: str | Sequence[str],
+        asked: Natural,
     ):
-        eyes = Perception(spec, points, channels, cameras)
+        eyes = Perception(spec, points, channels, cameras, asked)
         perception = TensorDictModule(eyes, in_keys=[IMAGE, INSTRUCTION_UTF8], out_keys=[VISUAL_FEATURES])
         fusion = TensorDictModule(
             Fusion(eyes.out_features, spec.state_dim, width),

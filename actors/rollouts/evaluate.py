@@ -13,25 +13,26 @@ from tqdm import tqdm
 
 from actors.policies.safe import SafePolicyWrapper
 from envs.rng import seed_process
-from envs.specs import JUDGE_STATUS, PROGRESS, SUCCESS, Status
+from envs.specs import JUDGE_STATUS, LOST, PROGRESS, SUCCESS, Status
 
 
 @dataclass
 class Outcome:
     """Results per episode, in the order of the seeds.
 
-    success bool [N], progress float [N], judged bool [N]: whether a judge gave a judgement.
+    success bool [N], progress float [N], counted bool [N]: whether that can be told: a judge gave a
+    judgement, physics did not crash.
     """
 
     seeds: list[int]
     success: Tensor
     progress: Tensor
-    judged: Tensor
+    counted: Tensor
 
     @property
     def rate(self) -> float:
-        """Share of successes among the episodes that could be judged."""
-        return float(self.success[self.judged].float().mean()) if self.judged.any() else float("nan")
+        """Share of successes among the episodes that count."""
+        return float(self.success[self.counted].float().mean()) if self.counted.any() else float("nan")
 
 
 @torch.no_grad()
@@ -58,7 +59,7 @@ def evaluate(
     width = env.batch_size[0]
     steps = base.horizon // base.chunk
     actor = SafePolicyWrapper(policy, base.spec, base.mode)
-    success, progress, judged = [], [], []
+    success, progress, counted = [], [], []
     seed_process(sampling_seed)
     mode = ExplorationType.RANDOM if stochastic else ExplorationType.DETERMINISTIC
     with set_exploration_type(mode):
@@ -80,11 +81,13 @@ def evaluate(
                 reached = torch.where(live, result[PROGRESS].squeeze(-1).cpu(), reached)
                 if JUDGE_STATUS in result.keys(True, True):
                     fine &= ~(live & (result[JUDGE_STATUS].squeeze(-1).cpu() != Status.OK.value))
+                if LOST in result.keys(True, True):
+                    fine &= ~(live & result[LOST].squeeze(-1).cpu())
                 over |= result["done"].squeeze(-1).cpu()
                 if over.all():
                     break
                 now = step_mdp(after, exclude_reward=True, exclude_done=True)
             success.append(won[: len(part)])
             progress.append(reached[: len(part)])
-            judged.append(fine[: len(part)])
-    return Outcome(list(seeds), torch.cat(success), torch.cat(progress), torch.cat(judged))
+            counted.append(fine[: len(part)])
+    return Outcome(list(seeds), torch.cat(success), torch.cat(progress), torch.cat(counted))

@@ -44,6 +44,7 @@ from envs.specs import (
     INVALID_ACTION,
     JUDGE_STATUS,
     LOG_PROB,
+    LOST,
     STATE,
     SUCCESS,
 )
@@ -113,7 +114,7 @@ class Host:
             EPISODE,
         ]
         self._after: list[NestedKey] = [
-            *("reward", "done", "terminated", "truncated", SUCCESS, STATE, JUDGE_STATUS),
+            *("reward", "done", "terminated", "truncated", SUCCESS, STATE, JUDGE_STATUS, LOST),
             *([IMAGE, INSTRUCTION_UTF8] if bootstrap and self._features is None else []),
         ]
         # What is built by now stays; looking through it for garbage again and again took a tenth of a

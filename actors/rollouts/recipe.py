@@ -39,6 +39,7 @@ class Recipe:
         simulator, decoder, judge: weights of the imagined world; without a simulator it is physics.
         data: data sets in whose episodes imagination begins.
         inside: numbers of the episodes anywhere inside which it begins; none for all first frames.
+        first: numbers of the episodes at whose first frames it begins beside those.
         horizon: control steps of an imagined episode; 0 for the task's.
         freeze_perception, bootstrap: see RLConfig and Host.
         later: let rewards arrive after the episode, see JudgeReward.
@@ -53,6 +54,7 @@ class Recipe:
     judge: str = ""
     data: tuple[str, ...] = ()
     inside: tuple[int, ...] = ()
+    first: tuple[int, ...] = ()
     horizon: int = 0
     freeze_perception: bool = False
     bootstrap: bool = True
@@ -101,7 +103,10 @@ def build_host(recipe: Recipe) -> Host:
     else:
         judge = build_judge(cfg, Path(recipe.judge))
     store = open_clips(cfg, [Path(folder) for folder in recipe.data])
-    starts = DecisionPoints(store, torch.tensor(recipe.inside)) if recipe.inside else InitialStates.of(store)
+    starts = InitialStates.of(store)
+    if recipe.inside:
+        first = torch.tensor(recipe.first, dtype=torch.int64)
+        starts = DecisionPoints(store, torch.tensor(recipe.inside), first)
     world = build_world(
         cfg, simulator, decoder, judge, starts, recipe.episodes, recipe.later, recipe.horizon or None
     )
@@ -110,6 +115,6 @@ def build_host(recipe: Recipe) -> Host:
 
 def build_host_process(plain: Mapping[str, Any]) -> Host:
     """build_host in a process of its own, from the wire's form of a recipe."""
-    recipe = Recipe(**{**plain, **{name: tuple(plain[name]) for name in ("data", "inside")}})
+    recipe = Recipe(**{**plain, **{name: tuple(plain[name]) for name in ("data", "inside", "first")}})
     prepare_process(0, recipe.config["rl"]["threads"])
     return build_host(recipe)

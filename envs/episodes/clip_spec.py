@@ -15,6 +15,7 @@ class ClipSpec:
         chunks: consecutive chunks per clip, L.
         stride: frames between two frames of the clip.
         history: consecutive commands and states up to now, H; 0 is as many as `memory`.
+        recent: whether memory is the newest frames instead, the first repeated where there are fewer.
     """
 
     memory: int = 4
@@ -22,3 +23,4 @@ class ClipSpec:
     chunks: int = 1
     stride: int = 1
     history: int = 0
+    recent: bool = False

@@ -20,7 +20,7 @@ from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.columns import Columns
 from envs.episodes.episode import EpisodeError
 from envs.episodes.splits import range_of
-from envs.specs import WorldSpec, memory_indices, text_to_bytes
+from envs.specs import WorldSpec, memory_indices, recent_indices, text_to_bytes
 
 
 class ClipStore:
@@ -179,6 +179,15 @@ class ClipStore:
         last = self.length[episodes][:, None] - 1
         return self.start[episodes][:, None] + torch.minimum(ahead, last), ahead <= last
 
+    def success(self, episodes: Tensor, rows: Tensor) -> Tensor:
+        """Whether the task is done in frames `rows` [B, ...] of `episodes` [B], float32 [B, ...]; NaN where
+        nobody labelled the episode.
+        """
+        if "success" not in self.arrays:
+            return torch.full(rows.shape, torch.nan)
+        labelled = self.arrays["labelled"][episodes].reshape(-1, *[1] * (rows.ndim - 1))
+        return torch.where(labelled, self.arrays["success"][rows].float(), torch.nan)
+
     # -- what simulators take
     def first(self, episodes: Tensor) -> TensorDict:
         """The first frames of episodes [E] with all that Simulator.reset takes."""
@@ -231,11 +240,12 @@ class ClipStore:
 
         Returns:
             TensorDict [B] with memory (index [L, M], frames uint8 [L, M, V, 3, H, W], commands [L, M, A]),
-            future (frames uint8 [L*K, V, 3, H, W], commands [L*K, A], states [L*K, S], valid bool [L*K]), now
-            (command [A], state [S]), history (commands, states [spec.history, ...]), begin []; memory and
-            future have c2w [..., V, 4, 4] too, and the clip intrinsic [V, 3, 3], if the robot is calibrated,
-            and pose_map uint8 [..., V, 3, H, W] if the spec asks for it. Frames past the episode's end repeat
-            its last; they and frames without a picture are not valid.
+            future (frames uint8 [L*K, V, 3, H, W], commands [L*K, A], states [L*K, S], valid bool [L*K],
+            success float32 [L*K], NaN where nobody labelled the episode), now (command [A], state [S]),
+            history (commands, states [spec.history, ...]), begin [], stride int64 []; memory and future have
+            c2w [..., V, 4, 4] too, and the clip intrinsic [V, 3, 3], if the robot is calibrated, and pose_map
+            uint8 [..., V, 3, H, W] if the spec asks for it. Frames past the episode's end repeat its last;
+            they and frames without a picture are not valid.
         """
         total = spec.chunks * spec.chunk
         last, base, size = self.length[episode] - 1, self.start[episode], episode.shape
@@ -243,35 +253,59 @@ class ClipStore:
         rows = base[:, None] + torch.minimum(ahead, last[:, None])
         # frames before each chunk, in strides
         past = begin[:, None] // spec.stride + spec.chunk * torch.arange(spec.chunks)
-        index = memory_indices(past + 1, spec.memory)  # [B, L, M], in strides from `begin % stride`
+        chosen = recent_indices if spec.recent else memory_indices
+        index = chosen(past + 1, spec.memory)  # [B, L, M], in strides from `begin % stride`
         at = (begin % spec.stride)[:, None, None] + index * spec.stride
         memory = base[:, None, None] + torch.minimum(at, last[:, None, None])
         recent = begin[:, None] - spec.stride * torch.arange((spec.history or spec.memory) - 1, -1, -1)
         before, now = base[:, None] + recent.clamp(min=0), base + begin
-        commands, states = self.arrays["commands"], self.arrays["states"]
+        states = self.arrays["states"]
         remembered = {
             "index": index,
             "frames": self.frames(memory),
-            "commands": commands[memory],
+            "commands": self.commands(memory, base, spec.stride),
             **self._conditioning(memory),
         }
         future = {
             "frames": self.frames(rows),
-            "commands": commands[rows],
+            "commands": self.commands(rows, base, spec.stride),
             "states": states[rows],
             "valid": (ahead <= last[:, None]) & self.arrays["present"][rows],
+            "success": self.success(episode, rows),
             **self._conditioning(rows),
         }
         out = {
             "memory": TensorDict(remembered, size),
             "future": TensorDict(future, size),
-            "now": TensorDict({"command": commands[now], "state": states[now]}, size),
-            "history": TensorDict({"commands": commands[before], "states": states[before]}, size),
+            "now": TensorDict({"command": self.commands(now, base, spec.stride), "state": states[now]}, size),
+            "history": TensorDict(
+                {"commands": self.commands(before, base, spec.stride), "states": states[before]}, size
+            ),
             "begin": begin // spec.stride,
+            "stride": torch.full(size, spec.stride),
         }
         if self.spec.embodiment.calibrated:
             out["intrinsic"] = self.intrinsic[episode]
         return TensorDict(out, size)
+
+    def commands(self, rows: Tensor, first: Tensor, stride: int) -> Tensor:
+        """Commands [*rows.shape, A] of rows [B, ...] of which one in `stride` is shown: those in force there,
+        of changes the sum since the row shown before. Grippers are as they are at the row.
+
+        Args:
+            first: rows [B] of the episodes' first frames, before which nothing was commanded.
+        """
+        commands, robot = self.arrays["commands"], self.spec.embodiment
+        out = commands[rows]
+        if not robot.delta or stride == 1:
+            return out
+        summed = torch.ones(robot.action_dim, dtype=torch.bool)
+        summed[list(robot.grippers)] = False
+        begin = first.reshape(-1, *[1] * (rows.ndim - 1))
+        for back in range(1, stride):
+            earlier = rows - back
+            out = out + (earlier >= begin)[..., None] * summed * commands[earlier.clamp(min=0)]
+        return out
 
     def sample(self, episodes: Tensor, count: int, spec: ClipSpec, generator: torch.Generator) -> TensorDict:
         """`count` random clips of the given episodes, every frame that has a successor being equally likely

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
@@ -16,6 +16,7 @@ class WriteBehind:
 
     Args:
         writer: writes the shards, in the order of the calls.
+        after: called when one is there, in that thread.
 
     Examples:
         >>> with WriteBehind(writer) as behind:
@@ -23,15 +24,19 @@ class WriteBehind:
         ...         behind.write(episodes(batch))
     """
 
-    def __init__(self, writer: LeRobotWriter):
-        self.writer = writer
+    def __init__(self, writer: LeRobotWriter, after: Callable[[], object] = lambda: None):
+        self.writer, self.after = writer, after
         self._thread = ThreadPoolExecutor(1)
         self._pending: Future[None] | None = None
 
     def write(self, episodes: Sequence[Episode]) -> None:
         """Begin to write a shard; waits for the one before."""
         self._wait()
-        self._pending = self._thread.submit(self.writer.write, episodes)
+        self._pending = self._thread.submit(self._write, episodes)
+
+    def _write(self, episodes: Sequence[Episode]) -> None:
+        self.writer.write(episodes)
+        self.after()
 
     def _wait(self) -> None:
         pending, self._pending = self._pending, None

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from envs.encoders import MultiViewEncoder, to_signed
 from envs.judges.base import Judge, Judgement, judgement_status
 from envs.language import TextEncoder
-from envs.ranges import Count, Discount, Share
+from envs.ranges import Count, Discount, Natural, Share
 from envs.specs import Status, WorldSpec, text_to_bytes
 
 _AT_ONCE = 512  # frames per forward pass of `score`, so that long clips of many episodes fit into memory
@@ -37,6 +37,7 @@ class LearnedJudge(Judge):
         points: soft key-points of the encoder.
         text: size of the encoded instruction.
         hidden: width of the last layers.
+        asked: key-points per view that look for what the instruction says.
     """
 
     def __init__(
@@ -50,10 +51,14 @@ class LearnedJudge(Judge):
         text: Count,
         hidden: Count,
         cameras: str | Sequence[str],
+        asked: Natural,
     ):
         super().__init__(hold)
         self.spec, self.margin, self.discount = spec, margin, discount
-        self.encoder = MultiViewEncoder(spec, points, width, pictures=2, cameras=cameras)
+        self.encoder = MultiViewEncoder(
+            spec, points, width, pictures=2, cameras=cameras, asked=asked, words=text
+        )
+        self.asked = asked
         self.words = TextEncoder(text)
         self.head = nn.Sequential(
             nn.Linear(self.encoder.out_features + text, hidden),
@@ -72,8 +77,9 @@ class LearnedJudge(Judge):
         """
         bytes_alone = frames.dtype == first.dtype == torch.uint8  # the encoder converts what it looks at
         both = (frames, first) if bytes_alone else (to_signed(frames), to_signed(first))
-        seen = self.encoder(torch.cat(both, 2))
-        success, progress = self.head(torch.cat((seen, self.words(text)), -1)).float().unbind(-1)
+        words = self.words(text)
+        seen = self.encoder(torch.cat(both, 2), words if self.asked else None)
+        success, progress = self.head(torch.cat((seen, words), -1)).float().unbind(-1)
         return success, progress
 
     @torch.no_grad()

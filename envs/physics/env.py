@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary
 
 from envs.chunked import ChunkedEnv
-from envs.physics.pool import TaskPool, Track
+from envs.physics.pool import PoolError, TaskPool, Track
 from envs.specs import (
     C2W,
     CHUNK,
     COMMAND,
     IMAGE,
     INTRINSIC,
+    LOST,
     PROGRESS,
     STATE,
     SUCCESS,
@@ -31,6 +33,8 @@ from envs.specs import (
 
 class PhysicsEnv(ChunkedEnv):
     """A batch of true episodes; rewards and success come from the suite.
+
+    An episode that the pool gives up is LOST, and ends with the observation before.
 
     Args:
         pool: a slot per episode side by side, B of them, which this world then owns; the suite's cameras must
@@ -65,12 +69,23 @@ class PhysicsEnv(ChunkedEnv):
         self.pool, self.rewards, self.record = pool, rewards, record
         self.tracks: deque[Track] = deque()
         self._rows: dict[int, dict[str, Any]] = {}
+        self._lost = torch.zeros(pool.slots, 1, dtype=torch.bool)
+
+    def _set_specs(self) -> None:
+        super()._set_specs()
+        self.observation_spec[LOST] = Binary(1, (*self.batch_size, 1), dtype=torch.bool)
+        self._observation_keys.append(LOST)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         mask = self._reset_mask(tensordict)
         seeds = self._next_seeds(mask)
         slots = mask.nonzero().flatten().tolist()
-        self._take(self.pool.reset({slot: int(seeds[slot]) for slot in slots}, self.record))
+        self._lost[mask] = False
+        self._take(self.pool.reset({slot: int(seeds[slot]) for slot in slots}, self.record), slots)
+        if not self._rows:
+            raise PoolError(f"physics crashes at the start of the episodes of seeds {seeds[slots].tolist()}")
+        for slot in slots:  # another's picture stands for an episode that has none
+            self._rows.setdefault(slot, next(iter(self._rows.values())))
         self._check(self._rows[slots[0]])
         self._steps[mask] = 0
         self._over[mask] = False
@@ -85,14 +100,15 @@ class PhysicsEnv(ChunkedEnv):
         check_chunk(chunk, self.spec.embodiment)
         commands = to_commands(chunk.detach().cpu(), self._last[COMMAND], self.mode).double().numpy()
         before, was_over = self._last[PROGRESS], self._over
-        self._take(self.pool.step(dict(enumerate(commands))))
+        slots = (~self._lost).flatten().nonzero().flatten().tolist()
+        self._take(self.pool.step({slot: commands[slot] for slot in slots}), slots)
         self._steps += self.spec.chunk
         self._last = self._observation()
         out = self._last.clone()
         success = out[SUCCESS]
         out["reward"] = self.rewards(before, out[PROGRESS], success & ~was_over)
         out["terminated"] = success.clone()
-        out["truncated"] = (self._steps >= self.horizon).unsqueeze(-1) & ~success
+        out["truncated"] = ((self._steps >= self.horizon).unsqueeze(-1) | self._lost) & ~success
         out["done"] = out["terminated"] | out["truncated"]
         self._over = out["done"].clone()
         return out
@@ -111,7 +127,10 @@ class PhysicsEnv(ChunkedEnv):
                     " spec from this suite's embodiment, with task.size equal to task.suite.size"
                 )
 
-    def _take(self, observed: dict[int, dict[str, Any]]) -> None:
+    def _take(self, observed: dict[int, dict[str, Any]], asked: Sequence[int]) -> None:
+        """Keep what the pool says of the slots that it was `asked` for."""
+        for slot in asked:
+            self._lost[slot] = slot not in observed
         for slot, values in observed.items():
             track = values.pop("track", None)
             if track is not None:
@@ -131,7 +150,8 @@ class PhysicsEnv(ChunkedEnv):
         if self.spec.embodiment.calibrated:
             out[INTRINSIC] = stack("intrinsic").float()
             out[C2W] = stack("c2w").float()
-        out[SUCCESS] = stack("success").unsqueeze(-1)
+        out[LOST] = self._lost.clone()
+        out[SUCCESS] = stack("success").unsqueeze(-1) & ~self._lost
         out[PROGRESS] = stack("progress").float().unsqueeze(-1)
         return self._with_identity(out, [row["instruction"] for row in rows])
 

@@ -177,6 +177,11 @@ class MetaWorld(TaskSuite):
         """Pictures with shadows, of any size."""
         return self._render(size, True)
 
+    def segment(self) -> NDArray[np.uint8]:
+        """See TaskSuite.segment."""
+        offscreen = offscreen_for(self._task, self._env.model, self.size)
+        return offscreen.segment(self._env.model, self._env.data, self._views)
+
     def observe(self) -> Observation:
         """Hand, gripper, and how the task stands; progress is a tenth of Meta-World's shaped reward."""
         intrinsic, c2w = None, None

@@ -142,6 +142,11 @@ class OGBench(TaskSuite):
         """Pictures with shadows, of any size."""
         return self._render(size, True)
 
+    def segment(self) -> NDArray[np.uint8]:
+        """See TaskSuite.segment."""
+        offscreen = offscreen_for(f"ogbench/{self._scene}", self._env._model, self.size)
+        return offscreen.segment(self._env._model, self._env._data, self._views)
+
     def observe(self) -> Observation:
         """Hand, gripper, and how the task stands; progress is the share of the target's distance made up."""
         intrinsic, c2w = None, None

@@ -84,6 +84,62 @@ class Offscreen:
             out[k] = whole[::-1].transpose(2, 0, 1)
         return out
 
+    def segment(
+        self, model: mujoco.MjModel, data: mujoco.MjData, views: tuple[str, ...]
+    ) -> NDArray[np.uint8]:
+        """What each pixel shows, uint8 [V, H, W] of PARTS, by the geom that is drawn there."""
+        self._gl.make_current()
+        kinds, fine = parts_of(model), self._fine
+        out = []
+        flags = (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR)
+        for view in views:
+            self._camera.fixedcamid = model.camera(view).id
+            mujoco.mjv_updateScene(
+                model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
+            )
+            for flag in flags:
+                self._scene.flags[flag] = 1
+            mujoco.mjr_render(self._rect, self._scene, self._context)
+            mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
+            for flag in flags:
+                self._scene.flags[flag] = 0
+            colours = self._pixels.astype(np.int64) @ (
+                1,
+                256,
+                65536,
+            )  # number of what is drawn, 0 for nothing
+            drawn = np.zeros(self._scene.ngeom + 1, np.uint8)
+            for geom in self._scene.geoms[: self._scene.ngeom]:
+                if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and 0 <= geom.segid < self._scene.ngeom:
+                    drawn[geom.segid + 1] = kinds[geom.objid]
+            colours[colours > self._scene.ngeom] = 0
+            out.append(drawn[colours][::-1][::fine, ::fine])
+        return np.stack(out)
+
+
+PARTS = {"background": 0, "arm": 1, "object": 2}  # what a pixel may show
+
+
+def parts_of(model: mujoco.MjModel) -> NDArray[np.uint8]:
+    """What each geom belongs to, uint8 [G] of PARTS: a robot, which has motors; a thing that can move; or
+    what stands still.
+    """
+    joints = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0]
+    tendons = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, 0]
+    for tendon in tendons:
+        begin, count = model.tendon_adr[tendon], model.tendon_num[tendon]
+        wrapped = slice(begin, begin + count)
+        joints = np.concatenate(
+            (joints, model.wrap_objid[wrapped][model.wrap_type[wrapped] == mujoco.mjtWrap.mjWRAP_JOINT])
+        )
+    driven = {int(model.body_rootid[model.jnt_bodyid[joint]]) for joint in joints}
+    moving = {int(model.body_rootid[body]) for body in model.jnt_bodyid}
+    roots = model.body_rootid[model.geom_bodyid]
+    kinds = [
+        PARTS["arm" if root in driven else "object" if root in moving else "background"] for root in roots
+    ]
+    return np.array(kinds, np.uint8)
+
 
 _CONTEXTS: dict[tuple[str, tuple[int, int]], Offscreen] = {}
 

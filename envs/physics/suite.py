@@ -113,6 +113,12 @@ class TaskSuite(ABC):
             ValueError: if the noise level lies outside [0, 1].
         """
 
+    def segment(self) -> NDArray[np.uint8] | None:
+        """What each pixel of `render` shows, uint8 [V, H, W]: 0 what stands still, 1 the robot, 2 things that
+        can move; None of suites that do not know. For evaluation alone.
+        """
+        return None
+
     def picture(self, size: tuple[int, int]) -> NDArray[np.uint8]:
         """Pictures for people to look at, uint8 [V, 3, H, W]; suites that can render `size` do."""
         return self.render()

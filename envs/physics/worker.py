@@ -162,6 +162,25 @@ class Worker:
             out.append(track)
         return out
 
+    def segment(self, jobs: list[tuple[int, Array]]) -> list[tuple[NDArray[np.uint8] | None, Array]]:
+        """For episodes that are repeated from (seed, commands [T, A]), of which the first is in force at the
+        start: what each pixel shows, uint8 [T, V, H, W] (TaskSuite.segment), None of suites that do not know;
+        and pictures uint8 [2, V, 3, H, W] of the first and the last frame, by which one sees whether it is
+        the same episode.
+        """
+        out = []
+        suite = self.slots[0].suite
+        for seed, commands in jobs:
+            self._lay_out(suite, seed)
+            labels, pictures = [suite.segment()], [suite.render()]
+            for command in commands[1:]:
+                suite.step(command)
+                labels.append(suite.segment())
+            pictures.append(suite.render())
+            known = [one for one in labels if one is not None]
+            out.append((np.stack(known) if len(known) == len(labels) else None, np.stack(pictures)))
+        return out
+
     def picture(self, seed: int, size: tuple[int, int]) -> NDArray[np.uint8]:
         """Pictures for people of an episode's start, uint8 [V, 3, H, W]."""
         suite = self.slots[0].suite

@@ -38,16 +38,18 @@ class Simulator(nn.Module):
 
     Args:
         spec: what it shows of which robot.
-        memory_frames: sparse memory frames, M; the first frame is always one of them.
+        memory_frames: memory frames, M; of sparse ones the first frame is always one.
 
     Attributes:
         feature_shape: of the features that state experts read, without the batch.
         hidden: names of the layers that optimisers may take for hidden ones (training/optimisers.py);
             none for all.
+        recent_memory: whether memory is the newest frames instead of some that are spread over the past.
     """
 
     feature_shape: tuple[int, ...]
     hidden: tuple[str, ...] = ()
+    recent_memory: bool = False
 
     def __init__(self, spec: WorldSpec, memory_frames: int):
         super().__init__()
@@ -70,7 +72,8 @@ class Simulator(nn.Module):
                 future: commands [K, A], and pose_map, c2w likewise;
                 now: command [A], state [S];
                 intrinsic [V, 3, 3] in pixels, if cameras are calibrated;
-                seed int64 [], chunk_index int64 [].
+                seed int64 [], chunk_index int64 [];
+                stride int64 [], the robot's frames from one frame to the next, here and in memory.
 
         Returns:
             frames uint8 [B, K, V, 3, H, W] and features float32 [B, *feature_shape] for the state expert.
@@ -128,14 +131,16 @@ class Simulator(nn.Module):
         """
 
     def recall(self, state: TensorDict, future: TensorDict) -> TensorDict:
-        """Memory for the next chunk, [B, M, ...]: evenly spread over the past, with the first frame."""
-        return memory.recall(state, self.memory_frames)
+        """Memory for the next chunk, [B, M, ...]: evenly spread over the past, with the first frame, or the
+        newest ones.
+        """
+        return memory.recall(state, self.memory_frames, self.recent_memory)
 
     def release(self, state: TensorDict, mask: Tensor) -> None:
         """The sessions of `mask` [B] end; what is held for them elsewhere can go. Here nothing is."""
 
     # -- the contract
-    def reset(self, first: TensorDict, seed: Tensor, capacity: int = 1) -> TensorDict:
+    def reset(self, first: TensorDict, seed: Tensor, capacity: int = 1, stride: int = 1) -> TensorDict:
         """Begin sessions from first frames.
 
         Args:
@@ -145,24 +150,30 @@ class Simulator(nn.Module):
             seed: int64 [B].
             capacity: frames to keep room for, where it is known how long sessions last; longer ones make
                 more.
+            stride: the robot's frames from one generated frame to the next: a chunk covers so many times
+                more time. Commands are then those of the frames that are shown, of changes their sums.
 
         Returns:
             The sessions' state, a TensorDict [B].
         """
-        return self.resume(first.unsqueeze(1), torch.ones(len(first), dtype=torch.int64), seed, capacity)
+        return self.resume(
+            first.unsqueeze(1), torch.ones(len(first), dtype=torch.int64), seed, capacity, stride
+        )
 
-    def resume(self, past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1) -> TensorDict:
+    def resume(
+        self, past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1, stride: int = 1
+    ) -> TensorDict:
         """Begin sessions that go on from recorded frames.
 
         Args:
             past: TensorDict [B, P] with what `reset` takes of a first frame, of every frame so far.
             length: int64 [B], how many of them there are, in 1..P.
-            seed, capacity: see reset.
+            seed, capacity, stride: see reset; `past` has one frame in `stride`.
 
         Returns:
             The sessions' state, a TensorDict [B].
         """
-        return memory.new_sessions(past, length, seed, capacity)
+        return memory.new_sessions(past, length, seed, capacity, stride)
 
     @torch.no_grad()
     def step(self, state: TensorDict, future: TensorDict) -> tuple[Tensor, Tensor, TensorDict]:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
 from envs.specs import WorldSpec
+
+if TYPE_CHECKING:
+    from envs.simulators.base import Simulator
 
 
 def build_inputs(
@@ -48,9 +53,25 @@ def build_inputs(
             "now": TensorDict(now, size),
             "seed": seed.to(clip.device),
             "chunk_index": zero.to(clip.device),
+            "stride": clip["stride"],
         },
         size,
     )
     if "intrinsic" in clip.keys():
         inputs["intrinsic"] = clip["intrinsic"]
     return inputs
+
+
+def own_frames(simulator: Simulator, clip: TensorDict, generator: torch.Generator) -> tuple[int, TensorDict]:
+    """A chunk of a clip, any of those that are not wholly past the end of every episode, and its inputs,
+    whose memory shows the simulator's own frames of the chunks before it.
+    """
+    chunk = simulator.spec.chunk
+    whole = clip["future", "valid"].bool().any(0).unflatten(0, (-1, chunk)).any(1)
+    chosen = int(torch.randint(max(1, int(whole.long().sum())), (1,), generator=generator))
+    own: Tensor | None = None
+    for number in range(chosen):
+        with torch.no_grad():
+            frames = simulator.predict(build_inputs(simulator.spec, clip, number, own, generator))[0]
+        own = frames if own is None else torch.cat([own, frames], 1)
+    return chosen, build_inputs(simulator.spec, clip, chosen, own, generator)

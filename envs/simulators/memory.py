@@ -2,8 +2,8 @@
 from.
 
 The state of B sessions is a TensorDict [B]: history (rows of frames, commands, states, and pose_map, c2w
-where there are any), length int64, intrinsic if cameras are calibrated, seed int64, chunk_index int64. Rows
-of the history past a session's length hold anything and are never read.
+where there are any), length int64, intrinsic if cameras are calibrated, seed, chunk_index and stride int64.
+Rows of the history past a session's length hold anything and are never read.
 """
 
 from __future__ import annotations
@@ -14,14 +14,16 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.specs import memory_indices
+from envs.specs import memory_indices, recent_indices
 
 # What a first frame or a chunk brings, by its name there, and the history's name for it.
 _FIRST = {"frames": "frames", "command": "commands", "state": "states", "pose_map": "pose_map", "c2w": "c2w"}
 _MEMORY = ("frames", "commands", "pose_map", "c2w")
 
 
-def new_sessions(past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1) -> TensorDict:
+def new_sessions(
+    past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1, stride: int = 1
+) -> TensorDict:
     """The state of sessions that go on from `past` [B, P]; see Simulator.resume."""
     size, device = past.shape[:1], past["frames"].device
     rows = {_FIRST[name]: value for name, value in past.items() if name in _FIRST}
@@ -31,6 +33,7 @@ def new_sessions(past: TensorDict, length: Tensor, seed: Tensor, capacity: int =
             "length": length.to(device, copy=True),
             "seed": seed.reshape(size).to(device),
             "chunk_index": torch.zeros(size, dtype=torch.int64, device=device),
+            "stride": torch.full(size, stride, device=device),
         },
         size,
     )
@@ -39,11 +42,14 @@ def new_sessions(past: TensorDict, length: Tensor, seed: Tensor, capacity: int =
     return state
 
 
-def recall(state: TensorDict, count: int) -> TensorDict:
-    """`count` remembered frames and what belongs to them, [B, M, ...], evenly spread, the first included."""
+def recall(state: TensorDict, count: int, newest: bool = False) -> TensorDict:
+    """`count` remembered frames and what belongs to them, [B, M, ...]: evenly spread, the first included, or
+    the newest ones.
+    """
     history = state["history"]
     known = history.select(*(name for name in _MEMORY if name in history.keys()))
-    return _pick(known, memory_indices(state["length"], count))
+    chosen = recent_indices if newest else memory_indices
+    return _pick(known, chosen(state["length"], count))
 
 
 def build_inputs(state: TensorDict, remembered: TensorDict, future: TensorDict) -> TensorDict:
@@ -56,6 +62,7 @@ def build_inputs(state: TensorDict, remembered: TensorDict, future: TensorDict) 
             "now": TensorDict({"command": now["commands"], "state": now["states"]}, state.shape),
             "seed": state["seed"],
             "chunk_index": state["chunk_index"],
+            "stride": state["stride"],
         },
         state.shape,
     )

@@ -13,7 +13,7 @@ from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
 
 from envs.ranges import Count, Natural, NonNegative, Positive, Share
-from envs.specs import CHUNK, INVALID_ACTION, JUDGE_STATUS, LOG_PROB, Status
+from envs.specs import CHUNK, INVALID_ACTION, JUDGE_STATUS, LOG_PROB, LOST, Status
 
 
 @dataclass(frozen=True)
@@ -161,9 +161,16 @@ def finite(batch: TensorDict) -> Tensor:
     return ~_episodes_with(batch[INVALID_ACTION].squeeze(-1), batch["next", "done"].squeeze(-1))
 
 
+def whole(batch: TensorDict) -> Tensor:
+    """Which steps [B, T] belong to episodes in which physics, if it is that, did not crash."""
+    if LOST not in batch["next"].keys(True, True):
+        return torch.ones(batch.shape, dtype=torch.bool, device=batch.device)
+    return ~_episodes_with(batch["next", LOST].squeeze(-1), batch["next", "done"].squeeze(-1))
+
+
 def sound(batch: TensorDict) -> Tensor:
     """Which steps [B, T] may be learned from."""
-    return judged(batch) & finite(batch)
+    return judged(batch) & finite(batch) & whole(batch)
 
 
 def _episodes_with(bad: Tensor, done: Tensor) -> Tensor:

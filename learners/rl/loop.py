@@ -53,7 +53,8 @@ def train_rl(
     Args:
         fleet: hosts of config.envs / config.shards episodes each; the policy's trained tensors are published
             to it. Of several workers only the leading one has one.
-        starts: number of start frames in imagination; in physics, the seeds that may be used.
+        starts: number of start frames in imagination, or their numbers, some more often than others; in
+            physics, the seeds that may be used.
         folder: receives checkpoints, metrics.jsonl and learned.jsonl, the jobs that were learned from; a
             checkpoint found there is resumed.
         true: what RLConfig.recorded and RLConfig.anchor speak of.
@@ -157,10 +158,14 @@ def train_rl(
             episodes += int(done.sum() + (~done[:, -1]).sum())
             ledger.settle(
                 len(batch),
-                {"judge": int(figures["dropped_by_judge"]), "NaN actions": int(figures["dropped_nan"])},
+                {
+                    "judge": int(figures["dropped_by_judge"]),
+                    "NaN actions": int(figures["dropped_nan"]),
+                    "physics": int(figures["dropped_by_physics"]),
+                },
             )
             if feed is not None:
-                feed.check_losses("judges that gave no verdict, or a policy that says NaN")
+                feed.check_losses("judges that gave no verdict, a policy that says NaN, physics that crashes")
             figures |= supply | {"time/rollout": collected - began, "time/update": updated - collected}
             if feed is not None:
                 figures["time/actors_idle_share"] = max(

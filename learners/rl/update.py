@@ -13,7 +13,7 @@ from torch import Tensor
 from actors.policies.contract import device_of
 from envs.rng import order_generator, step_generator
 from envs.specs import SUCCESS
-from learners.rl.algorithm import Algorithm, RLConfig, finite, first_episode, judged
+from learners.rl.algorithm import Algorithm, RLConfig, finite, first_episode, judged, whole
 from learners.rl.recorded import TrueExperience
 from learners.training.fit import TrainingDiverged
 from learners.training.parallel import Trainee, averaged, clip_gradients, my_share
@@ -104,14 +104,15 @@ def outcome(batch: TensorDict) -> dict[str, float]:
     something has.
     """
     done, success = batch["next", "done"].squeeze(-1), batch["next", SUCCESS].squeeze(-1)
-    mine, said = first_episode(done), finite(batch)[:, 0]
-    kept = said & judged(batch)[:, 0]
+    mine, stood, said = first_episode(done), whole(batch)[:, 0], finite(batch)[:, 0]
+    kept = stood & said & judged(batch)[:, 0]
     reward = (batch["next", "reward"].squeeze(-1) * mine).sum(1)[kept]
     there = bool(kept.any())
     return {
         "success": float((success & mine).any(1)[kept].float().mean()) if there else 0.0,
         "return": float(reward.mean()) if there else 0.0,
         "reward_std": float(reward.std(unbiased=False)) if there else 0.0,
-        "dropped_nan": float((~said).sum()),
-        "dropped_by_judge": float((said & ~kept).sum()),
+        "dropped_by_physics": float((~stood).sum()),
+        "dropped_nan": float((stood & ~said).sum()),
+        "dropped_by_judge": float((stood & said & ~kept).sum()),
     }

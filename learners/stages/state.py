@@ -90,7 +90,11 @@ class _Features:
     ):
         self.decoder, self.simulator, self.store, self.episodes = decoder, simulator, store, episodes
         self.bf16 = bf16
-        self.spec = ClipSpec(simulator.memory_frames, simulator.spec.chunk, history=decoder.memory_frames)
+        self.spec = ClipSpec(
+            *(simulator.memory_frames, simulator.spec.chunk),
+            history=decoder.memory_frames,
+            recent=simulator.recent_memory,
+        )
 
     def of(self, clip: TensorDict, generator: torch.Generator) -> TensorDict:
         """shown [B, ...] (see StateDecoder.look), history and future of a clip [B] on the device."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 
 from envs.targets import ConfigError
 from pipeline.cli.words import without_given
@@ -16,6 +17,11 @@ DISTIL = (
     "state_fit.first.fit={steps: 300, batch: 16, lr: 3e-3}",
 )
 
+STRIDES = (
+    *("experiment=smoke", "simulator=unet_small", "simulator.width=16", "name=strides", "task.horizon=48"),
+    "simulator_fit.first={single_chunk_fraction: 0.9, strides: [1,2,4], fit: {steps: 600, batch: 12}}",
+)
+
 # Where each benchmark is, and what it takes for granted unless the command line says otherwise.
 BENCHES: dict[str, tuple[str, tuple[str, ...]]] = {
     "conditioning": ("pipeline.benches.conditioning", ()),
@@ -27,19 +33,35 @@ BENCHES: dict[str, tuple[str, tuple[str, ...]]] = {
     "serving": ("pipeline.benches.serving", ("experiment=smoke",)),
     "gesim": ("pipeline.benches.gesim", ()),
     "distil": ("pipeline.benches.distil", DISTIL),
+    "size": ("pipeline.benches.size", ()),
+    "strides": ("pipeline.benches.strides", STRIDES),
     "overfit": ("pipeline.benches.training", ("simulator=dit_small", "task=lerobot")),
     "pretrained": ("pipeline.benches.training", ("experiment=smoke", "simulator=dit_small")),
 }
+# Options of benchmarks that are no part of a config, and what they are unless the command line says more.
+OWN: dict[str, dict[str, float]] = {"serving": {"seconds": 180.0}}
 
 
 def run_bench(words: list[str]) -> None:
     """`worldloop bench NAME [overrides]`.
 
     Raises:
-        ConfigError: for an unknown name.
+        ConfigError: for an unknown name, or an option of its own that is no number above 0.
     """
     if not words or words[0] not in BENCHES:
         raise ConfigError(f"say which: worldloop bench {'|'.join(BENCHES)}")
     module, base = BENCHES[words[0]]
-    cfg = load_config([*without_given(base, words[1:]), *words[1:]])
-    getattr(importlib.import_module(module), words[0])(cfg)
+    own, rest = dict(OWN.get(words[0], {})), []
+    for word in words[1:]:
+        key, _, value = word.partition("=")
+        if key not in own:
+            rest.append(word)
+            continue
+        try:
+            own[key] = float(value)
+        except ValueError:
+            own[key] = 0.0
+        if not 0 < own[key] < math.inf:
+            raise ConfigError(f"{word}: say a number above 0")
+    cfg = load_config([*without_given(base, rest), *rest])
+    getattr(importlib.import_module(module), words[0])(cfg, **own)

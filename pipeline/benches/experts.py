@@ -92,7 +92,8 @@ def _play(cfg: Mapping[str, Any], changes: Mapping[str, Any], level: float) -> d
         for begin in range(0, len(seeds), _AT_ONCE):
             part = seeds[begin : begin + _AT_ONCE]
             tracks = pool.script([(seed, level) for seed in part], task["chunk"])
-            for name, track in zip(tasks_of_seeds(cfg, part), tracks, strict=True):
+            played = tasks_of_seeds(cfg, (track.seed for track in tracks))
+            for name, track in zip(played, tracks, strict=True):
                 out[name].add(track)
     finally:
         pool.close()

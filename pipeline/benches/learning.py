@@ -44,7 +44,7 @@ def build(seed: int, envs: int) -> tuple[ChunkPolicy, LocalFleet]:
     seed_process(seed)
     env = ToyTrackingEnv(envs, seed=seed)
     head = {"_target_": "actors.policies.chunk_tokens.ChunkTokenHead", "bins": 64}
-    policy = ChunkPolicy(env.spec, head, width=128, points=8, channels=16, cameras="all")
+    policy = ChunkPolicy(env.spec, head, width=128, points=8, channels=16, cameras="all", asked=0)
     return policy, LocalFleet(Host(env, policy, bootstrap=False))
 
 

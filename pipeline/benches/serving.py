@@ -29,12 +29,11 @@ from envs.targets import options
 from pipeline.commands.demo_world import demo_recipe
 
 _CLIENTS, _CHUNKS = 4, 3  # at once; steps of a session, after which it is closed or left
-_SECONDS = 180.0
 
 
-def serving(cfg: dict[str, Any]) -> None:
+def serving(cfg: dict[str, Any], seconds: float) -> None:
     """Sessions are opened, stepped and closed (every third one is just left) by four clients; resident memory
-    is read every tenth of the time, and its slope over the second half is said.
+    is read every tenth of the `seconds`, and its slope over the second half is said.
     """
     prepare_process(0)
     config = options(ServeConfig, {**cfg["serve"], "port": 0, "grace_s": 1.0}, "serve")
@@ -43,7 +42,7 @@ def serving(cfg: dict[str, Any]) -> None:
         store, simulator = open_clips(cfg, recipe.data), build_simulator(cfg)
         host = SessionHost(simulator, build_state_decoder(cfg, simulator).eval(), config, bf16=False)
         with _running(host, config) as url:
-            _drive(url, host, store, _SECONDS)
+            _drive(url, host, store, seconds)
 
 
 @contextmanager

@@ -45,7 +45,7 @@ def _clips(lora: int = 0) -> SimulatorFitConfig:
 def clip_loss(simulator: Simulator, store: ClipStore, count: int = 16) -> float:
     """The simulator's loss on single chunks, on the same clips and noise at every call."""
     simulator.eval()
-    spec = ClipSpec(simulator.memory_frames, simulator.spec.chunk)
+    spec = ClipSpec(simulator.memory_frames, simulator.spec.chunk, recent=simulator.recent_memory)
     values = []
     for number in range(_BATCHES):
         generator = step_generator(0, number)

@@ -5,28 +5,29 @@ from __future__ import annotations
 import random
 from pathlib import Path
 
+from envs.manifest import MANIFEST, whole_files
+
 
 def spoil(stages: Path, chance: random.Random) -> tuple[Path, str] | None:
-    """Spoil one file of a finished stage or of a checkpoint.
+    """Spoil one file of a finished stage, of a checkpoint, or a whole one of a stage that is not finished.
 
     Returns:
         The folder whose removal is the fix, and what was done in words; None if there is nothing to spoil.
     """
-    folders = []
+    places = []
     for stage in sorted(stages.glob("*")):
-        done = (stage / "manifest.json").exists()
-        folders += [stage] if done else sorted(stage.rglob("checkpoint-*"))
-    if not folders:
+        if (stage / MANIFEST).exists():
+            places.append((stage, _files(stage)))
+            continue
+        places += [(checkpoint, _files(checkpoint)) for checkpoint in sorted(stage.rglob("checkpoint-*"))]
+        if whole := [stage / name for name in sorted(whole_files(stage))]:
+            places.append((stage, whole))
+    if not places:
         return None
-    folder = chance.choice(folders)
-    files = sorted(
-        path
-        for path in folder.rglob("*")
-        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    )
+    folder, files = chance.choice(places)
     # what is gone with its manifest is unfinished work, and made again without a word
     path = chance.choice(files)
-    ways = ["flip", "cut", "grow"] if path.name == "manifest.json" else ["flip", "cut", "grow", "remove"]
+    ways = ["flip", "cut", "grow"] if path.name == MANIFEST else ["flip", "cut", "grow", "remove"]
     way, content = chance.choice(ways), path.read_bytes()
     if way == "remove":
         path.unlink()
@@ -38,3 +39,12 @@ def spoil(stages: Path, chance: random.Random) -> tuple[Path, str] | None:
         at = chance.randrange(len(content))
         path.write_bytes(content[:at] + bytes([content[at] ^ 1 << chance.randrange(8)]) + content[at + 1 :])
     return folder, f"{way} of {path}"
+
+
+def _files(folder: Path) -> list[Path]:
+    """All files of a folder that are not hidden."""
+    return sorted(
+        path
+        for path in folder.rglob("*")
+        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    )

@@ -12,14 +12,15 @@ import sys
 from collections.abc import Callable
 
 from envs.targets import nearest
-from pipeline.cli import runs, tools
+from pipeline.cli import runs, tools, worlds
 from pipeline.cli.words import Words
 
 COMMANDS: dict[str, Callable[[Words], None]] = {
-    command.__name__: command
+    command.__name__.replace("_", "-"): command
     for command in (
-        *(runs.run, runs.rl, runs.stage, runs.stages, runs.evaluate, runs.trust, runs.controls),
-        *(runs.compare, runs.finetune, tools.serve, tools.play, tools.convert, tools.inspect, tools.bench),
+        *(runs.run, runs.rl, runs.stage, runs.stages, runs.evaluate, runs.trust, runs.controls, runs.study),
+        *(worlds.policy_value, worlds.fidelity, worlds.sweep, runs.compare, runs.finetune),
+        *(tools.serve, tools.play, tools.convert, tools.inspect, tools.bench, tools.gridworld),
         *(tools.verify, tools.submit, tools.chaos, tools.tasks, tools.config, tools.doctor, tools.completion),
     )
 }
@@ -28,7 +29,7 @@ _ROOMS = ("envs", "actors", "learners", "pipeline")
 
 def _help() -> str:
     lines = [
-        f"  {name:<10} {' '.join((command.__doc__ or '').split())}" for name, command in COMMANDS.items()
+        f"  {name:<12} {' '.join((command.__doc__ or '').split())}" for name, command in COMMANDS.items()
     ]
     return (
         "worldloop <command> [key=value ...]\n\n"

@@ -74,14 +74,14 @@ def evaluate(words: Words) -> None:
     """success of a policy: worldloop evaluate policy=<stage|folder> world=physics|imagined experiment=...;
     one that needs no weights is a choice of configs/policy: policy=openpi policy.url=ws://...
     """
-    from pipeline.config import choices
+    from pipeline.config import offered
 
     own, rest = {"weights": "", "world": "physics"}, []
     for word in words:
         key, _, value = word.partition("=")
         if key == "world":
             own["world"] = value
-        elif key == "policy" and value not in choices("policy"):
+        elif key == "policy" and not offered("policy", value, words):
             own["weights"] = value
         else:
             rest.append(word)
@@ -121,6 +121,25 @@ def controls(words: Words) -> None:
     with owning(root, "controls"), tracking(cfg, root) as tracker:
         table = run_controls(cfg, root, tracker)
     print(f"{table_text(table)}\n{root}/controls.json, {root}/report.html")
+
+
+def study(words: Words) -> None:
+    """the table of an experiment, its rows (imitation, the loop with and without RL, RL in physics) by tasks
+    and seeds; goes on where it stopped: worldloop study experiment=bench4 [study.minutes=60]
+    """
+    from pipeline.study.plan import plan_study
+
+    made = plan_study(words)
+    # a mistake in the words is told before any work
+    from actors.process import device_of, prepare_process
+    from pipeline.graph.owner import owning
+    from pipeline.study.run import run_study
+
+    device_of(made.cfg)
+    prepare_process(made.cfg["seed"])
+    with owning(made.root, "study"):
+        text = run_study(made)
+    print(f"\n{text}\n{made.root}/study.md, study.json, study.html")
 
 
 def compare(words: Words) -> None:

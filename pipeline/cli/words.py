@@ -31,5 +31,5 @@ def prepared(words: Words) -> tuple[dict[str, Any], Path]:
 
     device_of(cfg)  # what is not there is told before any work
     check_world(cfg)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     return cfg, root_of(cfg)

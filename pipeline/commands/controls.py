@@ -20,16 +20,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from actors.world_config import rewards_of
 from envs.files import write_text
 from envs.targets import ConfigError
 from pipeline.evaluation.report import build_report
 from pipeline.evaluation.result import outcomes
 from pipeline.evaluation.statistics import mcnemar, rate, rate_entry, rate_line
 from pipeline.graph.graph import Graph
-from pipeline.loop import build_loop, has_physics, last_round, of_round
+from pipeline.loop import build_loop, has_physics, last_round
 from pipeline.stages import controls as only_here
-from pipeline.stages import prove, rl
+from pipeline.stages import prove
+from pipeline.study.methods import EQUAL, Equal, add_rl_in_physics, privileged_note
 from pipeline.track import Tracker
 
 Cfg = Mapping[str, Any]
@@ -85,23 +85,9 @@ def run_controls(cfg: Cfg, root: Path, tracker: Tracker | None = None) -> dict[s
 
 def control_rows(cfg: Cfg, root: Path, loop: Graph) -> list[Row]:
     """The run itself and its controls, whose stages are added to the run's graph or have one of their own."""
-    rounds = range(1, last_round(cfg) + 2)  # the last deployment is of what the last round has learned
-    deploys = tuple(f"deploy-{n}" for n in rounds)
-    deployed = sum(of_round(cfg["rounds"]["deploy"], n) for n in rounds)
-    iterations = sum(of_round(cfg["rounds"]["iterations"], n) for n in rounds[:-1])
-    envs = cfg["rl"]["envs"]
-    few = max(1, round(deployed / envs))
-    whole = cfg["task"]["horizon"] // cfg["task"]["chunk"]
-    share = min(
-        1.0, (cfg["rl"]["chunks"] or whole) / whole
-    )  # of a physical episode's steps has an imagined one
-    iterations = max(1, round(iterations * share))
-    learned = {
-        "RL in physics, equal episodes": _rl_in_physics(loop, "equal-episodes", few),
-        "RL in physics, equal steps": _rl_in_physics(loop, "equal-steps", iterations),
-    }
-    told = "progress and success" if rewards_of(cfg).progress else "success"
-    note = f"rewarded by the suite's true {told}, which are privileged, not by a judge"
+    deploys = tuple(f"deploy-{n}" for n in range(1, last_round(cfg) + 2))
+    learned = {f"RL in physics, equal {equal}": _rl_in_physics(loop, cfg, equal) for equal in EQUAL}
+    note = privileged_note(cfg)
     loop.add("filtered-bc", only_here.filtered_bc, {"data": ["collect", *deploys]})
     loop.add("evaluate-filtered-bc", prove.evaluate_physics, {"policy": "filtered-bc"})
     without = build_loop(cfg, root, with_rl=False)
@@ -117,16 +103,16 @@ def control_rows(cfg: Cfg, root: Path, loop: Graph) -> list[Row]:
 
 def control_table(loop: Graph, rows: list[Row]) -> dict[str, Any]:
     """Rows of controls.json by title, the policy before first."""
-    before = outcomes(loop.folder("evaluate-before"))
-    start = rate_entry(before)
+    before = loop.folder("evaluate-before")
+    start = rate_entry(outcomes(before)[1][0])
     table: dict[str, Any] = {"before": {**start, "physics_episodes": 0, "paired": None}}
     for row in rows:
-        success = outcomes(row.graph.folder(row.node))
-        entry = rate_entry(success)
+        after = row.graph.folder(row.node)
+        entry = rate_entry(outcomes(after)[1][0])
         table[row.title] = {
             **entry,
             "gain": 100 * (rate(entry) - rate(start)),
-            "paired": mcnemar(before, success),
+            "paired": mcnemar(*outcomes(before, after)[1]),
             "physics_episodes": sum(row.graph.result(name)["episodes"] for name in row.learned),
             **({"note": row.note} if row.note else {}),
         }
@@ -147,10 +133,8 @@ def table_text(table: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _rl_in_physics(loop: Graph, name: str, iterations: int) -> str:
+def _rl_in_physics(loop: Graph, cfg: Cfg, equal: Equal) -> str:
     """Add RL in physics from the first policy and its evaluation; returns the former's name."""
-    learned = loop.add(
-        f"rl-in-physics-{name}", rl.rl_in_physics, {"policy": "imitation"}, iterations=iterations
-    )
+    learned = add_rl_in_physics(loop, cfg, equal)
     loop.add(f"evaluate-{learned}", prove.evaluate_physics, {"policy": learned})
     return learned

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -17,7 +18,11 @@ from envs.episodes import Episode, EpisodeError, LeRobotDataset, LeRobotWriter
 from envs.episodes.formats.foreign import read_foreign
 from envs.episodes.formats.gesim import write_bundle
 from envs.episodes.formats.recordings import Cut
+from envs.files import atomic, remove, write_json
 from envs.geometry.kinematics import Kinematics
+from pipeline.graph.owner import held_files, owning
+
+_HALF = ".converting.json"  # in an unfinished target: what it is made of
 
 
 def read_any(source: Path, cut: Cut | None = None) -> Iterator[Episode]:
@@ -30,26 +35,46 @@ def read_any(source: Path, cut: Cut | None = None) -> Iterator[Episode]:
 
 
 def convert(source: Path, target: Path, cut: Cut) -> int:
-    """Write `source` as a LeRobot data set, or a LeRobot data set as GE-Sim 2.0 bundles, a folder each.
+    """Write `source` as a LeRobot data set, or a LeRobot data set as GE-Sim 2.0 bundles, a folder each. What
+    was interrupted goes on after the episodes that are there.
 
     Returns:
         How many episodes.
 
     Raises:
-        EpisodeError: if the source is damaged or unknown, or the target is not empty.
+        EpisodeError: if the source is damaged or unknown, or the target holds something else.
+        RunInUse: if another process converts into the same folder.
     """
-    if target.exists() and any(target.iterdir()):
-        raise EpisodeError(f"{target} is not empty; choose a new folder")
+    with owning(target, f"convert {source} {target}", "choose another folder", passing=True):
+        half = target / _HALF
+        wanted = {"source": str(source.resolve()), "frames": cut.frames, "size": list(cut.size)}
+        if not half.exists():
+            if set(target.iterdir()) - held_files(target):
+                raise EpisodeError(f"{target} is not empty; choose a new folder")
+            write_json(half, wanted)
+        elif (begun := json.loads(half.read_text())) != wanted:
+            raise EpisodeError(f"{target} holds half of another conversion, {begun}; choose a new folder")
+        count = _write(source, target, cut)
+        remove(half)
+        return count
+
+
+def _write(source: Path, target: Path, cut: Cut) -> int:
+    """What `convert` does to a folder that it owns."""
     back = (source / "meta/info.json").exists()
     count = 0
     writer: LeRobotWriter | None = None
-    for episode in tqdm(read_any(source, cut), desc="convert", unit="ep"):
-        if back:
-            write_bundle(target / f"episode_{count:06d}", episode)
-        else:
-            writer = writer or LeRobotWriter(target, episode.embodiment)
-            writer.write([episode])
+    for number, episode in enumerate(tqdm(read_any(source, cut), desc="convert", unit="ep")):
         count += 1
+        bundle = target / f"episode_{number:06d}"
+        if back:
+            if not bundle.exists():
+                with atomic(bundle) as part:
+                    write_bundle(part, episode)
+            continue
+        writer = writer or LeRobotWriter(target, episode.embodiment)
+        if number >= writer.episodes:
+            writer.write([episode])
     return count
 
 

@@ -33,10 +33,7 @@ def demo_recipe(cfg: Mapping[str, Any], folder: Path, episodes: int, starts: int
             tracks = pool.script([(seed, (seed % 4) / 3) for seed in range(starts)], cfg["task"]["chunk"])
         finally:
             pool.close()
-        made = [
-            Episode.from_track(track, "noisy" if number % 4 else "expert", robot)
-            for number, track in enumerate(tracks)
-        ]
+        made = [Episode.from_track(track, "noisy" if track.seed % 4 else "expert", robot) for track in tracks]
         LeRobotWriter(data, robot).write(made)
         simulator = build_simulator(cfg)
         modules: list[nn.Module] = [

@@ -41,9 +41,9 @@ def evaluate_policy(cfg: Mapping[str, Any], root: Path, weights: str = "", world
         outcome = evaluate(env, actor, seeds, label=world)
     finally:
         env.close()
-    line = rate_line(rate_entry(outcome.success[outcome.judged]))
-    name, dropped = weights or cfg["policy"]["_target_"], int((~outcome.judged).sum())
-    return f"{name} in {world}: {line}, {dropped} dropped by the judge"
+    line = rate_line(rate_entry(outcome.success[outcome.counted]))
+    name, dropped = weights or cfg["policy"]["_target_"], int((~outcome.counted).sum())
+    return f"{name} in {world}: {line}, {dropped} dropped"
 
 
 def _physics(cfg: Mapping[str, Any], graph: Graph) -> tuple[Any, list[int]]:

@@ -70,11 +70,12 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
     policy = SafePolicyWrapper(build_policy(cfg, inputs.weights("policy")), physics.spec, physics.mode)
     seed_process(cfg["seed"])
     try:
-        rows = agreement(branch(world, physics, policy, judge, which, futures), cfg["seed"])
+        branches = branch(world, physics, policy, judge, which, futures)
     finally:
         physics.close()
-    write_text(root / f"trust-{number}.json", json.dumps({"moments": len(which), "depths": rows}, indent=1))
-    return _table(rows, len(which), futures)
+    rows, compared = agreement(branches, cfg["seed"]), len(branches.outcome)
+    write_text(root / f"trust-{number}.json", json.dumps({"moments": compared, "depths": rows}, indent=1))
+    return _table(rows, compared, futures)
 
 
 def _table(rows: list[dict[str, list[float]]], moments: int, futures: int) -> str:

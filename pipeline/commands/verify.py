@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from tqdm import tqdm
 
-from envs.manifest import DamagedArtefact, check, read_manifest
+from envs.manifest import DamagedArtefact, check, check_whole, read_manifest
 from envs.targets import ConfigError
+
+_PLACES = ("stages", "finetune")  # of a run's folder, in which stages leave theirs
+_ARTEFACT = re.compile(r".+-[0-9a-f]{12}")  # a stage and its key
 
 
 def verify_run(root: Path) -> str:
@@ -17,7 +21,9 @@ def verify_run(root: Path) -> str:
         ConfigError: if the folder holds no stages.
         DamagedArtefact: naming everything that has changed.
     """
-    folders = sorted(path for path in (root / "stages").glob("*") if path.is_dir())
+    folders = sorted(
+        path for place in _PLACES for path in (root / place).glob("*") if _ARTEFACT.fullmatch(path.name)
+    )
     if not folders:
         raise ConfigError(f"{root} holds no stages; say a run's folder, such as runs/quickstart")
     wrong, files, unfinished = [], 0, 0
@@ -26,6 +32,7 @@ def verify_run(root: Path) -> str:
             manifest = read_manifest(folder)
             if manifest is None:
                 unfinished += 1
+                check_whole(folder)
                 continue
             check(folder, manifest)
             files += len(manifest.get("files", {}))

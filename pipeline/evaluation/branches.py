@@ -22,7 +22,7 @@ from envs.initial_states import DecisionPoints
 from envs.judges.base import Judge
 from envs.physics.env import PhysicsEnv
 from envs.rng import resampling_generator
-from envs.specs import CHUNK, IMAGE, PROGRESS, SUCCESS, to_chunk
+from envs.specs import CHUNK, IMAGE, LOST, PROGRESS, SUCCESS, to_chunk
 
 _RESAMPLES = 400  # of the moments, for intervals
 
@@ -33,7 +33,7 @@ class Branches:
 
     imagined [D, N, G]: the judge's progress on generated frames; seen [D, N, G]: the same judge's on the true
     frames of the same actions; outcome [N, G]: whether the true episode succeeded in the end, the policy
-    going on in physics after the D chunks.
+    going on in physics after the D chunks. Moments in one of whose futures physics crashed are left out.
     """
 
     imagined: Tensor
@@ -77,7 +77,12 @@ def branch(
         ]
     seen, outcome = (torch.cat(values, -1) for values in zip(*parts, strict=True))
     shape = (len(which), futures)
-    return Branches(imagined.unflatten(-1, shape), seen.unflatten(-1, shape), outcome.reshape(shape))
+    whole = outcome.reshape(shape).isfinite().all(1)
+    return Branches(
+        imagined.unflatten(-1, shape)[:, whole],
+        seen.unflatten(-1, shape)[:, whole],
+        outcome.reshape(shape)[whole],
+    )
 
 
 def _imagine(world: EnvBase, policy: SafePolicyWrapper, slots: Tensor) -> tuple[Tensor, Tensor]:
@@ -104,7 +109,7 @@ def carry_out(
     chunks: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Progress [D, W] as the judge sees it and outcome [W] of the decision points `which` [W], followed by
-    chunks [D, W, K, A].
+    chunks [D, W, K, A]; an outcome is NaN where physics crashed.
     """
     store, count, depth = points.store, len(which), len(chunks)
     which = torch.cat((which, which[-1:].expand(physics.batch_size[0] - count)))  # fills the batch
@@ -114,7 +119,7 @@ def carry_out(
     texts = [store.instructions[number] for number in episode.tolist()]
     seen = torch.full((depth, len(which)), torch.nan)
     over = torch.zeros(len(which), dtype=torch.bool)
-    won = over.clone()
+    won, lost = over.clone(), over.clone()
     physics.schedule(seeds)
     now = physics.reset()
     for begin in range(0, physics.horizon, physics.chunk):
@@ -128,13 +133,14 @@ def carry_out(
         after = physics.step(acted)
         told = judge.score(after["next", IMAGE].unsqueeze(1), first, texts).progress[:, 0].cpu()
         won |= ~over & after["next", SUCCESS].squeeze(-1)
+        lost |= after["next", LOST].squeeze(-1)
         told = torch.where(won, 1.0, told)
         for number in range(depth):
             at = since == number
             seen[number, at] = told[at]
         over |= after["next", "done"].squeeze(-1)
         now = step_mdp(after)
-    return seen[:, :count], won[:count].float()
+    return seen[:, :count], won.float().masked_fill(lost, torch.nan)[:count]
 
 
 def _recorded(store: ClipStore, episode: Tensor, begin: int, physics: PhysicsEnv) -> Tensor:

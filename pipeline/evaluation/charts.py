@@ -61,6 +61,60 @@ def line_chart(curves: Sequence[Curve], title: str, xlabel: str, ylabel: str) ->
     return Markup(f'<svg class=chart viewBox="{box}" role=img>{"".join(parts)}</svg>')
 
 
+@dataclass(frozen=True)
+class Point:
+    """One mark of a scatter chart, coordinates in 0..1.
+
+    Args:
+        label: what it says when it is pointed at.
+        x, y: where it is.
+        error: half the length of the bar through it, along y.
+        series: number of its colour.
+    """
+
+    label: str
+    x: float
+    y: float
+    error: float = 0.0
+    series: int = 0
+
+
+def agreement_chart(points: Sequence[Point], series: Sequence[str], title: str) -> Markup:
+    """Estimated shares (up) over true ones (across) with the diagonal on which they are equal.
+
+    Args:
+        series: names of the points' colours.
+    """
+    across, up = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        return _LEFT + x * across, _HEIGHT - _BOTTOM - min(1.0, max(0.0, y)) * up
+
+    parts = [_text(_LEFT, 14, title, "title"), _text(_LEFT, 28, "estimated", "tick")]
+    for tick in (0.0, 0.25, 0.5, 0.75, 1.0):
+        parts.append(f'<path class=grid d="M{_LEFT:.0f} {place(0, tick)[1]:.1f}H{_WIDTH - _RIGHT:.0f}"/>')
+        parts.append(_text(_LEFT - 7, place(0, tick)[1] + 4, f"{tick:g}", "tick end"))
+        parts.append(_text(place(tick, 0)[0], _HEIGHT - 20, f"{tick:g}", "tick middle"))
+    parts.append(_text(_WIDTH / 2, _HEIGHT - 5, "true", "tick middle"))
+    parts.append(f'<path class="line recorded" d="{_path([place(0, 0), place(1, 1)])}"/>')
+    for point in points:
+        x, y = place(point.x, point.y)
+        kind = f"c{point.series % 6}"
+        ends = [place(point.x, point.y + sign * point.error) for sign in (-1, 1)]
+        parts.append(f'<path class="line {kind}" d="{_path(ends)}"/>')
+        parts.append(
+            f'<rect class="{kind}" x="{x - 4:.1f}" y="{y - 4:.1f}" width="8" height="8" rx="4">'
+            f"<title>{escape(point.label)}</title></rect>"
+        )
+    beside = _WIDTH - _RIGHT
+    for number, name in reversed(list(enumerate(series))):
+        beside -= 22 + 6.6 * len(name)
+        parts.append(f'<rect class="c{number % 6}" x="{beside:.0f}" y="20" width="8" height="8" rx="2"/>')
+        parts.append(_text(beside + 11, 28, name, "tick"))
+    box = f"0 0 {_WIDTH:.0f} {_HEIGHT:.0f}"
+    return Markup(f'<svg class=chart viewBox="{box}" role=img>{"".join(parts)}</svg>')
+
+
 def progress_chart(video: Mapping[str, Any]) -> Markup:
     """The judge's progress over the frames of a paired video, generated and recorded, and from when on the
     recording is a success; a bar that the page moves along with the video.

@@ -52,26 +52,34 @@ def build_report(
         result: see result.py.
         controls: rows of controls.json, None before `worldloop controls` has run.
     """
-    loader = PackageLoader("pipeline", "evaluation/page")
+    worst, tasks = _videos(inputs)
+    return (
+        templates()
+        .get_template("report.html.j2")
+        .render(
+            result=result,
+            heat=heat_maps(result["scenes"]),
+            controls=controls,
+            worst=worst,
+            tasks=tasks,
+            curves=_curves(inputs),
+            hosts=_hosts(inputs),
+            config=OmegaConf.to_yaml(OmegaConf.create({key: cfg[key] for key in cfg})),
+        )
+    )
+
+
+def templates() -> Environment:
+    """The templates of evaluation/page, with what their macros call."""
     page = Environment(
-        loader=loader,
+        loader=PackageLoader("pipeline", "evaluation/page"),
         autoescape=select_autoescape(["j2"]),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     page.globals |= {"rate": rate, "progress_chart": progress_chart}
-    worst, tasks = _videos(inputs)
-    return page.get_template("report.html.j2").render(
-        result=result,
-        heat=heat_maps(result["scenes"]),
-        controls=controls,
-        worst=worst,
-        tasks=tasks,
-        curves=_curves(inputs),
-        hosts=_hosts(inputs),
-        config=OmegaConf.to_yaml(OmegaConf.create({key: cfg[key] for key in cfg})),
-    )
+    return page
 
 
 def stage_folders(inputs: Inputs) -> dict[str, Path]:

@@ -79,10 +79,13 @@ def result_of(folder: Path) -> dict[str, Any]:
     return dict(manifest["result"])
 
 
-def outcomes(folder: Path, what: str = "success") -> torch.Tensor:
-    """Success bool [N] of the evaluation seeds, as evaluate_physics left it; or "progress", or "seeds"."""
-    kept: torch.Tensor = torch.load(folder / "outcomes.pt", weights_only=True)[what]
-    return kept
+def outcomes(*folders: Path) -> tuple[list[int], list[torch.Tensor]]:
+    """The evaluation seeds that all of these stages evaluate_physics could count, and success bool [N] on
+    them in each.
+    """
+    kept = [torch.load(folder / "outcomes.pt", weights_only=True) for folder in folders]
+    counted = torch.stack([one["counted"] for one in kept]).all(0)
+    return kept[0]["seeds"][counted].tolist(), [one["success"][counted] for one in kept]
 
 
 def verdict(result: Mapping[str, Any]) -> str:
@@ -134,7 +137,7 @@ def _physics(inputs: Inputs) -> dict[str, Any]:
     entries = {
         f"physics_{when}": {key: result_of(folder)[key] for key in _ENTRY} for when, folder in folders.items()
     }
-    return {**entries, "paired": mcnemar(outcomes(folders["before"]), outcomes(folders["after"]))}
+    return {**entries, "paired": mcnemar(*outcomes(folders["before"], folders["after"])[1])}
 
 
 def _tasks(cfg: Mapping[str, Any], inputs: Inputs, imagined: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -145,9 +148,8 @@ def _tasks(cfg: Mapping[str, Any], inputs: Inputs, imagined: Mapping[str, Any]) 
     names = sorted(set().union(*shown.values()))
     true: dict[str, Mapping[str, Any]] = {}
     if "physics_before" in inputs.found:
-        before, after = (inputs.folder(f"physics_{when}") for when in ("before", "after"))
-        tasks = tasks_of_seeds(cfg, outcomes(before, "seeds").tolist())
-        true = by_task(tasks, _pair, outcomes(before), outcomes(after))
+        seeds, pair = outcomes(*(inputs.folder(f"physics_{when}") for when in ("before", "after")))
+        true = by_task(tasks_of_seeds(cfg, seeds), _pair, *pair)
         names = sorted({*names, *true})
     nothing = {"physics_before": None, "physics_after": None, "paired": None}
     return {
@@ -169,10 +171,9 @@ def _scenes(cfg: Mapping[str, Any], inputs: Inputs, imagined: Mapping[str, Any])
         for cell in imagined[when]["scenes"]
     ]
     if "physics_before" in inputs.found:
-        before, after = (inputs.folder(f"physics_{when}") for when in ("before", "after"))
-        seeds = outcomes(before, "seeds").tolist()
+        seeds, pair = outcomes(*(inputs.folder(f"physics_{when}") for when in ("before", "after")))
         tasks, scenes = tasks_of_seeds(cfg, seeds), scenes_of_seeds(cfg, seeds)
-        parts += by_scene(tasks, scenes, _pair, outcomes(before), outcomes(after))
+        parts += by_scene(tasks, scenes, _pair, *pair)
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for part in parts:
         found.setdefault((part["task"], part["scene"]), {}).update(part)

@@ -59,6 +59,7 @@ class Graph:
     cfg: Mapping[str, Any]
     root: Path
     nodes: dict[str, Node] = field(default_factory=dict, init=False)
+    _met: set[str] = field(default_factory=set, init=False)  # finished ones, checked and told
 
     def add(self, name: str, stage: Stage, inputs: Names | None = None, **settings: Any) -> str:
         """Add a node and return its name.
@@ -123,8 +124,12 @@ class Graph:
         node = self.nodes[name]
         return node.stage.view(name, node.cfg, node.settings)
 
-    def result(self, name: str) -> dict[str, Any]:
-        """What a finished node returned.
+    def finished(self, name: str) -> bool:
+        """Whether the node's artefact is there."""
+        return read_manifest(self.folder(name)) is not None
+
+    def manifest(self, name: str) -> dict[str, Any]:
+        """What is known of a finished node.
 
         Raises:
             KeyError: if it is not finished.
@@ -132,7 +137,15 @@ class Graph:
         manifest = read_manifest(self.folder(name))
         if manifest is None:
             raise KeyError(f"stage {name} is not finished")
-        return dict(manifest["result"])
+        return manifest
+
+    def result(self, name: str) -> dict[str, Any]:
+        """What a finished node returned.
+
+        Raises:
+            KeyError: if it is not finished.
+        """
+        return dict(self.manifest(name)["result"])
 
     def run(
         self, until: str | Sequence[str] = (), tracker: Tracker | None = None
@@ -146,7 +159,7 @@ class Graph:
         Raises:
             KeyError: if `until` names no node.
         """
-        wanted = self._needs(_names(until)) if until else set(self.nodes)
+        wanted = self.needs(until) if until else set(self.nodes)
         following = tracker or NullTracker()
         return {name: self._finished(name, following) for name in self.nodes if name in wanted}
 
@@ -154,6 +167,9 @@ class Graph:
         """The manifest of a node, after running it if need be."""
         folder = self.folder(name)
         manifest = read_manifest(folder)
+        if manifest is not None and name in self._met:
+            return manifest
+        self._met.add(name)
         if manifest is not None:
             check(folder, manifest)
             clear_checkpoints(folder)  # of a process that was killed right after the manifest was there
@@ -183,7 +199,13 @@ class Graph:
             return ""
         return self.nodes[name].identity.changed(older[-1]["identity"])
 
-    def _needs(self, names: Sequence[str]) -> set[str]:
+    def needs(self, until: str | Sequence[str]) -> set[str]:
+        """Names of nodes and of all that they build on.
+
+        Raises:
+            KeyError: if `until` names no node.
+        """
+        names = _names(until)
         unknown = [name for name in names if name not in self.nodes]
         if unknown:
             raise KeyError(f"no stage {unknown[0]}; this graph has {list(self.nodes)}")

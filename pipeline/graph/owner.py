@@ -1,4 +1,4 @@
-"""One run, one owner: whoever writes into a run's folder holds its lock.
+"""One run, one owner: whoever writes into a run's folder, or a data set's, holds its lock.
 
 The system lets go of the lock when its holder ends, however that happens, on network file systems too where
 they know `flock`; elsewhere a lock file with the holder's process number stands in for it (filelock).
@@ -27,12 +27,17 @@ class RunInUse(RuntimeError):
 
 
 @contextmanager
-def owning(root: Path, command: str) -> Iterator[None]:
+def owning(
+    root: Path, command: str, otherwise: str = "say name=<another>", passing: bool = False
+) -> Iterator[None]:
     """Hold a run for the length of the block.
 
     Args:
         root: the run's folder, made if it is not there.
         command: what for; it is told to whoever comes meanwhile.
+        otherwise: what he may do instead of waiting.
+        passing: leave no lock file in the folder. Two may then hold it one right after the other in the
+            belief to be the first, so whoever does looks what lies there once he has it.
 
     Raises:
         RunInUse: if another process holds it.
@@ -43,7 +48,7 @@ def owning(root: Path, command: str) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout as error:
-        raise RunInUse(f"{_described(root)}; wait for its end or stop it, or say name=<another>") from error
+        raise RunInUse(f"{_described(root)}; wait for its end or stop it, or {otherwise}") from error
     try:
         since = datetime.now().astimezone().isoformat(timespec="seconds")
         mine = {"host": socket.gethostname(), "pid": os.getpid(), "command": command, "since": since}
@@ -52,7 +57,14 @@ def owning(root: Path, command: str) -> Iterator[None]:
     finally:
         with suppress(OSError):
             remove(root / _HOLDER)
+            if passing:
+                remove(root / _LOCK)
         lock.release()
+
+
+def held_files(root: Path) -> set[Path]:
+    """What an owner keeps in the folder while he has it."""
+    return {root / _LOCK, root / _HOLDER}
 
 
 def _described(root: Path) -> str:

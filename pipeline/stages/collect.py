@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator, Mapping
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +14,18 @@ import torch
 from tqdm import tqdm
 
 from actors.factory import build_physics, build_policy, build_pool, open_clips
+from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
 from actors.world_config import world_spec
 from envs.episodes.clips import ClipStore
 from envs.episodes.episode import Episode
 from envs.episodes.formats.lerobot import LeRobotDataset
+from envs.episodes.formats.lerobot_columns import SEED
 from envs.episodes.formats.lerobot_writer import LeRobotWriter
 from envs.episodes.splits import write_splits
 from envs.episodes.write_behind import WriteBehind
 from envs.files import write_text
+from envs.manifest import check_whole, keep_whole
 from envs.physics.suite import task_names
 from envs.physics.worker import Track
 from envs.rng import Purpose, episode_seeds, order_generator
@@ -42,35 +47,59 @@ def collect(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Scripted episodes into a LeRobot data set, in the order of its splits; goes on after the last shard."""
     section = cfg["collect"]
     task, robot, jobs = cfg["task"], world_spec(cfg).embodiment, scripted_jobs(cfg)
+    check_whole(folder)
     writer = LeRobotWriter(folder / "dataset", robot)
+    sealed = partial(_seal_shards, folder, writer)
+    if writer.shards:
+        sealed()  # one that was whole when the last try was cut off
     pool = build_pool(cfg)
-    done = len(LeRobotDataset(writer.root)) if writer.shards else 0
+    done = _next_job(writer, jobs)
     try:
         with (
             tqdm(total=len(jobs), initial=done, desc="collect", unit="ep", dynamic_ncols=True) as bar,
-            WriteBehind(writer) as behind,
+            WriteBehind(writer, sealed) as behind,
         ):
             for begin in range(done, len(jobs), section["shard"]):
                 mine = jobs[begin : begin + section["shard"]]
                 tracks = pool.script([(seed, level) for seed, level, _ in mine], task["chunk"])
-                behind.write(
-                    [
-                        Episode.from_track(track, source, robot)
-                        for track, (_, _, source) in zip(tracks, mine, strict=True)
-                    ]
-                )
+                sources = {seed: source for seed, _, source in mine}
+                behind.write([Episode.from_track(track, sources[track.seed], robot) for track in tracks])
                 bar.update(len(mine))
     finally:
         pool.close()
-    write_splits(writer.root, {name: section["episodes"][name] for name in SPLITS})
+    made, planned = _recorded_seeds(writer), iter(jobs)
+    splits = {name: list(islice(planned, section["episodes"][name])) for name in SPLITS}
+    write_splits(
+        writer.root, {name: sum(seed in made for seed, _, _ in part) for name, part in splits.items()}
+    )
     store = open_clips(cfg, [writer.root])
     return {
         "episodes": len(store),
+        "dropped": len(jobs) - len(store),
         "held_out": len(store.split("held_out")),
         "frames": int(store.length.sum()),
         "successes": sum(bool(row["success"]) for row in store.episodes),
         "expert_failures": _failures(cfg, store, folder),
+        "physics_episodes": {"scripted": len(store)},
     }
+
+
+def _recorded_seeds(writer: LeRobotWriter) -> list[int]:
+    """Seeds of the episodes that are written, in their order."""
+    if not writer.shards:
+        return []
+    return list(dict.fromkeys(LeRobotDataset(writer.root).column(SEED).flatten().tolist()))
+
+
+def _next_job(writer: LeRobotWriter, jobs: list[tuple[int, float, str]]) -> int:
+    """Where to go on: after the last job that left an episode; some before may have been dropped."""
+    made = _recorded_seeds(writer)
+    return 1 + [seed for seed, _, _ in jobs].index(made[-1]) if made else 0
+
+
+def _seal_shards(folder: Path, writer: LeRobotWriter) -> None:
+    """Remember what finished shards are, so that one that is spoiled before the stage ends is found."""
+    keep_whole(folder, writer.shard_files())
 
 
 def _failures(cfg: Cfg, store: ClipStore, folder: Path) -> list[str]:
@@ -113,6 +142,37 @@ def scripted_jobs(cfg: Cfg) -> list[tuple[int, float, str]]:
     return jobs
 
 
+@stage(reads=(*ROBOT, "extra_starts.episodes", "task.variants.{variant}"))
+def first_frames(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """How episodes of a variant of the task begin, as a data set of single frames: physics lays them out and
+    is asked for no step.
+
+    Settings: variant, its name in task.variants.
+    """
+    seeds = episode_seeds(cfg["seed"], Purpose.STARTS, cfg["extra_starts"]["episodes"])
+    changes, robot = cfg["task"]["variants"][inputs.settings["variant"]], world_spec(cfg).embodiment
+    data = folder / "dataset"
+    shutil.rmtree(data, ignore_errors=True)
+    pool = build_pool(cfg, changes, horizon=0)
+    try:
+        tracks = pool.script([(seed, 0.0) for seed in seeds], cfg["task"]["chunk"])
+    finally:
+        pool.close()
+    LeRobotWriter(data, robot).write([Episode.from_track(track, "start", robot) for track in tracks])
+    return {"starts": len(open_clips(cfg, [data])), "physics_episodes": {"first frames": len(seeds)}}
+
+
+@stage(reads=(*ROBOT, "extra_starts.data"))
+def recorded_starts(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """Recorded data sets whose episodes' first frames are starts; nothing is copied.
+
+    Settings: fingerprint of the data sets.
+    """
+    paths = [Path(path).resolve() for path in cfg["extra_starts"]["data"]]
+    write_text(folder / DATASETS, json.dumps([str(path) for path in paths]))
+    return {"starts": len(open_clips(cfg, paths))}
+
+
 @stage(reads=(*PHYSICS, "rounds.splits"))
 def deploy(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Episodes of the current stochastic policy in physics, recorded whole.
@@ -120,24 +180,28 @@ def deploy(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     Settings: number of the round, episodes.
     """
     number, episodes = inputs.settings["number"], inputs.settings["episodes"]
+    prepare_process(cfg["seed"], cfg["threads"])
     policy, robot = build_policy(cfg, inputs.weights("policy")), world_spec(cfg).embodiment
     seeds = episode_seeds(cfg["seed"], Purpose.DEPLOY, episodes, offset=100_000 * number)
     data = folder / "dataset"
     shutil.rmtree(data, ignore_errors=True)  # a deployment is short; half of one is begun anew
-    won: list[bool] = []
+    won, played = list[bool](), list[int]()
     with WriteBehind(LeRobotWriter(data, robot)) as behind:
         for tracks in run_recorded(cfg, policy, seeds):
             behind.write([Episode.from_track(track, f"policy-{number}", robot) for track in tracks])
             won += [bool(track.rows["success"][-1]) for track in tracks]
-    counts = split_counts(episodes, cfg["rounds"]["splits"])
+            played += [track.seed for track in tracks]
+    counts = split_counts(len(won), cfg["rounds"]["splits"])
     write_splits(data, counts)
     success = torch.tensor(won)
     return {
         "episodes": len(success),
+        "dropped": episodes - len(success),
         "held_out": counts["held_out"],
         "true_stochastic": rate_entry(success),
-        "tasks": by_task(tasks_of_seeds(cfg, seeds), rate_entry, success),
+        "tasks": by_task(tasks_of_seeds(cfg, played), rate_entry, success),
         "success": float(success.float().mean()),
+        "physics_episodes": {"own": len(success)},
     }
 
 
@@ -149,7 +213,7 @@ def split_counts(episodes: int, shares: Mapping[str, float]) -> dict[str, int]:
 
 def run_recorded(cfg: Cfg, policy: Any, seeds: list[int], stochastic: bool = True) -> Iterator[list[Track]]:
     """Recorded episodes of a policy in physics, in the order of the seeds, as many at once as run side by
-    side.
+    side; those in which physics crashes again and again are missing.
     """
     env = build_physics(cfg, batch=min(_SIDE_BY_SIDE, len(seeds)), record=True)
     try:
@@ -164,7 +228,7 @@ def run_recorded(cfg: Cfg, policy: Any, seeds: list[int], stochastic: bool = Tru
                 sampling_seed=cfg["seed"] * 1000 + begin,
             )
             tracks = {track.seed: track for track in env.pop_tracks()}
-            yield [tracks[seed] for seed in part]
+            yield [tracks[seed] for seed in part if seed in tracks]
     finally:
         env.close()
 
@@ -193,8 +257,11 @@ def recordings(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     }
 
 
-def fingerprint(paths: list[str]) -> str:
+def fingerprint(paths: list[str], key: str = "task.data") -> str:
     """Changes when recorded data sets do: a hash of their info.json.
+
+    Args:
+        key: of the config, that names them.
 
     Raises:
         ConfigError: for a folder that is no LeRobot v3.0 data set.
@@ -204,7 +271,7 @@ def fingerprint(paths: list[str]) -> str:
         info = Path(path) / "meta" / "info.json"
         if not info.is_file():
             raise ConfigError(
-                f"task.data: {info} is missing; name folders of LeRobot v3.0 data sets (`worldloop convert`"
+                f"{key}: {info} is missing; name folders of LeRobot v3.0 data sets (`worldloop convert`"
                 " makes them of other recordings)"
             )
         texts.append(info.read_text())

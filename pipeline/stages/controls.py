@@ -30,7 +30,7 @@ def filtered_bc(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     demos = demonstrations(cfg, store)
     own = store.select(["policy-*"], succeeded=True)
     own = own[torch.isin(own, learning_episodes(store))]
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     policy = build_policy(cfg)
     fit = fit_options(cfg, cfg["imitation"]["fit"], "imitation.fit")
     stats = train_imitation(Cloning(policy, store, torch.cat([demos, own]), mode_of(cfg)), fit, folder)

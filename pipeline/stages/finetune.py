@@ -17,7 +17,7 @@ from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import TASK, Cfg, fit_options
 from pipeline.stages.world import distil
 
-_READS = ("seed", *TASK, "simulator", "microbatches")
+_READS = ("seed", "threads", *TASK, "simulator", "microbatches")
 
 
 @stage(reads=(*_READS, "finetune.simulator", "finetune.weights"), place=Place.LEARNERS)
@@ -30,7 +30,7 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     fit = fit_options(cfg, section.pop("fit"), "finetune.simulator.fit")
     how = options(SimulatorFitConfig, section, "finetune.simulator")
     store = open_clips(cfg, cfg["task"]["data"])
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg, Path(weights) if weights else None)
     fresh = not (weights or cfg["simulator"].get("checkpoint"))
     stats = train_simulator(model, store, torch.arange(len(store)), how, fit, folder, fresh=fresh)
@@ -56,7 +56,7 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     section = cfg["finetune"]["state"]
     store = open_clips(cfg, cfg["task"]["data"])
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, model)
     fit = fit_options(cfg, section["fit"], "finetune.state.fit")

@@ -28,14 +28,15 @@ ROBOT = (
     *("seed", *TASK, "simulator.kinematics"),
     *("simulator.pose_map", "simulator.pose_map_style", "simulator.ray_map"),
 )
-POLICY = (*ROBOT, "policy")
-WORLD = ("seed", *TASK, "simulator", "judge")
+POLICY = (*ROBOT, "threads", "policy")
+WORLD = ("seed", "threads", *TASK, "simulator", "judge")
 PHYSICS = (*POLICY, "judge.rewards")
 
 # What a report shows.
 EVERYTHING = (
-    *("name", "seed", "microbatches", "task", "simulator", "judge", "policy", "algorithm", "rl", "rounds"),
-    *("collect", "imitation", "clone", "tokenizer_fit", "simulator_fit", "distill", "state_fit", "judge_fit"),
+    *("name", "seed", "threads", "microbatches", "task", "simulator", "judge", "policy", "algorithm", "rl"),
+    *("rounds", "collect", "imitation", "extra_starts", "clone", "tokenizer_fit", "simulator_fit", "distill"),
+    *("state_fit", "text_world_fit", "judge_fit"),
     *("evaluate", "measure"),
 )
 

@@ -32,7 +32,7 @@ def imitation(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Behaviour cloning of demonstrations (imitation.sources, imitation.demos)."""
     store = open_store(cfg, inputs)
     demos = demonstrations(cfg, store)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     policy = build_policy(cfg)
     section, mode = cfg["imitation"], mode_of(cfg)
     eyes = fit_options(cfg, section["perception"], "imitation.perception")
@@ -53,7 +53,7 @@ def clone(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     Settings: number of the round.
     """
     store, section = open_store(cfg, inputs), cfg["clone"]
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     policy = build_policy(cfg, inputs.weights("policy"))
     episodes = successful_episodes(cfg, store, inputs.settings["number"])
     own = store.select(["policy-*"])

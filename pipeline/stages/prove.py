@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     number = inputs.settings["number"]
     store = open_store(cfg, inputs)
     mine = store.select([f"policy-{number}"])[: cfg["measure"]["starts"]]
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     policy = build_policy(cfg, inputs.weights("policy"))
     truth = episode_success(store, mine)
     world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(mine)), mine)
@@ -53,8 +54,8 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     tasks = tasks_of_episodes(cfg, store, mine)
     result = {
         "round": number,
-        **_gap(truth, outcome.success, outcome.judged),
-        "tasks": by_task(tasks, _gap, truth, outcome.success, outcome.judged),
+        **_gap(truth, outcome.success, outcome.counted),
+        "tasks": by_task(tasks, _gap, truth, outcome.success, outcome.counted),
     }
     held = store.split("held_out")
     held = held[torch.isin(held, store.select(["policy-*"]))]
@@ -69,22 +70,42 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 @stage(reads=(*PHYSICS, "evaluate"), place=Place.EVALUATOR)
 def evaluate_physics(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Deterministic success in physics on the evaluation seeds."""
+    return _true_success(cfg, folder, inputs, {})
+
+
+@stage(reads=(*PHYSICS, "evaluate", "task.variants.{variant}"), place=Place.EVALUATOR)
+def evaluate_variant(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """The same on the same seeds in a variant of the task: other scenes, other words.
+
+    Settings: variant, its name in task.variants.
+    """
+    return _true_success(cfg, folder, inputs, cfg["task"]["variants"][inputs.settings["variant"]])
+
+
+def _true_success(cfg: Cfg, folder: Path, inputs: Inputs, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Deterministic success in physics, the suite's options changed; outcomes.pt has that of each seed."""
     section = cfg["evaluate"]
+    prepare_process(cfg["seed"], cfg["threads"])
     policy = build_policy(cfg, inputs.weights("policy"))
-    env = build_physics(cfg, section["envs"])
+    env = build_physics(cfg, section["envs"], changes=changes)
     began = time.perf_counter()
     try:
         seeds = episode_seeds(cfg["seed"], Purpose.EVALUATE, section["episodes"])
         outcome = evaluate(env, policy, seeds, label="physics")
     finally:
         env.close()
-    kept = {"success": outcome.success, "progress": outcome.progress, "seeds": torch.tensor(seeds)}
+    kept = {
+        "success": outcome.success,
+        "counted": outcome.counted,
+        "progress": outcome.progress,
+        "seeds": torch.tensor(seeds),
+    }
     write_atomically(folder / "outcomes.pt", lambda path: torch.save(kept, path))
     return {
         "rate": outcome.rate,
-        **rate_entry(outcome.success),
-        "tasks": by_task(tasks_of_seeds(cfg, seeds), rate_entry, outcome.success),
-        "progress": float(outcome.progress.mean()),
+        **_counted(outcome.success, outcome.counted),
+        "tasks": by_task(tasks_of_seeds(cfg, seeds), _counted, outcome.success, outcome.counted),
+        "progress": float(outcome.progress[outcome.counted].mean()),
         "evaluation_seconds": time.perf_counter() - began,
     }
 
@@ -94,6 +115,7 @@ def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Deterministic success in the last imagined world, of the policies in the roles before and after, from
     the starts of held-out episodes first.
     """
+    prepare_process(cfg["seed"], cfg["threads"])
     store = open_store(cfg, inputs)
     held = store.split("held_out")
     others = torch.arange(len(store))
@@ -105,21 +127,21 @@ def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         policy = build_policy(cfg, inputs.weights(label))
         outcome = evaluate(world, policy, list(range(len(starts))), label=f"imagined {label}")
         out[label] = {
-            **_imagined(outcome.success, outcome.judged),
-            "tasks": by_task(tasks, _imagined, outcome.success, outcome.judged),
-            "scenes": by_scene(tasks, scenes, _imagined, outcome.success, outcome.judged),
+            **_counted(outcome.success, outcome.counted),
+            "tasks": by_task(tasks, _counted, outcome.success, outcome.counted),
+            "scenes": by_scene(tasks, scenes, _counted, outcome.success, outcome.counted),
         }
     return out
 
 
-def _imagined(success: Tensor, judged: Tensor) -> dict[str, Any]:
-    """A rate entry of what the judge gave a judgement on, and how many it dropped."""
-    return {**rate_entry(success[judged]), "dropped": int((~judged).sum())}
+def _counted(success: Tensor, counted: Tensor) -> dict[str, Any]:
+    """A rate entry of the episodes that count, and how many were dropped."""
+    return {**rate_entry(success[counted]), "dropped": int((~counted).sum())}
 
 
-def _gap(truth: Tensor, success: Tensor, judged: Tensor) -> dict[str, Any]:
+def _gap(truth: Tensor, success: Tensor, counted: Tensor) -> dict[str, Any]:
     """True and imagined rates of the same starts, and how far they lie apart."""
-    imagined = success[judged]
+    imagined = success[counted]
     return {
         "true": rate_entry(truth),
         "imagined": rate_entry(imagined),
@@ -132,7 +154,7 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Rollout error, state error, speed and the judge's tables on held-out episodes of every source; and
     episodes.json, how far imagination and truth disagree in each of them (see disagreement.py).
     """
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     simulator = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
     judge = build_judge(cfg, inputs.weights("judge"))

@@ -7,14 +7,14 @@ from typing import Any
 
 import torch
 
-from actors.factory import build_algorithm, build_policy
+from actors.factory import build_algorithm, build_policy, open_clips
 from actors.fleets.launch import build_fleet
 from actors.policies.contract import action_key, freeze_perception
 from actors.process import prepare_process
 from actors.rollouts.recipe import Recipe
 from actors.world_config import rewards_of
 from envs.episodes.clips import ClipStore
-from envs.initial_states import decision_points
+from envs.initial_states import decision_points, shared_out
 from envs.rng import Purpose, episode_seeds
 from envs.specs import CHUNK
 from envs.targets import ConfigError
@@ -43,15 +43,16 @@ from pipeline.stages.given import (
 LEARNING = ("policy", "algorithm", "rl", "imitation", "microbatches")
 
 
-@stage(reads=(*WORLD, *LEARNING), place=Place.LEARNERS)
+@stage(reads=(*WORLD, *LEARNING, "extra_starts.share"), place=Place.LEARNERS)
 def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """Reinforcement learning inside the simulator.
+    """Reinforcement learning inside the simulator; the role `starts`, if somebody plays it, holds first
+    frames that nothing more was recorded of.
 
     Settings: number of the round, iterations; deployed, the round whose true successes anchor the policy (0:
     demonstrations alone).
     """
     number, deployed = inputs.settings["number"], inputs.settings["deployed"]
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     store = open_store(cfg, inputs)
     policy = build_policy(cfg, inputs.weights("policy"))
     settings = rl_options(cfg, iterations=inputs.settings["iterations"], seed=cfg["seed"] * 100 + number)
@@ -61,6 +62,8 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         anchor.encode()
     algorithm = build_algorithm(cfg, policy)
     inside = newest_episodes(store, learning_episodes(store)) if settings.starts == "inside" else None
+    data, more = (datasets(inputs.folders(role)) for role in ("data", "starts"))
+    extra = range(len(store), len(store) + (len(open_clips(cfg, more)) if more else 0))
     knew, decisions = _warm_up(cfg, policy, algorithm, store, settings.seed, number)
     recipe = Recipe(
         config=cfg.plain(),
@@ -69,8 +72,9 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         simulator=str(inputs.weights("simulator")),
         decoder=str(inputs.weights("state")),
         judge=str(inputs.weights("judge")),
-        data=tuple(str(path) for path in datasets(inputs.folders("data"))),
+        data=tuple(str(path) for path in (*data, *more)),
         inside=() if inside is None else tuple(inside.tolist()),
+        first=() if inside is None else tuple(extra),
         horizon=_horizon(cfg, settings.chunks, algorithm),
         freeze_perception=settings.freeze_perception,
         bootstrap=algorithm.bootstraps,
@@ -78,7 +82,9 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     )
     fleet = build_fleet(recipe) if leads() else None
     try:
-        starts = len(store) if inside is None else len(decision_points(store, inside)[0])
+        begun = len(store) if inside is None else len(decision_points(store, inside)[0])
+        share = cfg["extra_starts"]["share"]
+        starts = shared_out(begun, len(extra), share) if extra else begun
         true = TrueExperience(anchor, decisions)
         stats = train_rl(fleet, policy, algorithm, settings, folder, starts, true=true)
     finally:
@@ -130,7 +136,7 @@ def rl_in_physics(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, An
 
     Settings: iterations.
     """
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     iterations = inputs.settings["iterations"]
     policy = build_policy(cfg, inputs.weights("policy"))
     settings = rl_options(cfg, iterations=iterations, anchor=0.0, seed=cfg["seed"] * 100)
@@ -152,4 +158,4 @@ def rl_in_physics(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, An
         fleet.close()
     save_weights(policy, folder)
     stats.pop("last")
-    return dict(stats)
+    return {**stats, "physics_episodes": {"own": stats["episodes"]}}

@@ -106,7 +106,7 @@ def videos(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Paired videos: held-out episodes in which imagination and truth disagreed most, and of each task some
     of the policies in the roles before and after, in physics, and the same actions in the simulator.
     """
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     studio, robot = Studio.of(cfg, folder, inputs), world_spec(cfg).embodiment
     made = list(studio.worst(inputs, open_store(cfg, inputs)))
     count = cfg["measure"]["videos"] * len(task_names(cfg["task"]["name"]))
@@ -127,7 +127,7 @@ def replays(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Paired videos without physics: recordings, held-out ones if there are any, and their actions in the
     simulator; first those in which imagination and truth disagreed most.
     """
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     studio, store = Studio.of(cfg, folder, inputs), open_store(cfg, inputs)
     held = store.split("held_out")
     label, episodes = ("held-out", held) if len(held) else ("learned-from", torch.arange(len(store)))

@@ -10,8 +10,9 @@ from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
-from actors.factory import build_judge, build_simulator, build_state_decoder
+from actors.factory import build_judge, build_simulator, build_state_decoder, build_text_world
 from actors.process import prepare_process
+from actors.weights import load
 from envs.episodes.clips import ClipStore
 from envs.rng import order_generator
 from envs.simulators.base import Simulator
@@ -21,12 +22,14 @@ from learners.stages.generated import generated_frames
 from learners.stages.judge import calibrate, judge_recordings, train_judge
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
+from learners.stages.text_world import train_text_world
 from learners.stages.tokenizer import train_tokenizer
 from pipeline.acting import acting
 from pipeline.evaluation.judging import episode_success, labelled
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import (
+    ROBOT,
     TASK,
     WORLD,
     Cfg,
@@ -37,14 +40,14 @@ from pipeline.stages.given import (
     open_store,
 )
 
-SIMULATOR = ("seed", *TASK, "simulator", "microbatches")
+SIMULATOR = ("seed", "threads", *TASK, "simulator", "microbatches")
 
 
 @stage(reads=(*SIMULATOR, "tokenizer_fit"), place=Place.LEARNERS)
 def tokenizer(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The video autoencoder of a simulator that works on latents."""
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg)
     fit = fit_options(cfg, cfg["tokenizer_fit"], "tokenizer_fit")
     stats = train_tokenizer(model, store, learning_episodes(store), fit, folder)
@@ -64,7 +67,7 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     how = options(SimulatorFitConfig, section, f"simulator_fit.{phase}")
     store = open_store(cfg, inputs)
     episodes = learning_episodes(store)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg, inputs.weights("warm"))
     stats = (
         train_simulator(
@@ -127,7 +130,7 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     phase = inputs.settings["phase"]
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, model, inputs.weights("warm"))
     section = cfg["state_fit"][phase]
@@ -138,18 +141,42 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return stats
 
 
+@stage(reads=(*ROBOT, "judge.text_world", "text_world_fit", "microbatches"), place=Place.LEARNERS)
+def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """The text world of a judge that asks for one, with its tokenizer, going on from the role `warm` if there
+    is one.
+
+    Settings: phase, first or refresh.
+    """
+    phase, section = inputs.settings["phase"], cfg["text_world_fit"]
+    store = open_store(cfg, inputs)
+    prepare_process(cfg["seed"])
+    model = build_text_world(cfg, inputs.weights("warm"))
+    fit = fit_options(cfg, section[phase], f"text_world_fit.{phase}")
+    tokenizer = fit_options(cfg, section["tokenizer"], "text_world_fit.tokenizer")
+    stats = train_text_world(
+        *(model, store, learning_episodes(store), section["stride"], fit, folder),
+        tokenizer=tokenizer if phase == "first" else None,
+    )
+    save_weights(model, folder)
+    return stats
+
+
 @stage(reads=(*WORLD, "judge_fit.{phase}", "rl.starts", "rl.chunks", "microbatches"), place=Place.LEARNERS)
 def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The judge on recorded and on generated frames; its threshold on recorded video that no judge learns
-    from. A judge without weights is only calibrated.
+    from. A judge without weights is only calibrated. One with a text world takes over what the role
+    `text_world` has learned, and leaves it as it is.
 
     Settings: phase, first or refresh.
     """
     phase = inputs.settings["phase"]
     section = cfg["judge_fit"][phase]
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model: Any = build_judge(cfg, inputs.weights("warm"))
+    if golden := inputs.weights("text_world"):
+        load(model.text_world, golden).requires_grad_(False)
     stats: dict[str, Any] = {}
     if learns(model):
         train = labelled(store, store.split("train"))

@@ -20,7 +20,7 @@ import ray
 from ray.cluster_utils import Cluster
 
 from actors.factory import build_policy
-from actors.fleets.cluster import _advice, check_versions, connect, versions
+from actors.fleets.cluster import _advice, _our_sigterm, check_versions, connect, versions
 from actors.fleets.launch import build_fleet
 from actors.fleets.ray_fleet import RayFleet
 from actors.rollouts.host import Job, trained_weights
@@ -104,6 +104,21 @@ def test_an_ended_driver_leaves_no_ray_and_the_status_that_shells_expect(
     command.send_signal(number)
     assert command.wait(60) == status
     nothing_left("", command.pid, AssertionError)
+
+
+@pytest.mark.parametrize("turned", [RuntimeError, SystemExit, None])
+def test_a_sigterm_counts_whatever_a_starting_ray_makes_of_it(turned: type[BaseException] | None) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as ended, _our_sigterm():
+        signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(number))  # as ray.init does
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except SystemExit as error:  # as its C++ does, where that is at work
+            if turned is not None:
+                raise turned(15) from error
+    assert ended.value.code == 143 and signal.getsignal(signal.SIGTERM) is before
+    with pytest.raises(ValueError, match="its own"), _our_sigterm():
+        raise ValueError("its own")
 
 
 def test_a_wrong_token_is_named() -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from torch import nn
 
 from actors.factory import build_policy
 from actors.process import device_of, prepare_process
@@ -15,6 +17,7 @@ from actors.world_config import world_spec
 from envs.embodiment import Embodiment
 from envs.episodes.formats.lerobot_info import INFO_KEY, to_info
 from envs.targets import ConfigError
+from pipeline.config import composed
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES
 from tests.sections import section
 
@@ -97,6 +100,24 @@ def test_processes_are_prepared_alike() -> None:
         prepare_process(5, 1)
         drawn.append(torch.rand(3).tolist())
     assert drawn[0] == drawn[1] and torch.get_num_threads() == 1
+
+
+def test_arithmetic_is_the_same_on_any_number_of_cores() -> None:
+    known, made = os.sched_getaffinity(0), []
+    try:
+        for cores in (known, {min(known)}):
+            os.sched_setaffinity(0, cores)
+            prepare_process(0, composed([])["threads"])
+            layers = nn.Sequential(nn.Conv2d(3, 8, 3), nn.GroupNorm(2, 8), nn.Flatten(), nn.Linear(7200, 8))
+            optimiser = torch.optim.Adam(layers.parameters())
+            for _ in range(3):
+                optimiser.zero_grad()
+                layers(torch.randn(64, 3, 32, 32)).square().mean().backward()
+                optimiser.step()
+            made.append(torch.cat([weight.detach().flatten() for weight in layers.parameters()]))
+    finally:
+        os.sched_setaffinity(0, known)
+    assert torch.equal(*made)
 
 
 def test_gradients_of_indexing_are_the_same_every_time() -> None:

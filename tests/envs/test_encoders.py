@@ -34,6 +34,19 @@ def test_two_pictures_of_a_view_are_seen_as_one() -> None:
     assert encoder(torch.randn(3, spec.views, 6, 32, 32)).shape == (3, encoder.out_features)
 
 
+def test_some_key_points_look_for_what_the_words_say() -> None:
+    torch.manual_seed(0)
+    spec = world_spec(ARM_DELTAS)
+    encoder = MultiViewEncoder(spec, points=4, width=8, asked=2, words=6)
+    pictures, words = torch.randn(2, spec.views, 3, 32, 32), torch.randn(2, 6)
+    out, other = encoder(pictures, words), encoder(pictures, torch.stack((words[0], words[0])))
+    assert out.shape == (2, encoder.out_features)
+    assert torch.allclose(out[0], other[0]) and not torch.allclose(out[1], other[1])
+    places = spec.views * 6 * 2  # of key-points stand first; those of the last two of each view hang on words
+    moved = (out - other)[1, :places].reshape(spec.views, 6, 2).abs().sum(-1) > 1e-6
+    assert moved[:, 4:].all() and not moved[:, :4].any()
+
+
 def test_centres_are_in_half_pictures_from_the_middle() -> None:
     share = torch.zeros(2, 4, 8)
     share[0, 0, 0] = share[1, 3, 7] = 1.0

@@ -11,7 +11,7 @@ from torchrl.envs import TransformedEnv
 from envs.embodiment import Embodiment
 from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
-from envs.initial_states import DecisionPoints, InitialStates, decision_points
+from envs.initial_states import DecisionPoints, InitialStates, decision_points, shared_out
 from envs.simulators import memory
 from envs.specs import CHUNK, IMAGE, STATE, ActionMode, Rewards
 from envs.transforms import world_transforms
@@ -50,14 +50,37 @@ def test_no_episode_is_an_error_that_names_the_key(store: ClipStore) -> None:
 
 
 @ROBOTS
-def test_sessions_remember_what_clips_show(tiny_store: Stores, robot: Embodiment) -> None:
+def test_first_frames_of_further_episodes_are_starts(tiny_store: Stores, robot: Embodiment) -> None:
+    store = tiny_store(robot)
+    inside, further = torch.tensor([3, 1]), torch.tensor([0, 5, 7])
+    starts = DecisionPoints(store, inside, further)
+    points = len(decision_points(store, inside)[0])
+    assert len(starts) == points + 3
+    past, length = starts.past(torch.arange(points, points + 3))
+    assert length.tolist() == [1, 1, 1]
+    assert torch.equal(past["frames"][:, 0], store.first(further)["frames"])
+    assert starts.instructions[points:] == [store.instructions[n] for n in further.tolist()]
+
+
+@pytest.mark.parametrize(("inside", "extra"), [(4000, 320), (300, 300), (50, 1000)])
+def test_extra_starts_get_about_their_share(inside: int, extra: int) -> None:
+    for share in (0.2, 0.5):
+        pool = shared_out(inside, extra, share)
+        assert set(pool) == set(range(inside + extra))
+        assert sum(number >= inside for number in pool) / len(pool) == pytest.approx(share, abs=0.12)
+
+
+@pytest.mark.parametrize("newest", [False, True], ids=["spread", "newest"])
+@ROBOTS
+def test_sessions_remember_what_clips_show(tiny_store: Stores, robot: Embodiment, newest: bool) -> None:
     store = tiny_store(robot)
     starts = DecisionPoints(store, torch.arange(len(store)))
     which = torch.tensor([0, len(starts) - 1, len(starts) // 2])
     past, length = starts.past(which)
     state = memory.new_sessions(past, length, which, starts.longest)
-    remembered = memory.recall(state, 3)
-    clip = store.clips(starts.episode[which], starts.frame[which], ClipSpec(3, store.spec.chunk))
+    remembered = memory.recall(state, 3, newest)
+    spec = ClipSpec(3, store.spec.chunk, recent=newest)
+    clip = store.clips(starts.episode[which], starts.frame[which], spec)
     for name in remembered.keys():
         assert torch.equal(remembered[name], clip["memory", name][:, 0]), name
     now = memory.newest(state)

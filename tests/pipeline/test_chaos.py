@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from envs.manifest import DamagedArtefact, check, read_manifest, write_manifest
+from envs.manifest import DamagedArtefact, check, check_whole, keep_whole, read_manifest, write_manifest
 from pipeline.chaos.books import Books
 from pipeline.chaos.compare import differences
 from pipeline.chaos.corruption import spoil
@@ -62,6 +62,23 @@ def test_no_spoiled_file_passes(seed: int, tmp_path: Path) -> None:
     assert done is not None and done[0] == stage
     with pytest.raises(DamagedArtefact, match="one-key"):
         check(stage, read_manifest(stage) or {})
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_no_spoiled_file_of_an_unfinished_stage_passes(seed: int, tmp_path: Path) -> None:
+    stage = tmp_path / "stages/one-key"
+    (stage / "dataset").mkdir(parents=True)
+    for number in range(3):
+        (stage / f"dataset/file-{number}.mp4").write_bytes(bytes(range(200)))
+        keep_whole(stage, stage.glob("dataset/*"))
+    (stage / "half.jsonl").touch()
+    check_whole(stage)
+    done = spoil(tmp_path / "stages", random.Random(seed))
+    assert done is not None and done[0] == stage and "half" not in done[1]
+    with pytest.raises(DamagedArtefact, match="one-key"):
+        check_whole(stage)
+    with pytest.raises(DamagedArtefact, match="one-key"):
+        write_manifest(stage, {"stage": "one", "result": {}})
 
 
 def test_runs_are_equal_but_for_their_times(tmp_path: Path) -> None:

@@ -74,6 +74,12 @@ def test_mistakes_name_the_fix() -> None:
         (("controls", "experiment=smoke", "name=never-run"), "worldloop run"),
         (("compare", "/nowhere"), "result.json is not there"),
         (("stage",), "worldloop stages"),
+        (
+            ("evaluate", "policy=imitation", "policy=coarse", "experiment=smoke", "name=never-run")
+            + (f"hydra.searchpath=[file://{ROOT}/examples/configs]",),
+            "imitation-",  # whose weights are not there; coarse is the class that they would be of
+        ),
+        (("bench", "serving", "seconds=soon"), "seconds=soon: say a number above 0"),
     ):
         wrong = worldloop(*words)
         assert wrong.returncode == 1 and said in wrong.stderr and "Traceback" not in wrong.stderr, wrong

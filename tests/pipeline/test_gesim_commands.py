@@ -18,6 +18,7 @@ from pipeline.benches.gesim_floor import count_flops
 from pipeline.cli import tools
 from pipeline.commands.finetune import build_finetune
 from pipeline.commands.serving import build_session_host
+from pipeline.commands.verify import verify_run
 from pipeline.config import load_config
 from tests.actors.serving import serve_config
 from tests.envs.simulators.gesim_tiny import write_checkpoint
@@ -76,6 +77,7 @@ def test_finetune_a_checkpoint_distil_it_again_and_serve_what_came_of_it(
     simulator = build_simulator(graph.cfg, graph.folder("student") / "weights.safetensors")
     assert simulator.sampler == Distilled(DISTILLED[:2])
     build_state_decoder(graph.cfg, simulator, graph.folder("state") / "weights.safetensors")
+    assert verify_run(tmp_path / "runs/default").startswith("2 stages of")
     host = build_session_host(cfg, tmp_path / "runs/default", serve_config())
     assert host.simulator.spec.chunk == 5
     for served, stage in ((host.simulator, "student"), (host.decoder, "state")):

@@ -58,7 +58,15 @@ LASTS = {
     "trust": (["trust", *SOAK, "name=known", "depth=1", "futures=300"], r"carried out: +\d"),
     "controls": (["controls", *SOAK, "name=known"], r"deploy: +\d"),
     "finetune": (
-        ["finetune", "simulator=unet_small", "task=lerobot", "name=new", "track=disabled", *ENDLESS],
+        [
+            "finetune",
+            "simulator=unet_small",
+            "task=lerobot",
+            "threads=1",
+            "name=new",
+            "track=disabled",
+            *ENDLESS,
+        ],
         r"simulator: +\d+%.*loss",
     ),
     "serve": (["serve", *SOAK, "name=known", "serve.port=0"], r"http://127\.0\.0\.1:\d+"),

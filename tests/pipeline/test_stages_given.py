@@ -7,11 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from envs.manifest import DamagedArtefact, write_manifest
 from envs.rng import Purpose, episode_seeds
 from envs.targets import ConfigError
 from pipeline.config import load_config
 from pipeline.evaluation.by_task import tasks_of_seeds
-from pipeline.stages.collect import fingerprint, scripted_jobs, split_counts
+from pipeline.graph.stage import Inputs
+from pipeline.stages.collect import collect, fingerprint, scripted_jobs, split_counts
 
 
 def test_splits_add_up_and_none_is_empty() -> None:
@@ -25,6 +27,47 @@ def test_splits_add_up_and_none_is_empty() -> None:
         "held_out": 1,
         "calibration": 1,
     }
+
+
+def test_a_shard_that_is_spoiled_before_the_stage_ends_is_found(tmp_path: Path) -> None:
+    cfg = load_config(["experiment=soak", "collect.episodes={train: 1, held_out: 1, calibration: 1}"])
+    cfg["collect"]["shard"], cfg["launch"]["workers"] = 2, 1
+    view = collect.view("collect", cfg, {})
+    collect.run(view, tmp_path, Inputs())  # what a run would seal now
+    (video, *_) = sorted((tmp_path / "dataset").rglob("*.mp4"))
+    content = bytearray(video.read_bytes())
+    content[len(content) // 2] ^= 1
+    video.write_bytes(content)
+    for go_on in (
+        lambda: write_manifest(tmp_path, {"stage": "collect", "result": {}}),
+        lambda: collect.run(view, tmp_path, Inputs()),
+    ):
+        with pytest.raises(DamagedArtefact, match=video.name):
+            go_on()
+    content[len(content) // 2] ^= 1
+    video.write_bytes(content)
+    sealed = write_manifest(tmp_path, {"stage": "collect", "result": {}})["files"]
+    assert video.relative_to(tmp_path).as_posix() in sealed
+
+
+def test_an_episode_that_crashes_physics_is_left_out_of_its_split(tmp_path: Path) -> None:
+    cfg = load_config(["experiment=soak", "launch.workers=2"])
+    cfg["task"] |= {"suite": {"_target_": "tests.envs.physics.sections.Counting", "fault": "exit"}}
+    cfg["task"] |= {"name": "count", "size": [4, 4], "horizon": 4, "mode": "absolute"}
+    cfg["collect"] |= {
+        "shard": 2,
+        "mix": {"expert": 0.93, "random": 0.07},
+    }  # it is the random ones that crash
+    cfg["collect"]["episodes"] = {"train": 2, "held_out": 2, "calibration": 2}
+    sources = [source for _, _, source in scripted_jobs(cfg)]
+    assert sources.count("random") == 1
+    for _ in range(2):  # the second goes on after the last episode, so there is nothing to do
+        said = collect.run(collect.view("collect", cfg, {}), tmp_path, Inputs())
+        assert (said["episodes"], said["dropped"], said["held_out"]) == (
+            5,
+            1,
+            2 - sources[2:4].count("random"),
+        )
 
 
 def test_any_prefix_of_the_scripted_episodes_is_mixed() -> None:
@@ -56,10 +99,10 @@ def test_seeds_of_purposes_and_experiments_never_meet() -> None:
     drawn = [
         set(episode_seeds(seed, purpose, 1000))
         for seed in (0, 1)
-        for purpose in (Purpose.COLLECT, Purpose.DEPLOY, Purpose.PRACTICE)
+        for purpose in (Purpose.COLLECT, Purpose.DEPLOY, Purpose.PRACTICE, Purpose.STARTS)
     ]
     evaluation = set(episode_seeds(0, Purpose.EVALUATE, 1000))
-    assert len(set().union(*drawn, evaluation)) == 7000
+    assert len(set().union(*drawn, evaluation)) == 9000
     assert evaluation == set(episode_seeds(1, Purpose.EVALUATE, 1000))
 
 

@@ -37,7 +37,14 @@ COMMANDS = {
 def words_of(name: str, folder: Path, data: Path) -> list[str]:
     """A command with options by which its first stage that learns never ends."""
     if name == "finetune":
-        task = ["simulator=unet_small", "task=lerobot", "task.size=[32,32]", "task.chunk=4", "task.horizon=8"]
+        task = [
+            "simulator=unet_small",
+            "task=lerobot",
+            "threads=1",
+            "task.size=[32,32]",
+            "task.chunk=4",
+            "task.horizon=8",
+        ]
         task += [f"task.data=[{data}]", f"finetune.data=[{data}]"]
     else:
         task = ["experiment=soak"]

@@ -30,7 +30,13 @@ AGIBOT: Embodiment = replace(
     arms=tuple(replace(arm, gripper_range=(35.0, 120.0)) for arm in GENIE.arms),
 )
 
-
+# Of each frame, by arm.
+_STATE = {
+    "effector/position": (2,),
+    "end/position": (2, 3),
+    "end/orientation": (2, 4),
+    "joint/position": (14,),
+}
 Targets = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
@@ -46,18 +52,20 @@ def _read(place: Path, number: int, cut: Cut) -> Episode:
     try:
         with h5py.File(readings) as file:
             read = {
-                key: np.asarray(file[f"state/{key}"], np.float32)
-                for key in ("effector/position", "end/position", "end/orientation", "joint/position")
+                key: np.asarray(file[f"state/{key}"], np.float32).reshape(-1, *shape)
+                for key, shape in _STATE.items()
             }
             sent = _targets(file, len(read["joint/position"]))
-    except (OSError, KeyError) as error:
+    except (OSError, KeyError, ValueError) as error:
         raise EpisodeError(f"{readings}: {error}") from error
     length = len(read["joint/position"])
+    if any(len(values) != length for values in read.values()):
+        raise EpisodeError(f"{readings}: {', '.join(read)} are not of as many frames")
     folder = root / f"parameters/{task}/{name}/parameters/camera"
     cameras = [_camera(folder, view, length) for view in VIEWS]
     videos = [read_video(place / f"videos/{view}_color.mp4") for view in VIEWS]
     length = min(length, *(len(video) for video in videos), cut.frames or length)
-    hands = read["effector/position"][:length].reshape(length, 2)
+    hands = read["effector/position"][:length]
     joints = _in_order(read["joint/position"][:length], hands)
     return assemble(
         AGIBOT,

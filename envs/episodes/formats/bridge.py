@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +36,7 @@ def _read(place: Path, number: int, cut: Cut) -> Episode:
     try:
         with np.load(numbers, allow_pickle=False) as file:
             actions = file["arr_0"].astype(np.float32)
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise EpisodeError(f"{numbers}: {error!r}") from error
     if actions.ndim != 2 or actions.shape[1] != BRIDGE.action_dim:
         raise EpisodeError(f"{numbers}: arr_0 has shape {actions.shape}, expected (T, {BRIDGE.action_dim})")

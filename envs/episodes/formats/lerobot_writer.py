@@ -98,6 +98,11 @@ class LeRobotWriter:
         """Number of finished episodes."""
         return len(self._rows)
 
+    def shard_files(self) -> list[Path]:
+        """The files of finished shards, which nothing writes again."""
+        kinds = ("data", "videos", "meta/episodes")
+        return [path for kind in kinds for path in sorted((self.root / kind).rglob("file-*.*"))]
+
     def write(self, episodes: Sequence[Episode], split: str = TRAIN) -> None:
         """Add one shard; afterwards the data set on disk is complete and consistent.
 
@@ -186,11 +191,10 @@ class LeRobotWriter:
     def _fresh_shard(self) -> int:
         """A file index that no file of the data set has."""
         used = [-1]
-        for kind in ("data", "videos", "meta/episodes"):
-            for path in (self.root / kind).rglob("file-*.*"):
-                found = _FILE.search(path.as_posix())
-                if found:
-                    used.append(int(found[1]) * CHUNK_FILES + int(found[2]))
+        for path in self.shard_files():
+            found = _FILE.search(path.as_posix())
+            if found:
+                used.append(int(found[1]) * CHUNK_FILES + int(found[2]))
         return max(used) + 1
 
     def _finish_journal(self) -> str:

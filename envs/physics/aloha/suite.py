@@ -132,6 +132,11 @@ class Aloha(TaskSuite):
         """Pictures with shadows, of any size."""
         return self._render(size, True)
 
+    def segment(self) -> NDArray[np.uint8]:
+        """See TaskSuite.segment."""
+        offscreen = offscreen_for(f"aloha/{self._task}", self._bench.model, self.size)
+        return offscreen.segment(self._bench.model, self._bench.data, self._views)
+
     def observe(self) -> Observation:
         """Joints, and how the task stands; progress is a quarter of gym-aloha's reward of 0 to 4."""
         bench = self._bench

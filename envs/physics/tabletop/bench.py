@@ -121,3 +121,7 @@ class Bench:
         """Pictures uint8 [V, 3, H, W]."""
         offscreen = offscreen_for(self.assets, self.model, size)
         return offscreen.render(self.model, self.data, self.cameras, shadows)
+
+    def segment(self, size: tuple[int, int]) -> NDArray[np.uint8]:
+        """What each pixel shows, uint8 [V, H, W] of render.PARTS."""
+        return offscreen_for(self.assets, self.model, size).segment(self.model, self.data, self.cameras)

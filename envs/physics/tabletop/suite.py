@@ -82,6 +82,10 @@ class TwoArmSuite(TaskSuite):
         """Pictures with shadows, of any size."""
         return self._bench.render(size, shadows=True)
 
+    def segment(self) -> NDArray[np.uint8]:
+        """See TaskSuite.segment."""
+        return self._bench.segment(self.size)
+
     def observe(self) -> Observation:
         """Joint state, calibration, and how the task stands."""
         bench = self._bench

@@ -17,7 +17,7 @@ from envs.simulators.dit.augment import augment_memory_frames, augment_memory_la
 from envs.simulators.dit.diffusion import Diffusion, Given
 from envs.simulators.dit.network import MultiViewDiT
 from envs.simulators.foreground import foreground_weight
-from envs.simulators.inputs import build_inputs
+from envs.simulators.inputs import own_frames
 from envs.simulators.samplers import Distilled, Sampler
 from envs.simulators.tokenizers.autoencoder import STRIDE, Codec
 from envs.specs import WorldSpec
@@ -191,22 +191,16 @@ class LatentWorld(Simulator):
         """Any chunk of a clip: its inputs, after own predictions of the chunks before, its true frames float
         [B, K, V, 3, H, W] in 0..1, and which are valid [B, K].
         """
-        chunk = self.spec.chunk
-        # Chunks wholly past the end of every episode teach nothing.
-        whole = clip["future", "valid"].bool().any(0).unflatten(0, (-1, chunk)).any(1)
-        chosen = int(torch.randint(max(1, int(whole.long().sum())), (1,), generator=generator))
-        own: Tensor | None = None
-        for number in range(chosen):
-            with torch.no_grad():
-                frames = self.predict(build_inputs(self.spec, clip, number, own, generator))[0]
-            own = frames if own is None else torch.cat([own, frames], 1)
-        part = slice(chosen * chunk, (chosen + 1) * chunk)
-        inputs = build_inputs(self.spec, clip, chosen, own, generator)
+        chosen, inputs = own_frames(self, clip, generator)
+        part = slice(chosen * self.spec.chunk, (chosen + 1) * self.spec.chunk)
         return inputs, unit(clip["future", "frames"][:, part]), clip["future", "valid"][:, part]
 
     def _given(self, inputs: TensorDict, memory: Tensor) -> Given:
         latent_hw = (memory.shape[-2], memory.shape[-1])
-        return Given(memory, self.conditioning(inputs, latent_hw), self.actions(inputs))
+        stride = inputs["stride"]
+        alike = bool((stride == stride[0]).all())  # as in sessions: one set of positions serves all
+        fps = self.spec.fps / (int(stride[0]) if alike else stride)
+        return Given(memory, self.conditioning(inputs, latent_hw), self.actions(inputs), fps)
 
     def _weight(self, truth: Tensor, valid: Tensor) -> Tensor:
         """Loss weights [B, V, 1, T', h, w] of true frames [B, K, V, 3, H, W] and valid [B, K]."""
@@ -229,7 +223,7 @@ class LatentWorld(Simulator):
             latents.flatten(0, 1),
             self.diffusion.time_scale * steps.repeat_interleave(views, 0),
             None if self.prompt is None else self.prompt.expand(len(future), -1, -1),
-            self.spec.fps,
+            given.fps.repeat_interleave(views, 0) if isinstance(given.fps, Tensor) else given.fps,
             None if actions is None else actions.repeat_interleave(views, 0),
             layers,
         )

@@ -74,7 +74,7 @@ class Attention(nn.Module):
         known: tuple[Tensor, Tensor] | None = None,
     ) -> Tensor:
         """Tokens [B, L, width]; `known` are keys and values of a context that was met before (`keys_of`)."""
-        q = self.norm_q(self._heads(self.to_q(x)))
+        q = self.queries_of(x)
         k, v = known if known is not None else self.keys_of(x if context is None else context)
         if rope is not None:
             q, k = rotate(q, rope), rotate(k, rope)
@@ -88,6 +88,10 @@ class Attention(nn.Module):
         softmax over one key is 1, whoever asks. [B, 1, width].
         """
         return self.to_out[0](value.transpose(1, 2).flatten(2))
+
+    def queries_of(self, x: Tensor) -> Tensor:
+        """Queries [B, heads, L, head_dim] of tokens [B, L, width]."""
+        return self.norm_q(self._heads(self.to_q(x)))
 
     def keys_of(self, context: Tensor) -> tuple[Tensor, Tensor]:
         """Keys and values [B, heads, L, head_dim] of a context [B, L, width]."""

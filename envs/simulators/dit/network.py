@@ -48,7 +48,7 @@ class _FixedLayerNorm(nn.Module):
         return F.layer_norm(x, self.weight.shape, self.weight, self.bias, eps=1e-6)
 
 
-class _Stem(nn.Module):
+class Stem(nn.Module):
     """Two convolutions over each latent frame, whose channels stand beside it: transformers with large
     patches learn from few pictures more quickly with one (Xiao et al. 2021)."""
 
@@ -84,7 +84,7 @@ class MultiViewDiT(nn.Module):
         self.shape, self.checkpointing = shape, False
         self._text: tuple[Tensor, int, list[tuple[Tensor, Tensor]]] | None = None
         width, patch = shape.width, math.prod(shape.patch_size)
-        self.stem = _Stem(shape.in_channels, shape.stem) if shape.stem else nn.Identity()
+        self.stem = Stem(shape.in_channels, shape.stem) if shape.stem else nn.Identity()
         channels = shape.in_channels + shape.stem + shape.concat_padding_mask
         self.patch_embed = nn.ModuleDict({"proj": nn.Linear(channels * patch, width, bias=False)})
         self.time_embed = _VideoTime(width)
@@ -103,7 +103,7 @@ class MultiViewDiT(nn.Module):
         latents: Tensor,
         timestep: Tensor,
         text: Tensor | None,
-        fps: float,
+        fps: float | Tensor,
         actions: Tensor | None = None,
         layers: list[Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
@@ -114,7 +114,7 @@ class MultiViewDiT(nn.Module):
                 side.
             timestep: [B * V, 1, T, 1, 1] or [B * V, T] noise level of every latent frame.
             text: [B, L, D] or [B * V, L, D] prompt embedding; None where the network reads no text.
-            fps: of the video.
+            fps: of the video, or [B * V] of each.
             actions: [B * V, T, action_size] action vector of every latent frame, embedded and added to the
                 time step's embedding, which modulates every block (adaLN); None where there are none.
             layers: takes the output of every block, each [B * V, tokens, width], for training the mix.

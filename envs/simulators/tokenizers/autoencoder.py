@@ -4,11 +4,15 @@ pixels to 16 channels.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from envs.ranges import Count
+from envs.simulators.tokenizers.convolutions import FOLD, decoder, encoder
+from envs.simulators.tokenizers.errors import picture_error, psnr
 
 STRIDE = 8
 
@@ -55,22 +59,6 @@ class Codec(nn.Module):
         return torch.cat([values[:, :1], values[:, 1:].unflatten(1, (-1, self.period)).mean(2)], 1)
 
 
-class _Residual(nn.Module):
-    def __init__(self, width: int):
-        super().__init__()
-        self.layers = nn.Sequential(
-            nn.GroupNorm(8, width),
-            nn.SiLU(),
-            nn.Conv2d(width, width, 3, padding=1),
-            nn.GroupNorm(8, width),
-            nn.SiLU(),
-            nn.Conv2d(width, width, 3, padding=1),
-        )
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.layers(x)
-
-
 class Autoencoder(Codec):
     """Deterministic convolutional autoencoder with normalised latents.
 
@@ -85,39 +73,19 @@ class Autoencoder(Codec):
     def __init__(self, channels: Count, width: Count):
         super().__init__()
         self.channels = channels
-        self.encoder = nn.Sequential(
-            nn.Conv2d(3 * 16, width, 1),
-            _Residual(width),
-            nn.Conv2d(width, width, 2, stride=2),
-            _Residual(width),
-            _Residual(width),
-            nn.GroupNorm(8, width),
-            nn.SiLU(),
-            nn.Conv2d(width, channels, 1),
-        )
-        self.decoder = nn.Sequential(
-            nn.Conv2d(channels, width, 3, padding=1),
-            _Residual(width),
-            _Residual(width),
-            nn.Conv2d(width, 4 * width, 1),
-            nn.PixelShuffle(2),
-            _Residual(width),
-            nn.GroupNorm(8, width),
-            nn.SiLU(),
-            nn.Conv2d(width, 3 * 16, 1),
-        )
+        self.encoder, self.decoder = encoder(channels, width), decoder(channels, width)
         self.register_buffer("latent_mean", torch.zeros(channels))
         self.register_buffer("latent_std", torch.ones(channels))
 
     def encode(self, frames: Tensor) -> Tensor:
         """See Codec."""
-        raw = self.encoder(F.pixel_unshuffle(frames * 2 - 1, 4))
+        raw = self.encoder(F.pixel_unshuffle(frames * 2 - 1, FOLD))
         return (raw - self.latent_mean[:, None, None]) / self.latent_std[:, None, None]
 
     def decode(self, latents: Tensor) -> Tensor:
         """Normalised latents [N, C, h, w] -> stills [N, 3, 8 h, 8 w], about 0..1."""
         raw = latents * self.latent_std[:, None, None] + self.latent_mean[:, None, None]
-        return F.pixel_shuffle(self.decoder(raw), 4) * 0.5 + 0.5
+        return F.pixel_shuffle(self.decoder(raw), FOLD) * 0.5 + 0.5
 
     def encode_clips(self, clips: Tensor) -> Tensor:
         """See Codec."""
@@ -127,6 +95,20 @@ class Autoencoder(Codec):
         """See Codec."""
         flat = latents.transpose(1, 2)
         return self.decode(flat.flatten(0, 1)).unflatten(0, flat.shape[:2])
+
+    def loss(self, frames: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Training loss of stills [N, 3, H, W], and how well they are kept."""
+        made = self.decode(self.encode(frames)).float()
+        return picture_error(made, frames), {"psnr": psnr(made, frames)}
+
+    @torch.no_grad()
+    def figures(self, frames: Tensor) -> dict[str, float]:
+        """PSNR in dB on stills."""
+        return {"psnr": float(psnr(self.decode(self.encode(frames)).float(), frames))}
+
+    def warning(self, figures: Mapping[str, float]) -> str:
+        """Nothing can collapse here."""
+        return ""
 
     @torch.no_grad()
     def normalise(self, frames: Tensor) -> None:

@@ -22,6 +22,7 @@ from envs.episodes.formats.gesim import GENIE, GENIE_POSES, write_bundle
 from envs.episodes.video import write_video
 from envs.specs import WorldSpec
 from pipeline.commands.convert import convert, inspect
+from pipeline.graph.owner import RunInUse, owning
 from tests.moving_square import moving_square
 
 
@@ -48,6 +49,7 @@ def test_a_bundle_comes_back_as_it_was(shared: Path, tmp_path: Path) -> None:
     size = (384, 512)
     cut = Cut(size=size)
     assert convert(shared / "data/gesim_v2", tmp_path / "lerobot", cut) == 1
+    assert {path.name for path in (tmp_path / "lerobot").iterdir()} == {"data", "meta", "videos"}
     (there,) = LeRobotDataset(tmp_path / "lerobot")
     (source,) = read_foreign(shared / "data/gesim_v2", cut)
     for name in ("c2w", "intrinsic", "commands", "poses", "states", "present"):
@@ -62,6 +64,34 @@ def test_a_bundle_comes_back_as_it_was(shared: Path, tmp_path: Path) -> None:
     assert joints[:, 17:].all()
     with pytest.raises(EpisodeError, match="not empty"):
         convert(tmp_path / "lerobot", tmp_path / "bundles", Cut())
+
+
+def test_a_conversion_goes_on_where_it_broke_off(shared: Path, tmp_path: Path) -> None:
+    source, target, cut = tmp_path / "clips", tmp_path / "lerobot", Cut(frames=4, size=(32, 32))
+    shutil.copytree(shared / "data/bridge", source)
+    numbers = source / "000000003.npz"
+    content = numbers.read_bytes()
+    numbers.write_bytes(content[:100])
+    with pytest.raises(EpisodeError, match=numbers.name):
+        convert(source, target, cut)
+    numbers.write_bytes(content)
+    with pytest.raises(EpisodeError, match="half of another conversion"):
+        convert(source, target, Cut(frames=5))
+    made = {path: path.stat().st_mtime_ns for path in target.rglob("file-*.*")}
+    assert convert(source, target, cut) == 5 and not list(target.glob(".*"))
+    assert made and all(path.stat().st_mtime_ns == then for path, then in made.items())
+    convert(source, tmp_path / "at once", cut)
+    for one, other in zip(LeRobotDataset(target), LeRobotDataset(tmp_path / "at once"), strict=True):
+        assert np.array_equal(one.frames, other.frames) and np.array_equal(one.commands, other.commands)
+
+
+def test_two_conversions_into_one_folder_are_one_too_many(shared: Path, tmp_path: Path) -> None:
+    with (
+        owning(tmp_path, "convert there here"),
+        pytest.raises(RunInUse, match=r"convert there here.*another folder"),
+    ):
+        convert(shared / "data/gesim_v1", tmp_path, Cut(frames=4))
+    assert not (tmp_path / "meta").exists()
 
 
 def test_a_bundle_has_one_robot(shared: Path, tmp_path: Path) -> None:

@@ -8,9 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 
+from actors.rollouts.evaluate import evaluate
+from envs.physics.env import PhysicsEnv
 from envs.physics.pool import PoolError, TaskPool
 from envs.physics.suite import build_suite
+from envs.specs import CHUNK, LOST, STATE, ActionMode, Rewards, WorldSpec
 from envs.targets import ConfigError
 from tests.envs.physics.sections import task_section
 
@@ -67,11 +73,52 @@ def test_a_worker_that_keeps_dying_is_reported() -> None:
         pool_of(2, 2, at_start="exit")
 
 
-def test_an_episode_in_which_physics_keeps_crashing_is_named() -> None:
+def test_an_episode_in_which_physics_keeps_crashing_is_dropped_and_counted() -> None:
     pool = pool_of(2, 2, fault="exit")
-    with pytest.raises(PoolError, match=r"died 4 times.*in the episodes of the seeds \[7\]"):
-        pool.script([(7, 1.0), (8, 0.0)], 1)
+    assert [track.seed for track in pool.script([(7, 1.0), (8, 0.0)], 1)] == [8] and pool.lost == [7]
+    with pytest.raises(PoolError, match=r"in 2 of 3 episodes \(seeds \[7, 9\]\), more than a share of"):
+        pool.script([(9, 1.0)], 1)
     pool.close()
+
+
+def test_only_the_slot_in_which_physics_keeps_crashing_is_lost() -> None:
+    pool = TaskPool({**COUNTING, "fault": "exit"}, "count", 4, 8, 2)
+    spec = WorldSpec(build_suite({**COUNTING}).embodiment, (4, 4), 2)
+    env = PhysicsEnv(pool, spec, ActionMode.ABSOLUTE, Rewards(1.0, 1.0), record=True)
+    env.schedule([0, 10, 20, 30, 40])
+    now = env.reset()
+    crash = torch.tensor([0.0, 2.0, 0.0, 0.0])[:, None, None].expand(4, 2, 1)
+    for chunk, counted in ((crash * 0, [2, 12, 22, 32]), (crash, [4, 12, 24, 34])):
+        now[CHUNK] = chunk
+        now = env.step(now)["next"]
+        assert now[STATE].flatten().tolist() == counted
+    now[CHUNK] = crash
+    after, now = env.step_and_maybe_reset(now)
+    assert after["next", STATE].flatten().tolist() == [6, 12, 26, 36]  # it stands where it was lost
+    assert after["next", LOST].flatten().tolist() == [False, True, False, False]
+    assert torch.equal(after["next", LOST], after["next", "done"])
+    now[CHUNK] = crash * 0
+    after = env.step(now)["next"]
+    assert after[STATE].flatten().tolist() == [8, 42, 28, 38] and not after[LOST].any()
+    assert pool.lost == [10] and [track.seed for track in env.pop_tracks()] == [0, 20, 30]
+    env.close()
+
+
+def test_evaluations_do_not_count_where_physics_crashes() -> None:
+    pool = TaskPool({**COUNTING, "fault": "exit"}, "count", 2, 4, 2)
+    spec = WorldSpec(build_suite({**COUNTING}).embodiment, (4, 4), 2)
+    env = PhysicsEnv(pool, spec, ActionMode.ABSOLUTE, Rewards(1.0, 1.0))
+
+    class Reckless(TensorDictModuleBase):
+        in_keys, out_keys = [STATE], [CHUNK]
+
+        def forward(self, seen: TensorDict) -> TensorDict:
+            odd = seen[STATE] == 13.0
+            return seen.set(CHUNK, torch.where(odd, 2.0, 0.0).unsqueeze(1).expand(-1, 2, 1))
+
+    outcome = evaluate(env, Reckless(), [1, 11, 21, 31])
+    assert outcome.counted.tolist() == [True, False, True, True]
+    env.close()
 
 
 def test_an_exception_in_a_worker_arrives_with_its_traceback() -> None:

@@ -12,6 +12,7 @@ from torchrl.envs.utils import check_env_specs
 from envs.episodes import Episode
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import TaskPool, Track
+from envs.physics.render import PARTS
 from envs.physics.suite import Observation, TaskSuite, build_suite
 from envs.specs import CHUNK, COMMAND, EPISODE, IMAGE, STATE, Rewards, WorldSpec
 from envs.targets import ConfigError
@@ -86,6 +87,17 @@ def test_shapes_are_those_of_the_embodiment(task: dict[str, Any], suite: TaskSui
         assert seen.c2w is not None and seen.c2w.shape == (len(robot.cameras), 4, 4)
     else:
         assert seen.intrinsic is None and seen.c2w is None
+
+
+def test_each_pixel_is_the_robots_a_things_or_nobodys(task: dict[str, Any], suite: TaskSuite) -> None:
+    suite.reset(task["name"], 1)
+    pictures, labels = suite.render(), suite.segment()
+    assert labels is not None and labels.dtype == np.uint8
+    assert labels.shape == (len(suite.embodiment.cameras), *task["size"])
+    # What a robot with its things fills is some of the pictures, and not most of them.
+    assert {PARTS["background"], PARTS["arm"]} <= set(np.unique(labels)) <= set(PARTS.values())
+    assert 0.005 < (labels == PARTS["arm"]).mean() < 0.6
+    assert np.array_equal(suite.render(), pictures)  # looking at parts changes nothing
 
 
 def test_an_episode_depends_on_its_seed_alone(task: dict[str, Any], suite: TaskSuite) -> None:

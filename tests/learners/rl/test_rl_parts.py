@@ -6,17 +6,18 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from envs.specs import INVALID_ACTION, JUDGE_STATUS, Status
+from envs.specs import INVALID_ACTION, JUDGE_STATUS, LOST, SUCCESS, Status
 from envs.targets import ConfigError, options
 from learners.rl.alarms import Alarms
-from learners.rl.algorithm import RLConfig, finite, first_episode, judged, sound
+from learners.rl.algorithm import RLConfig, finite, first_episode, judged, sound, whole
+from learners.rl.update import outcome
 from learners.training.fit import TrainingDiverged
 from tests.learners.rl.test_algorithms import RL
 
 DONE = torch.tensor([[False, True, False, True], [False, False, False, True]])
 
 
-def test_an_episode_that_a_judge_or_a_nan_spoiled_is_left_out_whole() -> None:
+def test_an_episode_that_a_judge_a_nan_or_a_crash_spoiled_is_left_out_whole() -> None:
     assert first_episode(DONE).tolist() == [[True, True, False, False], [True] * 4]
     status = torch.full((2, 4, 1), Status.OK.value)
     status[0, 3] = Status.ERROR.value
@@ -27,6 +28,13 @@ def test_an_episode_that_a_judge_or_a_nan_spoiled_is_left_out_whole() -> None:
     assert judged(batch).tolist() == [[True, True, False, False], [True] * 4]
     assert finite(batch).tolist() == [[True] * 4, [False] * 4]
     assert sound(batch).tolist() == [[True, True, False, False], [False] * 4]
+    lost = torch.zeros(2, 4, 1, dtype=torch.bool)
+    lost[0, 1] = True
+    batch["next", LOST] = lost
+    assert whole(batch).tolist() == [[False, False, True, True], [True] * 4] and not sound(batch).any()
+    batch["next"].update({"reward": torch.ones(2, 4, 1), SUCCESS: torch.ones(2, 4, 1, dtype=torch.bool)})
+    told = outcome(batch)
+    assert (told["dropped_by_physics"], told["dropped_nan"], told["dropped_by_judge"]) == (1.0, 1.0, 0.0)
 
 
 def test_alarms() -> None:

@@ -1,0 +1,48 @@
+"""Actions as text: their digits in words, through a frozen embedding. The other side of WPE's comparison."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from envs.embodiment import Embodiment
+from envs.language import FEATURES, TextEncoder
+from envs.ranges import Natural
+from envs.specs import text_to_bytes
+
+
+class ActionText(nn.Module):
+    """Commands as fixed features of the text that says them, such as "minus 3 7 plus 1 2".
+
+    The embedding is that of envs/language.py: hashed n-grams of words and their order, without a vocabulary,
+    a language model or anything that learns. In place of ActionVector, whose contract this has.
+
+    Args:
+        embodiment: whose actions.
+        decimals: digits after the point.
+
+    Attributes:
+        size: numbers per frame that `forward` gives.
+    """
+
+    def __init__(self, embodiment: Embodiment, decimals: Natural = 0):
+        super().__init__()
+        self.decimals, self.size = decimals, FEATURES
+        self.encoder = TextEncoder(1).requires_grad_(False)  # of which only fixed features are read
+
+    def normalise(self, commands: Tensor, moves: Tensor) -> None:
+        """Text has no units to take."""
+
+    def forward(self, commands: Tensor, now: Tensor) -> Tensor:
+        """float32 [..., K, size] of commands [..., K, A]; the command in force [..., A] is not told."""
+        rows = commands.flatten(0, -2).cpu()
+        text = text_to_bytes([self.describe(row) for row in rows.tolist()])
+        features = self.encoder.features(text.to(commands.device))
+        return features.float().reshape(*commands.shape[:-1], -1)
+
+    def describe(self, numbers: list[float]) -> str:
+        """Signs, digits and points as words of their own, number by number."""
+        said = []
+        for number in numbers:
+            digits = f"{abs(number):.{self.decimals}f}"
+            said += ["minus" if number < 0 else "plus", *("point" if c == "." else c for c in digits)]
+        return " ".join(said)

@@ -1,0 +1,185 @@
+"""One process that holds task suites, and what it takes to replace it by another that stands where it stood.
+
+A process that dies takes its episodes with it. They run again, one at a time, bit for bit as before; so an
+episode in which physics crashes again and again is found and given up, and the others go on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from multiprocessing import Pipe
+from typing import Any
+
+from numpy.typing import NDArray
+
+from envs.physics.worker import WorkerSpec
+from envs.targets import ConfigError
+
+log = logging.getLogger(__name__)
+RETRIES = 3  # replacements of a process that may die in a row at one request
+Request = tuple[str, tuple[Any, ...]]  # a method of Worker and its arguments
+
+
+class PoolError(RuntimeError):
+    """A physics worker failed; the message holds its own traceback."""
+
+
+class _Died(Exception):
+    """The process at the other end of a pipe is gone."""
+
+
+@dataclass
+class _Episode:
+    """What it takes to run an episode again: its seed and all chunks so far."""
+
+    seed: int
+    record: bool
+    chunks: list[NDArray[Any]] = field(default_factory=list)
+
+
+class WorkerProcess:
+    """A worker process; see the module's docstring.
+
+    Args:
+        index: of the worker, for messages.
+        spec: of suite and task.
+        slots: episodes side by side.
+
+    Attributes:
+        lost: seeds of the episodes that were given up.
+    """
+
+    def __init__(self, index: int, spec: WorkerSpec, slots: int):
+        self.index, self.spec, self.slots = index, spec, slots
+        self._episodes: dict[int, _Episode] = {}
+        self._request: Request | None = None
+        self.lost: list[int] = []
+        self._start()
+
+    def send(self, name: str, *arguments: Any) -> None:
+        """Ask for a method of Worker; `answer` waits for what it gives."""
+        self._request = (name, arguments)
+        if not self._fresh:
+            self._write(self._request)
+
+    def answer(self) -> Any:
+        """What the last request gave. A process that died is replaced and asked again, episode by episode; of
+        one in which its successors die as well there is no answer, and its seed joins `lost`.
+
+        Raises:
+            PoolError: if the method failed, or if processes die before they come to an episode.
+        """
+        assert self._request is not None
+        try:
+            return self._attempt()
+        except _Died:
+            self._replace()
+        name, (work, *extra) = self._request[0], self._request[1] or (None,)
+        if name == "script":
+            said = [self._insist((name, ([job], *extra)), job[0]) for job in work]
+            return [track for some in said for track in some or []]
+        if name in ("reset", "step"):
+            seeds = work if name == "reset" else {slot: self._episodes[slot].seed for slot in work}
+            said = [self._insist((name, ({slot: work[slot]}, *extra)), seeds[slot], slot) for slot in work]
+            return {slot: value for some in said for slot, value in (some or {}).items()}
+        return self._insist(self._request)
+
+    def _insist(self, request: Request, seed: int | None = None, slot: int | None = None) -> Any:
+        """What a request gives that is about one episode, or none; None if physics crashes in it anew."""
+        self.send(request[0], *request[1])
+        reached = False
+        for _ in range(RETRIES):
+            try:
+                return self._attempt()
+            except _Died:
+                reached = not self._fresh
+                code = self._replace()
+        if not reached or seed is None:
+            raise PoolError(
+                f"physics worker {self.index} died {1 + RETRIES} times in a row (exit code {code}); out of"
+                " memory, a broken GL driver, or a suite that crashes"
+            )
+        log.warning("physics crashed %d times in the episode of seed %d; it is dropped", 1 + RETRIES, seed)
+        self.lost.append(seed)
+        if slot is not None:
+            self._episodes.pop(slot, None)
+        return None
+
+    def _attempt(self) -> Any:
+        if self._fresh:
+            self._catch_up()
+        value = self._read()
+        self._remember()
+        return value
+
+    def _replace(self) -> int | None:
+        """Another process in place of one that died, whose exit code is returned."""
+        code = self.close(0.0)
+        log.warning("physics worker %d died (exit code %s); its episodes run again", self.index, code)
+        self._start()
+        return code
+
+    def close(self, patience: float) -> int | None:
+        """End the process, by force after `patience` seconds; returns its exit code."""
+        self._write(None)
+        try:
+            self.process.wait(patience)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        self.pipe.close()
+        return self.process.returncode
+
+    def _start(self) -> None:
+        self.pipe, theirs = Pipe()
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "envs.physics.worker", str(theirs.fileno())],
+            pass_fds=[theirs.fileno()],
+            start_new_session=True,  # a terminal's Ctrl-C is for the owner, whose end closes the pipe
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)},
+        )
+        theirs.close()
+        self._fresh = True
+        self._write((self.spec, self.slots))
+
+    def _catch_up(self) -> None:
+        """Wait for a new process, run its episodes up to where the last one stood, and repeat the request."""
+        self._read()
+        for slot, episode in self._episodes.items():
+            self._write(("reset", ({slot: episode.seed}, episode.record)))
+            self._read()
+            for chunk in episode.chunks:
+                self._write(("step", ({slot: chunk},)))
+                self._read()
+        self._fresh = False
+        self._write(self._request)
+
+    def _remember(self) -> None:
+        assert self._request is not None
+        name, arguments = self._request
+        if name == "reset":
+            seeds, record = arguments
+            self._episodes |= {slot: _Episode(seed, record) for slot, seed in seeds.items()}
+        elif name == "step":
+            for slot, chunk in arguments[0].items():
+                self._episodes[slot].chunks.append(chunk)
+
+    def _write(self, message: Any) -> None:
+        with contextlib.suppress(OSError):  # it died, which the next `_read` finds
+            self.pipe.send(message)
+
+    def _read(self) -> Any:
+        try:
+            status, value = self.pipe.recv()
+        except (EOFError, OSError) as error:
+            raise _Died from error
+        if status == "config":
+            raise ConfigError(value)
+        if status == "error":
+            raise PoolError(f"physics worker {self.index} failed:\n{value}")
+        return value

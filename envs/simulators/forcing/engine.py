@@ -1,0 +1,281 @@
+"""The world of WPE (Quevedo et al. 2025): diffusion forcing (Chen et al. 2024) on latents of single frames.
+
+In training every frame of a window has a noise level of its own, so one network serves any number of frames
+before and ahead. A chunk is generated in blocks: the newest c frames stand before h frames of noise under
+their h actions, which are denoised at once; then the window moves by h.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDict
+from torch import Tensor
+
+from envs.conditioning import Pace, render_ray_map
+from envs.ranges import Count, NonNegative, Share
+from envs.simulators import memory
+from envs.simulators.base import Simulator, noise_generator, to_bytes
+from envs.simulators.dit.latent_world import unit
+from envs.simulators.forcing.network import ForcingDiT, Known, Trunk
+from envs.simulators.forcing.prediction import Prediction
+from envs.simulators.forcing.schedule import DDIM, Sigmoid
+from envs.simulators.foreground import foreground_weight
+from envs.simulators.tokenizers.autoencoder import STRIDE, Autoencoder
+from envs.specs import WorldSpec
+from envs.targets import OptionsOf, build, options
+
+_ENCODED = 512  # pictures encoded at a time
+
+
+@dataclass(frozen=True)
+class Denoising:
+    """How it is trained and sampled.
+
+    Args:
+        steps: DDIM steps per block.
+        stabilisation: time on the schedule, 0..1, that context frames are said to stand at. They are shown as
+            they are: a network that took its own frames for clean would trust their errors.
+        as_sampled: chance that a clip of training has the levels of sampling (context as above, all newer
+            frames at one level) instead of independent ones.
+        foreground: extra loss weight of what differs from the picture's median colour.
+        schedule: options of Sigmoid.
+    """
+
+    steps: Count
+    stabilisation: Share
+    as_sampled: Share
+    foreground: NonNegative
+    schedule: Annotated[Mapping[str, Any], OptionsOf(Sigmoid)]
+
+
+class ForcingSimulator(Simulator):
+    """Blockwise-autoregressive diffusion transformer; see the module's docstring.
+
+    Args:
+        spec: what it shows; sizes must be multiples of 8 * patch.
+        window: frames of a training clip of one chunk, more than a chunk has.
+        context: newest frames that a block is generated from, c; before there are so many, the first repeats,
+            as for a robot that stood still.
+        horizon: frames generated at once, h, at most.
+        net: options of Trunk.
+        codec: options of Autoencoder.
+        denoising: options of Denoising.
+        prediction: what the network says, a class of prediction.py.
+        actions: how it is told of actions, a class such as ActionVector.
+
+    Attributes:
+        context, horizon: may be set to other numbers at any time; no weight depends on them.
+
+    Raises:
+        ValueError: if sizes do not fit.
+        ConfigError: naming an option that is unknown, missing or out of range.
+    """
+
+    recent_memory = True
+    hidden = ("attn", "ff")
+
+    def __init__(
+        self,
+        spec: WorldSpec,
+        window: Count,
+        context: Count,
+        horizon: Count,
+        net: Annotated[Mapping[str, Any], OptionsOf(Trunk)],
+        codec: Annotated[Mapping[str, Any], OptionsOf(Autoencoder)],
+        denoising: Annotated[Mapping[str, Any], OptionsOf(Denoising)],
+        prediction: Mapping[str, Any],
+        actions: Mapping[str, Any],
+    ):
+        if window <= spec.chunk:
+            raise ValueError(
+                f"simulator.window={window} must be more than task.chunk={spec.chunk}: a chunk goes on from"
+                " at least one frame"
+            )
+        super().__init__(spec, window - spec.chunk)
+        trunk = options(Trunk, net, "simulator.net")
+        if any(side % (STRIDE * trunk.patch) for side in spec.size):
+            raise ValueError(
+                f"task.size={list(spec.size)} must be multiples of {STRIDE * trunk.patch} for this network's"
+                " patches"
+            )
+        self.context, self.horizon = context, horizon
+        self.denoising = options(Denoising, denoising, "simulator.denoising")
+        self.schedule = options(Sigmoid, self.denoising.schedule, "simulator.denoising.schedule")
+        self.prediction: Prediction = build(prediction, "simulator.prediction")
+        self.actions = build(actions, "simulator.actions", embodiment=spec.embodiment)
+        self.pace = Pace(self.actions.size)
+        self.codec = Autoencoder(**codec).requires_grad_(False)
+        latents, maps = self.codec.channels, 3 * spec.pose_map + 6 * spec.ray_map
+        none = torch.zeros(1, 1, 1, 1, 1, 1)
+        seen = latents * (1 if self.prediction.base(none, none) is None else 2)
+        self.net = ForcingDiT(trunk, seen + maps, latents, spec.views, self.actions.size)
+        self.feature_shape = (spec.chunk * spec.views * trunk.width,)
+
+    def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
+        """See Simulator.normalise; actions take their units."""
+        self.actions.normalise(commands, moves)
+
+    def recall(self, state: TensorDict, future: TensorDict) -> TensorDict:
+        """See Simulator.recall; the newest `context` frames."""
+        return memory.recall(state, self.context, newest=True)
+
+    # -- generating
+    def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
+        """See Simulator.predict; features are those of the last step, means over each view of each frame."""
+        latents, features = self._generate(inputs)
+        return to_bytes(
+            self.codec.decode(latents.flatten(0, 2)).float().unflatten(0, latents.shape[:3])
+        ), features
+
+    def features(self, inputs: TensorDict) -> Tensor:
+        """See Simulator.features; nothing is decoded to pixels."""
+        return self._generate(inputs)[1]
+
+    def _generate(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
+        """Latents [B, K, V, C, h, w] of a chunk and its features [B, K * V * width], block by block."""
+        remembered = {name: rows[:, -self.context :] for name, rows in inputs["memory"].items()}
+        frames, chunk = self._whole(remembered, inputs), self.spec.chunk
+        latents = self._encode(unit(frames["frames"]))
+        before, features = latents.shape[1], []
+        noise = self._noise(inputs["seed"], inputs["chunk_index"], latents)
+        for begin in range(0, chunk, self.horizon):
+            ahead = noise[:, begin : begin + self.horizon]
+            window = slice(begin, begin + before + ahead.shape[1])
+            made, seen = self._block(latents[:, begin:], ahead, self._beside(frames, window, inputs))
+            latents = torch.cat([latents, made], 1)
+            features.append(seen)
+        return latents[:, before:], torch.cat(features, 1).flatten(1)
+
+    def _block(self, context: Tensor, noise: Tensor, beside: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """Frames [B, n, V, C, h, w] after those of the context [B, c, V, C, h, w], and their features.
+
+        Nothing in frames of the past depends on newer ones: they are read once, and not at every step.
+
+        Args:
+            noise: like the frames.
+            beside: channels [B, c + n, V, C', h, w] and action vectors [B, c + n, size].
+        """
+        past, kept = context.shape[1], list[Tensor]()
+        stable = float(self.schedule.level(torch.tensor(self.denoising.stabilisation)))
+        old = torch.full(context.shape[:2], stable, device=context.device)
+        _, _, known = self._run(context, old, (beside[0][:, :past], beside[1][:, :past]))
+        ahead = (beside[0][:, past:], beside[1][:, past:])
+
+        def velocity(z: Tensor, level: float) -> Tensor:
+            levels = torch.full(z.shape[:2], level, device=z.device)
+            base = self._base(torch.cat([context, z], 1), torch.cat([old, levels], 1))
+            base = None if base is None else base[:, past:]
+            output, features, _ = self._run(z, levels, ahead, base, known)
+            kept[:] = [features]
+            return (z - self.prediction.clean(output, z, _wide(levels), base)) / level
+
+        made = DDIM(self.schedule.levels(self.denoising.steps))(velocity, noise)
+        return made, kept[0]
+
+    def _noise(self, seed: Tensor, chunk_index: Tensor, like: Tensor) -> Tensor:
+        """Noise [B, K, V, C, h, w], row by row from its own generator, the same in any batch."""
+        shape = (self.spec.chunk, *like.shape[2:])
+        pairs = zip(seed.tolist(), chunk_index.tolist(), strict=True)
+        return torch.stack([torch.randn(shape, generator=noise_generator(*pair)) for pair in pairs]).to(
+            like.device
+        )
+
+    # -- training
+    def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of every frame that has one before it; memory and all chunks of the clip are one window."""
+        first = {name: rows[:, 0] for name, rows in clip["memory"].items()}
+        frames = self._whole(first, clip)
+        truth = unit(frames["frames"])
+        clean = self._encode(truth)
+        level = self._levels(clean.shape[:2], first["index"].shape[1], generator).to(clean.device)
+        noise = torch.randn(clean.shape, generator=generator).to(clean.device)
+        z = (1 - _wide(level)) * clean + _wide(level) * noise
+        base = self._base(z, level)
+        output, _, _ = self._run(z, level, self._beside(frames, slice(None), clip), base)
+        error = self.prediction.error(output, (clean, noise), _wide(level), base)
+        repeats = first["index"].diff(dim=1, prepend=first["index"][:, :1]) == 0  # the first frame as well
+        weight = self._weight(truth, torch.cat([~repeats, clip["future", "valid"].bool()], 1))
+        return (error.square() * weight).sum() / (weight.sum() * clean.shape[3]).clamp(min=1), {}
+
+    def _levels(self, shape: torch.Size, past: int, generator: torch.Generator) -> Tensor:
+        """Noise levels of frames [B, T] of which `past` are context in sampling."""
+        times = torch.rand(shape, generator=generator)
+        sampled = torch.rand(len(times), 1, generator=generator) < self.denoising.as_sampled
+        like = times[:, -1:].expand(shape).clone()
+        like[:, :past] = self.denoising.stabilisation
+        return self.schedule.level(torch.where(sampled, like, times))
+
+    def _weight(self, truth: Tensor, valid: Tensor) -> Tensor:
+        """Loss weights [B, T, V, 1, h, w] of true frames [B, T, V, 3, H, W] and valid [B, T]."""
+        weight = foreground_weight(truth, self.denoising.foreground) * valid[:, :, None, None, None, None]
+        return F.avg_pool2d(weight.flatten(0, 2), STRIDE).unflatten(0, truth.shape[:3])
+
+    # -- parts
+    def _whole(self, remembered: Mapping[str, Tensor], inputs: TensorDict) -> dict[str, Tensor]:
+        """Remembered and future frames, as far as these are known, and what belongs to them, [B, T, ...]."""
+        known = {}
+        for name in ("frames", "commands", "pose_map", "c2w"):
+            parts = [rows[name] for rows in (remembered, inputs["future"]) if name in rows.keys()]
+            if parts:
+                known[name] = torch.cat(parts, 1)
+        return known
+
+    def _encode(self, frames: Tensor) -> Tensor:
+        """Latents [B, T, V, C, h, w] of frames float [B, T, V, 3, H, W] in 0..1; no gradient reaches the
+        autoencoder.
+        """
+        with torch.no_grad():
+            flat = torch.cat([self.codec.encode(piece) for piece in frames.flatten(0, 2).split(_ENCODED)])
+        return flat.float().unflatten(0, frames.shape[:3])
+
+    def _beside(
+        self, frames: Mapping[str, Tensor], window: slice, inputs: TensorDict
+    ) -> tuple[Tensor, Tensor]:
+        """What stands beside the latents of a window: channels [B, T, V, C', h, w] of pose and ray maps, as
+        the spec asks for them, and action vectors [B, T, size]. An action is told as the step from the
+        command before, whatever the window; its first frame has none before.
+        """
+        commands = frames["commands"][:, window]
+        before = torch.cat([commands[:, :1], commands[:, :-1]], 1)
+        vectors = self.actions(commands.flatten(0, 1)[:, None], before.flatten(0, 1))
+        vectors = vectors.squeeze(1).unflatten(0, commands.shape[:2])
+        vectors = vectors + self.pace(inputs["stride"])[:, None].to(vectors.dtype)
+        latent_hw = tuple(side // STRIDE for side in self.spec.size)
+        channels = [torch.zeros(*commands.shape[:2], self.spec.views, 0, *latent_hw, device=commands.device)]
+        if self.spec.pose_map:
+            maps = frames["pose_map"][:, window]
+            scaled = maps.flatten(0, 2).float() / 127.5 - 1
+            small = F.interpolate(scaled, size=latent_hw, mode="bilinear", antialias=True)
+            channels.append(small.unflatten(0, maps.shape[:3]))
+        if self.spec.ray_map:
+            c2w = frames["c2w"][:, window].transpose(1, 2)
+            rays = render_ray_map(inputs["intrinsic"], c2w, self.spec.size, stride=STRIDE)
+            channels.append(rays.transpose(1, 2))
+        return torch.cat(channels, 3), vectors
+
+    def _base(self, z: Tensor, level: Tensor) -> Tensor | None:
+        return self.prediction.base(z, _wide(level))
+
+    def _run(
+        self,
+        z: Tensor,
+        level: Tensor,
+        beside: tuple[Tensor, Tensor],
+        base: Tensor | None = None,
+        known: list[Known] | None = None,
+    ) -> tuple[Tensor, Tensor, list[Known]]:
+        """One pass of the network over frames z [B, T, V, C, h, w] at levels [B, T]; see ForcingDiT."""
+        shown = z / ((1 - _wide(level)).square() + _wide(level).square()).sqrt()  # of unit variance
+        base = self._base(z, level) if base is None else base
+        parts = [shown, beside[0]] if base is None else [shown, base, beside[0]]
+        return self.net(torch.cat(parts, 3), level, beside[1], known)
+
+
+def _wide(level: Tensor) -> Tensor:
+    """Levels [B, T] as [B, T, 1, 1, 1, 1]."""
+    return level[..., None, None, None, None]

@@ -1,0 +1,189 @@
+"""Pictures as tokens: an autoencoder with lookup-free quantisation (MAGVIT-2, Yu et al. 2023).
+
+Every number of the latent keeps only its sign, so n numbers are a code of 2^n without a codebook to look up.
+Codes so large are too many for a softmax: their bits are split into factors, each a small vocabulary of its
+own. Every frame of every camera is encoded on its own, all with the same weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated
+
+import torch
+import torch.nn.functional as F
+from annotated_types import Ge, Le, MultipleOf
+from torch import Tensor, nn
+
+from envs.ranges import Count, NonNegative
+from envs.simulators.tokenizers.convolutions import FOLD, decoder, encoder
+from envs.simulators.tokenizers.errors import gradient_difference, picture_error, psnr
+
+_COLLAPSED = 0.02  # perplexity, of the codes that there are, below which a codebook has collapsed
+_FEWEST = 1.5  # and in codes, for small ones
+
+
+class LookupFreeQuantiser(nn.Module):
+    """Numbers to signs, and signs to tokens and back.
+
+    Args:
+        bits: numbers of a latent, n.
+        factors: parts the code is split into; a divisor of bits.
+
+    Attributes:
+        codes: of a factor, 2^(bits / factors).
+
+    Raises:
+        ValueError: if the bits cannot be split so.
+    """
+
+    powers: Tensor
+    table: Tensor
+
+    def __init__(self, bits: int, factors: int):
+        super().__init__()
+        if bits % factors:
+            raise ValueError(f"codec.bits={bits} must be a multiple of codec.factors={factors}")
+        self.bits, self.factors, self.each = bits, factors, bits // factors
+        self.codes = 2**self.each
+        powers = 2 ** torch.arange(self.each)
+        signs = (torch.arange(self.codes)[:, None] // powers % 2) * 2 - 1
+        self.register_buffer("powers", powers, persistent=False)
+        self.register_buffer("table", signs.float(), persistent=False)  # [codes, bits of a factor]
+
+    def signs(self, z: Tensor) -> Tensor:
+        """Numbers [N, bits, h, w] as -1 and 1; gradients pass as if they were left as they are."""
+        hard = torch.where(z > 0, 1.0, -1.0).to(z.dtype)
+        return z + (hard - z).detach()
+
+    def tokens(self, z: Tensor) -> Tensor:
+        """Tokens int64 [N, h, w, factors] of numbers or signs [N, bits, h, w]."""
+        ones = (z > 0).long().unflatten(1, (self.factors, self.each))
+        return (ones * self.powers[:, None, None]).sum(2).permute(0, 2, 3, 1)
+
+    def latents(self, tokens: Tensor) -> Tensor:
+        """Signs float32 [N, bits, h, w] of tokens [N, h, w, factors]."""
+        ones = tokens[..., None] // self.powers % 2
+        return (ones.flatten(-2) * 2 - 1).permute(0, 3, 1, 2).to(self.table.dtype)
+
+    def entropies(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Entropy of each place's code, and of the codes of all places, in nats, summed over the factors.
+
+        A place's code is taken for random, with the odds exp(-|z - code|^2); its bits are then independent,
+        so that their entropies add up.
+        """
+        logits = 4 * z.float().permute(0, 2, 3, 1).flatten(0, 2)  # |z + 1|^2 - |z - 1|^2
+        share = logits.sigmoid()
+        each = F.binary_cross_entropy_with_logits(logits, share, reduction="none").sum(-1).mean()
+        # of all bits of a factor at once: half of each logit, with the sign of the code's bit
+        joint = (logits.unflatten(-1, (self.factors, self.each)) / 2) @ self.table.T
+        mean = joint.softmax(-1).mean(0)
+        return each, torch.special.entr(mean).sum()
+
+    def use(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
+        """How tokens [..., factors] use the codebook: the share of the codes that occur, and their
+        perplexity, exp of the entropy of their frequencies, each a mean over the factors.
+        """
+        shares, perplexities = [], []
+        for factor in tokens.reshape(-1, self.factors).unbind(-1):
+            count = torch.bincount(factor, minlength=self.codes).float()
+            frequency = count / count.sum()
+            shares.append((count > 0).float().mean())
+            perplexities.append(torch.special.entr(frequency).sum().exp())
+        return torch.stack(shares).mean(), torch.stack(perplexities).mean()
+
+
+class LookupFreeTokenizer(nn.Module):
+    """Convolutional autoencoder of stills whose latents are signs; pictures are float in 0..1.
+
+    Args:
+        bits, factors: see LookupFreeQuantiser.
+        stride: pixels each way of a token: 4, 8, 16, ...
+        width: channels of all layers, a multiple of 8.
+        gradients: loss weight of the multi-scale gradient difference (errors.py).
+        commitment: loss weight of the distance between numbers and their signs.
+        entropy: loss weight of the entropy of a place's code less that of all codes: a code shall be sure,
+            and codes shall be many.
+
+    Raises:
+        ValueError: if the bits cannot be split, or the stride is no power of two from 4 on.
+    """
+
+    def __init__(
+        self,
+        bits: Annotated[int, Ge(1), Le(64)],
+        factors: Count,
+        stride: Annotated[int, Ge(FOLD)],
+        width: Annotated[int, Ge(8), MultipleOf(8)],
+        gradients: NonNegative,
+        commitment: NonNegative,
+        entropy: NonNegative,
+    ):
+        super().__init__()
+        if stride & (stride - 1):
+            raise ValueError(f"codec.stride={stride} must be a power of two, such as 8 or 16")
+        self.stride = stride
+        self.gradients, self.commitment, self.entropy = gradients, commitment, entropy
+        halvings = (stride // FOLD).bit_length() - 1
+        self.encoder, self.decoder = (make(bits, width, halvings) for make in (encoder, decoder))
+        self.quantiser = LookupFreeQuantiser(bits, factors)
+
+    @property
+    def factors(self) -> int:
+        """Tokens of a place."""
+        return self.quantiser.factors
+
+    @property
+    def codes(self) -> int:
+        """Different tokens of a factor."""
+        return self.quantiser.codes
+
+    def encode(self, frames: Tensor) -> Tensor:
+        """Stills [N, 3, H, W] -> tokens int64 [N, H / stride, W / stride, factors]."""
+        return self.quantiser.tokens(self._numbers(frames))
+
+    def decode(self, tokens: Tensor) -> Tensor:
+        """Tokens [N, h, w, factors] -> stills float32 [N, 3, H, W], about 0..1."""
+        return self._pictures(self.quantiser.latents(tokens))
+
+    def loss(self, frames: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Training loss of stills, and how well they are kept and the codebook is used."""
+        z = self._numbers(frames).float()
+        signs = self.quantiser.signs(z)
+        made = self._pictures(signs)
+        value = picture_error(made, frames) + self.gradients * gradient_difference(made, frames)
+        each, all_places = self.quantiser.entropies(z)
+        value = value + self.commitment * (z - signs.detach()).square().mean()
+        value = value + self.entropy * (each - all_places)
+        return value, {"psnr": psnr(made, frames), **self._use(self.quantiser.tokens(z))}
+
+    def normalise(self, frames: Tensor) -> None:
+        """Signs have no units to take."""
+
+    @torch.no_grad()
+    def figures(self, frames: Tensor) -> dict[str, float]:
+        """PSNR in dB, share of the codes used and perplexity on stills."""
+        tokens = self.encode(frames)
+        found = {"psnr": psnr(self.decode(tokens), frames), **self._use(tokens)}
+        return {name: float(value) for name, value in found.items()}
+
+    def warning(self, figures: Mapping[str, float]) -> str:
+        """What to do where figures of `loss` or `figures` say that the codebook has collapsed, else ""."""
+        floor = max(_FEWEST, _COLLAPSED * self.codes)
+        if figures["perplexity"] >= floor:
+            return ""
+        return (
+            f"the codebook has collapsed: of {self.codes} codes a factor, as if"
+            f" {figures['perplexity']:.2f} were in use (least {floor:.2f}); raise simulator.codec.entropy,"
+            " lower tokenizer_fit.lr or simulator.codec.bits, or see whether all pictures are alike"
+        )
+
+    def _numbers(self, frames: Tensor) -> Tensor:
+        return self.encoder(F.pixel_unshuffle(frames * 2 - 1, FOLD))
+
+    def _pictures(self, signs: Tensor) -> Tensor:
+        return F.pixel_shuffle(self.decoder(signs), FOLD).float() * 0.5 + 0.5
+
+    def _use(self, tokens: Tensor) -> dict[str, Tensor]:
+        share, perplexity = self.quantiser.use(tokens)
+        return {"codebook_use": share, "perplexity": perplexity}

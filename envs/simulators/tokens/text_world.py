@@ -1,0 +1,161 @@
+"""The text world of RoboScape-R: how the task would go on if it were done as the instruction says.
+
+The action world's transformer with weights of its own, told the instruction instead of commands. From a first
+frame it imagines the golden trajectory, up to the frame in which the task is done: the goal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from envs.ranges import Count, Share
+from envs.rng import noise_generator
+from envs.simulators.tokenizers.lfq import LookupFreeTokenizer
+from envs.simulators.tokens.decoding import Draws
+from envs.simulators.tokens.transformer import Trunk
+from envs.simulators.tokens.video import Lesson, TokenTraining, TokenVideo
+from envs.simulators.tokens.words import WordEncoder, WordReader
+from envs.specs import WorldSpec, bytes_to_text
+from envs.targets import OptionsOf, build, options
+
+_KEY = "judge.text_world"
+_STREAM = 2**41 + 7  # added to episode seeds, for other draws than the simulator's
+
+
+class GoldenTrajectory(NamedTuple):
+    """How tasks go on when they are done.
+
+    frames uint8 [B, T, V, 3, H, W] after the first; of an episode that ends before others its last one
+    repeats. done float32 [B, T] in 0..1. goal int64 [B], the first frame with done above the threshold; the
+    last one where there is none, and finished bool [B] is false there.
+    """
+
+    frames: Tensor
+    done: Tensor
+    goal: Tensor
+    finished: Tensor
+
+
+@dataclass(frozen=True)
+class Ending:
+    """When a golden trajectory ends.
+
+    Args:
+        threshold: of done, above which the task is.
+        max_frames: imagined, at most.
+    """
+
+    threshold: Share
+    max_frames: Count
+
+
+class TextWorld(nn.Module):
+    """See the module's docstring.
+
+    Args:
+        spec: what it shows; sizes must be multiples of codec.stride.
+        window: frames that a frame sees, itself included; training clips are as long.
+        codec, net, conditioning, decoding, training: see TokenVideo. The tokenizer is its own, for its
+            weights are a judge's.
+        words: `_target_` and options of a WordEncoder.
+        ending: options of Ending.
+
+    Raises:
+        ValueError: if sizes do not fit, or a window holds one frame alone.
+        ConfigError: naming an option that is unknown, missing or out of range.
+    """
+
+    hidden = ("blocks",)
+
+    def __init__(
+        self,
+        spec: WorldSpec,
+        window: Count,
+        codec: Annotated[Mapping[str, Any], OptionsOf(LookupFreeTokenizer)],
+        net: Annotated[Mapping[str, Any], OptionsOf(Trunk)],
+        conditioning: Mapping[str, Any],
+        decoding: Mapping[str, Any],
+        training: Annotated[Mapping[str, Any], OptionsOf(TokenTraining)],
+        words: Mapping[str, Any],
+        ending: Annotated[Mapping[str, Any], OptionsOf(Ending)],
+    ):
+        super().__init__()
+        if window < 2:
+            raise ValueError(f"{_KEY}.window={window} must be at least 2: a frame and one before it")
+        self.window, self.ending = window, options(Ending, ending, f"{_KEY}.ending")
+        self.video = TokenVideo(spec, window, codec, net, conditioning, decoding, training, _KEY)
+        encoder: WordEncoder = build(words, f"{_KEY}.words")
+        self.reader = WordReader(encoder, self.video.trunk.width, self.video.told_tokens)
+
+    @property
+    def codec(self) -> LookupFreeTokenizer:
+        """The tokenizer, which is trained apart."""
+        return self.video.codec
+
+    def check(self, instructions: Sequence[str]) -> None:
+        """Refuse instructions that the text encoder would cut.
+
+        Raises:
+            ValueError: naming the text and the fix.
+        """
+        self.reader.words.check(sorted(set(instructions)))
+
+    def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        """Training loss of clips of successful episodes, and figures to log.
+
+        Args:
+            clip: TensorDict [B] with frames uint8 [W, V, 3, H, W], valid bool [W], success float32 [W] (NaN
+                where nobody says so) and text uint8 [TEXT_BYTES] (specs.text_to_bytes).
+        """
+        tokens, valid = self.video.encode(clip["frames"]), clip["valid"]
+        success = torch.where(valid, clip["success"], torch.nan)
+        told = self.reader(bytes_to_text(clip["text"])).expand(-1, tokens.shape[1], -1, -1)
+        return self.video.loss(Lesson(tokens, valid[:, 1:], success), told, None, generator)
+
+    @torch.no_grad()
+    def imagine(self, first: Tensor, instruction: Sequence[str], seed: Tensor) -> GoldenTrajectory:
+        """Golden trajectories.
+
+        Args:
+            first: uint8 [B, V, 3, H, W].
+            instruction: B texts.
+            seed: int64 [B]; an episode is the same in any batch.
+        """
+        device = next(self.parameters()).device
+        told, known = self.reader(instruction), self.video.net.memory()
+        self.video.net.observe(self.video.encode(first[:, None].to(device)), told, None, known)
+        draws = Draws([noise_generator(row + _STREAM, 0) for row in seed.tolist()], device)
+        ended = torch.zeros(len(first), dtype=torch.bool, device=device)
+        tokens: list[Tensor] = []
+        done: list[Tensor] = []
+        while len(tokens) < self.ending.max_frames and not ended.all():
+            new = self.video.next_frame(known, told, None, draws)
+            said = self.video.done(self.video.net.observe(new[:, None], told, None, known).float())[:, 0]
+            if tokens:  # those that have ended rest
+                new = torch.where(ended[:, None, None], tokens[-1], new)
+                said = torch.where(ended, done[-1], said)
+            tokens.append(new)
+            done.append(said)
+            ended = ended | (said > self.ending.threshold)
+        every = torch.stack(done, 1)
+        over = every > self.ending.threshold
+        goal = torch.where(ended, over.long().argmax(1), over.shape[1] - 1)
+        frames = self.video.decode(torch.stack(tokens, 1))
+        return GoldenTrajectory(*(part.to(first.device) for part in (frames, every, goal, ended)))
+
+    @torch.no_grad()
+    def done(self, frames: Tensor, instruction: Sequence[str]) -> Tensor:
+        """Whether the task is done, as this world says, float32 [B, T] in 0..1 of frames uint8 [B, T, V, 3,
+        H, W] that follow one another.
+        """
+        device = next(self.parameters()).device
+        tokens = self.video.encode(frames.to(device))
+        told = self.reader(instruction).expand(-1, tokens.shape[1], -1, -1)
+        seen = self.video.net.observe(tokens, told, None, self.video.net.memory())
+        return self.video.done(seen.float()).to(frames.device)

@@ -1,0 +1,181 @@
+"""Video as tokens and its continuation: what the action world and the text world have in common.
+
+A tokenizer that was trained apart, the transformer over its tokens, and the head that says whether the task
+is done in a frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from envs.ranges import Count, NonNegative, Share
+from envs.simulators.base import to_bytes
+from envs.simulators.row_linear import RowLinear
+from envs.simulators.tokenizers.lfq import LookupFreeTokenizer
+from envs.simulators.tokens.blocks import Memory
+from envs.simulators.tokens.conditioning import Conditioning
+from envs.simulators.tokens.decoding import Decoding, Draws
+from envs.simulators.tokens.transformer import SpatioTemporalTransformer, Trunk, Vocabulary
+from envs.specs import WorldSpec
+from envs.targets import OptionsOf, build, options
+
+_AT_ONCE = 512  # pictures that the tokenizer takes in one call
+_FLAT = 1e-6  # under the root of the done head's error, whose slope has no bound at zero
+
+
+@dataclass(frozen=True)
+class TokenTraining:
+    """How the transformer is trained.
+
+    Args:
+        motion: extra loss weight of places whose tokens differ from those of the frame before.
+        corrupt: largest share of the known tokens that are replaced by random ones, drawn for every clip: a
+            world's own frames hold mistakes, too.
+        done: weight of the done head's error.
+    """
+
+    motion: NonNegative
+    corrupt: Share
+    done: NonNegative
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What a clip of T frames teaches.
+
+    Args:
+        tokens: int64 [B, T, P, F].
+        counted: bool [B, T - 1], which frames after the first are to be predicted.
+        success: float32 [B, T], whether the task is done in a frame; NaN where nobody says so.
+    """
+
+    tokens: Tensor
+    counted: Tensor
+    success: Tensor
+
+
+class TokenVideo(nn.Module):
+    """See the module's docstring. `told` and `beside` are those of SpatioTemporalTransformer.
+
+    Args:
+        spec: what the pictures show; sizes must be multiples of the tokenizer's stride.
+        window: frames that a frame sees, itself included.
+        codec: options of LookupFreeTokenizer.
+        net: options of Trunk.
+        conditioning, decoding: `_target_` and options of a Conditioning and of a Decoding.
+        training: options of TokenTraining.
+        key: config section of all these, for messages.
+
+    Raises:
+        ValueError: if sizes do not fit.
+        ConfigError: naming an option that is unknown, missing or out of range.
+    """
+
+    def __init__(
+        self,
+        spec: WorldSpec,
+        window: Count,
+        codec: Annotated[Mapping[str, Any], OptionsOf(LookupFreeTokenizer)],
+        net: Annotated[Mapping[str, Any], OptionsOf(Trunk)],
+        conditioning: Mapping[str, Any],
+        decoding: Mapping[str, Any],
+        training: Annotated[Mapping[str, Any], OptionsOf(TokenTraining)],
+        key: str,
+    ):
+        super().__init__()
+        self.spec = spec
+        # Whatever trains the tokenizer lets it learn for that time.
+        self.codec = LookupFreeTokenizer(**codec).requires_grad_(False)
+        stride = self.codec.stride
+        if any(side % stride for side in spec.size):
+            raise ValueError(
+                f"task.size={list(spec.size)} must be multiples of {stride}, which is {key}.codec.stride"
+            )
+        rows, columns = (side // stride for side in spec.size)
+        self.vocabulary = Vocabulary(spec.views, rows, columns, self.codec.factors, self.codec.codes)
+        self.trunk = options(Trunk, net, f"{key}.net")
+        self.training_options = options(TokenTraining, training, f"{key}.training")
+        self.decoding: Decoding = build(decoding, f"{key}.decoding")
+        told: Conditioning = build(conditioning, f"{key}.conditioning")
+        self.told_tokens = told.tokens
+        self.net = SpatioTemporalTransformer(self.vocabulary, self.trunk, window, told)
+        width = self.trunk.width
+        self.done_head = nn.Sequential(
+            nn.LayerNorm(width), RowLinear(width, width), nn.SiLU(), RowLinear(width, 1)
+        )
+
+    # -- tokens
+    @torch.no_grad()
+    def encode(self, frames: Tensor) -> Tensor:
+        """Tokens int64 [B, T, P, F] of frames uint8 [B, T, V, 3, H, W]."""
+        flat = frames.flatten(0, 2).split(_AT_ONCE)
+        tokens = torch.cat([self.codec.encode(part.float() / 255) for part in flat])
+        return tokens.unflatten(0, frames.shape[:3]).flatten(2, 4)
+
+    @torch.no_grad()
+    def decode(self, tokens: Tensor) -> Tensor:
+        """Frames uint8 [B, T, V, 3, H, W] of tokens [B, T, P, F]."""
+        v = self.vocabulary
+        grids = tokens.unflatten(2, (v.views, v.rows, v.columns))
+        flat = grids.flatten(0, 2).split(_AT_ONCE)
+        return torch.cat([to_bytes(self.codec.decode(part)) for part in flat]).unflatten(0, grids.shape[:3])
+
+    # -- frames to come
+    def next_frame(self, memory: Memory, told: Tensor, beside: Tensor | None, draws: Draws) -> Tensor:
+        """Tokens int64 [B, P, F] of the frame after those of a memory; told and beside are of that frame."""
+        v = self.vocabulary
+        return self.decoding.decide(_NextFrame(self.net, memory, told, beside), v.places, v.factors, draws)
+
+    def done(self, features: Tensor) -> Tensor:
+        """Whether the task is done, float32 [B, T] in 0..1, by features [B, T, P, width]."""
+        return self.done_head(features.mean(2)).float().sigmoid().squeeze(-1)
+
+    # -- training
+    def loss(
+        self, lesson: Lesson, told: Tensor, beside: Tensor | None, generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Cross-entropy of the tokens of frames asked for, plus the root mean square error of done."""
+        how, tokens = self.training_options, lesson.tokens
+        shown, asked = self.decoding.shown(tokens[:, 1:], generator)
+        known = self._corrupted(tokens, generator)
+        logits, features = self.net(known, shown, told, beside, self.decoding.causal)
+        error = F.cross_entropy(logits.float().flatten(0, 3), tokens[:, 1:].flatten(), reduction="none")
+        error = error.view(tokens[:, 1:].shape).sum(-1)
+        moved = (tokens[:, 1:] != tokens[:, :-1]).any(-1)
+        weight = (1 + how.motion * moved) * (asked & lesson.counted[..., None])
+        value = (error * weight).sum() / weight.sum().clamp(min=1)
+        labelled = torch.isfinite(lesson.success)
+        gap = torch.where(labelled, self.done(features) - torch.nan_to_num(lesson.success), 0.0)
+        done = (gap.square().sum() / labelled.sum().clamp(min=1) + _FLAT).sqrt()
+        figures = {"tokens": value.detach(), "done": done.detach()}
+        return value + how.done * done, figures
+
+    def _corrupted(self, tokens: Tensor, generator: torch.Generator) -> Tensor:
+        """Tokens [B, T, P, F], some of them replaced by random ones."""
+        shape = tokens.shape
+        most = self.training_options.corrupt * torch.rand(len(tokens), 1, 1, 1, generator=generator)
+        chosen = torch.rand(*shape[:3], 1, generator=generator) < most
+        other = torch.randint(self.vocabulary.codes, shape, generator=generator)
+        return torch.where(chosen.to(tokens.device), other.to(tokens.device), tokens)
+
+
+@dataclass(frozen=True)
+class _NextFrame:
+    """The frame after those of a memory; see decoding.Asker."""
+
+    net: SpatioTemporalTransformer
+    memory: Memory
+    told: Tensor
+    beside: Tensor | None
+
+    def all(self, shown: Tensor) -> Tensor:
+        return self.net.ask(shown, self.told, self.beside, self.memory)
+
+    def place(self, number: int, shown: Tensor) -> Tensor:
+        return self.net.ask_place(number, shown, self.told, self.beside, self.memory)

@@ -1,0 +1,96 @@
+"""Stage: teach a text world how successful episodes go on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from envs.episodes.clips import ClipStore
+from envs.ranges import Count
+from envs.simulators.tokens.text_world import TextWorld
+from learners.stages.tokenizer import train_tokenizer
+from learners.training.fit import FitConfig, fit
+
+
+@dataclass(frozen=True)
+class SuccessfulClips:
+    """Clips of successful episodes, as TextWorld.loss takes them.
+
+    Args:
+        store: whose recorded success counts.
+        episodes: to learn from, int64 [N], all of them successful.
+        frames: of a clip.
+        stride: recorded frames between two frames of a clip: a plan needs fewer than a robot's rate.
+    """
+
+    store: ClipStore
+    episodes: Tensor
+    frames: int
+    stride: int
+
+    def sample(self, count: int, generator: torch.Generator) -> TensorDict:
+        """Random clips [count], each of a random episode from any of its frames on.
+
+        The last frame repeats beyond the end, and counts: there the task is done, and stays so.
+        """
+        store = self.store
+        chosen = self.episodes[torch.randint(len(self.episodes), (count,), generator=generator)]
+        length = store.length[chosen]
+        begin = (torch.rand(count, generator=generator) * (length - 1).clamp(min=1)).long()
+        ahead = begin[:, None] + self.stride * torch.arange(self.frames)
+        rows = store.start[chosen][:, None] + torch.minimum(ahead, length[:, None] - 1)
+        return TensorDict(
+            {
+                "frames": store.frames(rows),
+                "valid": store.arrays["present"][rows],
+                "success": store.success(chosen, rows),
+                "text": store.text[chosen],
+            },
+            [count],
+        )
+
+
+def train_text_world(
+    world: TextWorld,
+    store: ClipStore,
+    episodes: Tensor,
+    stride: Count,
+    options: FitConfig,
+    folder: Path,
+    tokenizer: FitConfig | None = None,
+) -> dict[str, Any]:
+    """Train `world` in place on those of the episodes that are labelled successes.
+
+    Args:
+        stride: see SuccessfulClips.
+        tokenizer: trains its tokenizer first, on all the episodes; None leaves it as it is.
+
+    Returns:
+        What `fit` does, how many episodes it learned from, and what the tokenizer's training says.
+
+    Raises:
+        ValueError: if none of them is a success, or an instruction is longer than its encoder takes.
+    """
+    good = episodes[[store.episodes[number]["success"] is True for number in episodes.tolist()]]
+    if not len(good):
+        raise ValueError(
+            "no episode of the data is labelled a success (next.success), and a text world learns from those"
+            " alone; collect or label some, or use a judge without judge.text_world"
+        )
+    world.check([store.instructions[number] for number in good.tolist()])
+    about: dict[str, Any] = {}
+    if tokenizer is not None:
+        kept = train_tokenizer(world, store, episodes, tokenizer, folder / "tokenizer")
+        about = {f"tokenizer_{name}": kept[name] for name in ("psnr", "codebook_use", "perplexity", "alarm")}
+    clips = SuccessfulClips(store, good, world.window, stride)
+
+    def batch(step: int, generator: torch.Generator) -> TensorDict:
+        return clips.sample(options.part, generator)
+
+    stats = fit("text_world", world, batch, world.loss, options, folder)
+    return {**stats, **about, "successes": len(good)}

@@ -1,0 +1,97 @@
+"""worldloop gridworld: how to tell a world of actions (WPE, figure 3), by squares that move as they say."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from actors.factory import build_simulator
+from envs.files import write_text
+from envs.simulators.replay import replay
+from envs.targets import TARGET
+from pipeline.evaluation.squares import square_errors
+from pipeline.graph.graph import Graph
+from pipeline.stages import collect, world
+from pipeline.stages.given import open_store
+from pipeline.track import Tracker
+
+# How actions are told, and by which class.
+TOLD = {
+    "numbers": "envs.conditioning.ActionVector",
+    "digits": "envs.conditioning.ActionText",
+}
+STEPS = (1, 5, 10, 25, 50)
+
+
+def variant(cfg: Mapping[str, Any], squares: int, told: str) -> dict[str, Any]:
+    """The config of a world of so many squares whose actions are told as TOLD names it."""
+    suite, task = {**cfg["task"]["suite"], "squares": squares}, cfg["task"]
+    simulator = {**cfg["simulator"], "actions": {TARGET: TOLD[told]}}
+    return {**cfg, "task": {**task, "suite": suite}, "simulator": simulator}
+
+
+def gridworld(cfg: Mapping[str, Any], root: Path, squares: Sequence[int], tracker: Tracker | None) -> str:
+    """Train a world for each number of squares and each way to tell actions, and measure it; a table.
+
+    Finished stages are reused, interrupted ones resume; what is measured is written to gridworld.json as soon
+    as it is known.
+
+    Args:
+        cfg: the resolved config of experiment=gridworld.
+        root: the run's folder.
+        squares: numbers of squares.
+    """
+    rows: list[dict[str, Any]] = []
+    for count in squares:
+        for told in TOLD:
+            row = {"squares": count, "told": told, **_measured(variant(cfg, count, told), root, tracker)}
+            rows.append(row)
+            write_text(root / "gridworld.json", json.dumps(rows, indent=1))
+            print(f"{count} squares, actions as {told}: {row['errors']}", flush=True)
+    return table(rows)
+
+
+def _measured(cfg: Mapping[str, Any], root: Path, tracker: Tracker | None) -> dict[str, Any]:
+    """Train one world, and roll it out over the held-out episodes under their true actions."""
+    graph = Graph(cfg, root / "stages")
+    data = [graph.add("collect", collect.collect)]
+    codec = graph.add("tokenizer", world.tokenizer, {"data": data})
+    name = graph.add("simulator", world.simulator, {"data": data, "warm": codec}, phase="first")
+    manifests = graph.run(tracker=tracker)
+    inputs = graph.inputs(name)
+    store = open_store(cfg, inputs)
+    held = store.split("held_out")
+    simulator = build_simulator(cfg, graph.folder(name) / "weights.safetensors")
+    made = replay(simulator, store, held, bf16=cfg["simulator"]["bf16"])
+    steps = tuple(step for step in STEPS if step <= made.valid.shape[1])
+    return {
+        "parameters": sum(p.numel() for p in simulator.parameters() if p.requires_grad),
+        "training_seconds": manifests[name]["seconds"],
+        "episodes": len(held),
+        "errors": square_errors(store, held, made, steps),
+    }
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown: error in pixels of a 256 x 256 picture, median (90th percentile), lost squares."""
+    steps = list(rows[0]["errors"])
+    heads = [f"after {step}" for step in steps]
+    lines = [
+        "Distance of squares from where they truly are, in pixels of a 256 x 256 picture under true actions:"
+        " median (90th percentile), lost squares; at the end of a row, squares that are taken to stand still",
+        "",
+        f"| squares | actions as | M parameters | {' | '.join(heads)} | still |",
+        f"| --- | --- | --- |{' --- |' * (len(steps) + 1)}",
+    ]
+    for row in rows:
+        found = [row["errors"][step] for step in steps]
+        cells = [
+            f"{e['error']['median']:.1f} ({e['error']['p90']:.1f}), {100 * e['lost']:.0f}%" for e in found
+        ]
+        lines.append(
+            f"| {row['squares']} | {row['told']} | {row['parameters'] / 1e6:.1f} | {' | '.join(cells)} |"
+            f" {found[-1]['still']:.0f} |"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""Commands that say how far an imagined world can be trusted; what they share stands in subject.py."""

@@ -1,0 +1,140 @@
+"""worldloop fidelity: a simulator's video against the truth, under the recorded actions of held-out
+episodes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from envs.episodes.clips import ClipStore
+from envs.files import write_text
+from envs.perceptual import PerceptualDistance
+from envs.targets import ConfigError, build
+from pipeline.commands.worlds.subject import Subject
+from pipeline.evaluation.fidelity.extractors import Extractor
+from pipeline.evaluation.fidelity.grid import Settings, combinations, run_grid, with_settings
+from pipeline.evaluation.fidelity.long import drift, long_episodes, longest
+from pipeline.evaluation.fidelity.masks import part_labels
+from pipeline.evaluation.fidelity.open_loop import OpenLoop, held_still
+from pipeline.evaluation.fidelity.page import build_page, summary_text
+from pipeline.evaluation.measurement import groups, speed
+from pipeline.loop import has_physics
+
+Cfg = Mapping[str, Any]
+
+
+def fidelity(cfg: Cfg, root: Path) -> str:
+    """Measure; writes fidelity.json and fidelity.html into the run's folder.
+
+    Returns:
+        The figures, as Markdown.
+
+    Raises:
+        ConfigError: if what is named is not there or cannot work.
+    """
+    section = cfg["fidelity"]
+    # what cannot work is told before anything is measured
+    tried = {} if section["grid"] is None else section["grid"]
+    settled = [with_settings(cfg, settings) for settings in combinations(tried)] if tried else []
+    extractors = build_extractors(section)
+    subject = Subject.of(cfg, root)
+    for other in settled:  # options that change what the weights are of are refused here
+        subject.simulator(other)
+    store = subject.store()
+    episodes = chosen(subject, store, section["episodes"])
+    simulator = subject.simulator()
+    labels = part_labels(cfg, store, episodes, section["masks"])
+    loop = OpenLoop(store, episodes, cfg["simulator"]["bf16"], labels, extractors, section["clip"])
+    place = {int(number): n for n, number in enumerate(episodes)}
+    mine = {
+        name: torch.tensor([place[n] for n in some.tolist()])
+        for name, some in groups(store, episodes).items()
+    }
+    measured = loop.measure(simulator).result(store.spec.embodiment.views, mine)
+    distance = loop.distance
+    result: dict[str, Any] = {
+        **subject.about(),
+        "task": cfg["task"]["name"],
+        "size": list(store.spec.size),
+        "fps": store.fps,
+        "perceptual": distance.name,
+        **measured,
+        "masks": _masks(section, labels),
+        "still": held_still(store, episodes, distance),
+        "frames_per_second": {f"batch {n}": speed(simulator, store, n, 1) for n in (1, 32)},
+        "long": _long(cfg, root, subject, store, distance) if section["long"]["frames"] else None,
+        "grid": None,
+    }
+    if settled:
+        alone = OpenLoop(store, episodes, cfg["simulator"]["bf16"], labels)
+        result["grid"] = _grid(cfg, subject, alone, tried, len(settled))
+    write_text(root / "fidelity.json", json.dumps(result, indent=1))
+    write_text(root / "fidelity.html", build_page(result))
+    return summary_text(result)
+
+
+def build_extractors(section: Mapping[str, Any]) -> list[Extractor]:
+    """The extractors of a section fidelity, of frames and of clips.
+
+    Raises:
+        ConfigError: for weights of another architecture, or an extractor of the other kind.
+    """
+    out = []
+    for key, clips in (("frames_extractor", False), ("clips_extractor", True)):
+        extractor = build(section[key], f"fidelity.{key}")
+        if not isinstance(extractor, Extractor) or extractor.clips is not clips:
+            raise ConfigError(
+                f"fidelity.{key}._target_={section[key]['_target_']} should be an Extractor of"
+                f" {'clips' if clips else 'single frames'} (pipeline/evaluation/fidelity/extractors.py)"
+            )
+        out.append(extractor)
+    return out
+
+
+def chosen(subject: Subject, store: ClipStore, count: int) -> Tensor:
+    """`count` held-out episodes at most, int64 [N], evenly spread over those there are."""
+    held = subject.held_out(store)
+    held = held[store.length[held] > 1]
+    return held[torch.linspace(0, len(held) - 1, min(count, len(held))).round().long()]
+
+
+def _masks(section: Mapping[str, Any], labels: Tensor | None) -> dict[str, Any]:
+    """Where masks came from, and of how many episodes there are any."""
+    if labels is None:
+        return {"source": None, "episodes": 0}
+    known = int((labels != 255).flatten(1).any(1).sum())
+    return {"source": section["masks"] or "physics", "episodes": known}
+
+
+def _long(
+    cfg: Cfg, root: Path, subject: Subject, store: ClipStore, distance: PerceptualDistance
+) -> dict[str, Any] | None:
+    section, simulator = cfg["fidelity"]["long"], subject.simulator()
+    if has_physics(cfg):
+        longer = long_episodes(cfg, root / "fidelity-long")
+        if longer is None:
+            return None
+        store, episodes = longer, torch.arange(len(longer))
+    else:
+        episodes = longest(store, subject.held_out(store), section["episodes"])
+    out = drift(simulator, store, episodes, cfg["simulator"]["bf16"], distance)
+    return {"wanted": section["frames"], **out}
+
+
+def _grid(cfg: Cfg, subject: Subject, loop: OpenLoop, tried: Mapping[str, Any], count: int) -> dict[str, Any]:
+    with tqdm(total=count, desc="fidelity grid", unit="setting", dynamic_ncols=True) as bar:
+
+        def measure(settings: Settings) -> Mapping[str, Any]:
+            simulator = subject.simulator(with_settings(cfg, settings))
+            found = loop.measure(simulator).result(loop.store.spec.embodiment.views, {})
+            bar.update()
+            return {**found["overall"], "frames_per_second": speed(simulator, loop.store, 1, 1)}
+
+        return run_grid(tried, measure)

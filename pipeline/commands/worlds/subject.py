@@ -1,0 +1,152 @@
+"""The imagined world that a command looks at: the run's last, or whatever the section `imagined` names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor, nn
+
+from actors.factory import build_judge, build_simulator, build_state_decoder, open_clips
+from actors.weights import load
+from envs.episodes.clips import ClipStore
+from envs.judges.base import Judge
+from envs.manifest import digest_of, read_manifest
+from envs.simulators.base import Simulator
+from envs.simulators.state_experts.base import StateDecoder
+from envs.targets import ConfigError
+from pipeline.graph.graph import Graph
+from pipeline.loop import build_loop, has_physics
+from pipeline.stages.given import datasets, learns
+
+Cfg = Mapping[str, Any]
+WEIGHTS = "weights.safetensors"
+
+
+@dataclass
+class Subject:
+    """What is looked at.
+
+    Args:
+        cfg: the resolved config.
+        graph: of the run.
+        weights: files of simulator, state and judge, by role.
+        data: data sets.
+    """
+
+    cfg: Cfg
+    graph: Graph
+    weights: Mapping[str, Path]
+    data: list[Path]
+
+    @classmethod
+    def of(cls, cfg: Cfg, root: Path) -> Subject:
+        """That of a run; nothing is loaded yet.
+
+        Raises:
+            ConfigError: if what is named is not there.
+        """
+        graph, section = build_loop(cfg, root), cfg["imagined"]
+        cfg = graph.cfg  # of the world that is acted in
+        inputs = graph.inputs("evaluate-imagined")
+        weights = {
+            role: weights_at(graph, section[role], f"imagined.{role}")
+            if section[role]
+            else inputs.folder(role) / WEIGHTS
+            for role in ("simulator", "state", "judge")
+        }
+        if section["data"]:
+            data = [Path(folder) for folder in section["data"]]
+        elif has_physics(cfg):
+            data = datasets(inputs.folders("data"))
+        else:
+            data = [Path(folder) for folder in cfg["task"]["data"]]
+        missing = [str(folder) for folder in data if not (folder / "meta/info.json").is_file()]
+        if missing:
+            raise ConfigError(
+                f"{missing[0]} is no LeRobot data set (yet); run the stages that record, or name data sets by"
+                " imagined.data=[folder]"
+            )
+        return cls(cfg, graph, weights, data)
+
+    def store(self) -> ClipStore:
+        """Its data sets."""
+        return open_clips(self.cfg, self.data)
+
+    def held_out(self, store: ClipStore) -> Tensor:
+        """Numbers int64 [N] of the episodes that no part of the world has learned from.
+
+        Raises:
+            ConfigError: if there are none.
+        """
+        held = store.split("held_out")
+        if not len(held):
+            raise ConfigError(
+                f"no episode of {[str(folder) for folder in self.data]} is held out; name other data sets by"
+                " imagined.data=[folder], or give these a split 'held_out' (envs/episodes/splits.py)"
+            )
+        return held
+
+    def simulator(self, cfg: Cfg | None = None) -> Simulator:
+        """The simulator, of another config than the subject's own if that is given."""
+        return _with_weights(build_simulator(cfg or self.cfg), self.weights["simulator"]).eval()
+
+    def decoder(self, simulator: Simulator) -> StateDecoder:
+        """The state expert on that simulator."""
+        decoder = _with_weights(build_state_decoder(self.cfg, simulator), self.weights["state"]).eval()
+        decoder.attach(simulator)
+        return decoder
+
+    def judge(self) -> Judge:
+        """The judge."""
+        return _with_weights(build_judge(self.cfg), self.weights["judge"]).eval()
+
+    def about(self) -> dict[str, Any]:
+        """What is looked at, for people: name, classes of simulator and judge, and the weights' files."""
+        return {
+            "name": self.cfg["name"],
+            "simulator": str(self.cfg["simulator"]["_target_"]).rpartition(".")[2],
+            "judge": str(self.cfg["judge"]["_target_"]).rpartition(".")[2],
+            "weights": {role: str(path) for role, path in self.weights.items()},
+        }
+
+    def identity(self, *roles: str) -> dict[str, Any]:
+        """What tells this world from others, as far as some of its parts go: sections and weights."""
+        sections = {"simulator": "simulator", "state": "simulator", "judge": "judge"}
+        return {
+            "sections": {name: self.cfg[name] for name in sorted({sections[role] for role in roles})},
+            "weights": {role: mark(self.weights[role]) for role in roles},
+        }
+
+
+def weights_at(graph: Graph, name: str, key: str) -> Path:
+    """The weights of a stage of the run, of a folder, or a file of weights itself.
+
+    Raises:
+        ConfigError: if there are none.
+    """
+    folder = graph.folder(name) if name in graph.nodes else Path(name)
+    path = folder if folder.suffix == ".safetensors" else folder / WEIGHTS
+    if not path.is_file():
+        stages = [stage for stage in graph.nodes if (graph.folder(stage) / WEIGHTS).is_file()]
+        raise ConfigError(
+            f"{key}={name}: {path} does not exist; name a folder with weights, or one of the finished stages"
+            f" {stages}"
+        )
+    return path
+
+
+def mark(path: Path) -> str:
+    """What tells weights from others: the key of the stage that left them, else a hash of the file; "" where
+    there is no file.
+    """
+    manifest = read_manifest(path.parent) or {}
+    return str(manifest.get("key") or (digest_of(path) if path.is_file() else ""))
+
+
+def _with_weights(part: Any, weights: Path) -> Any:
+    """A part with its weights; one that learns nothing, such as a client of a server, does without."""
+    assert isinstance(part, nn.Module)
+    return part if not learns(part) and not weights.is_file() else load(part, weights)

@@ -1,0 +1,130 @@
+"""worldloop sweep: one number of the action at a time is moved from a start, and the imagined frames are laid
+out as a contact sheet for each, so that one sees whether a world has understood what each number does.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import step_mdp
+from tqdm import tqdm
+
+from actors.factory import build_world
+from envs.episodes.clips import ClipStore
+from envs.files import write_atomically, write_text
+from envs.initial_states import InitialStates
+from envs.specs import CHUNK, COMMAND, WorldSpec, to_chunk
+from envs.targets import ConfigError
+from pipeline.commands.worlds.subject import Subject
+from pipeline.evaluation.value.candidates import action_spread
+from pipeline.stages.given import mode_of
+
+_HEIGHT = 128  # pixels of a picture, about
+_BAR = 20  # pixels over a row, for its title
+
+
+def sweep(cfg: Mapping[str, Any], root: Path) -> list[Path]:
+    """Draw a contact sheet for each number of the action into the run's folder; beside them sweep.json says
+    what was commanded, and by how much pictures changed against those of a robot at rest.
+
+    Raises:
+        ConfigError: if there is no such episode, or what is named is not there.
+    """
+    section, subject = cfg["sweep"], Subject.of(cfg, root)
+    store = subject.store()
+    if section["episode"] >= len(store):
+        raise ConfigError(f"sweep.episode={section['episode']}: there are {len(store)}, from 0 on")
+    spread = usual_travel(store, cfg)
+    names = store.spec.embodiment.action_names
+    simulator = subject.simulator()
+    parts = (simulator, subject.decoder(simulator), subject.judge())
+    levels = [0.0, *section["levels"]]
+    starts = InitialStates.of(store, torch.tensor([section["episode"]]))
+    horizon = section["chunks"] * store.spec.chunk
+    shared = {**cfg, "simulator": {**cfg["simulator"], "shared_noise": True}}  # rows differ by actions alone
+    world = build_world(shared, *parts, starts, len(levels), horizon=horizon)
+    folder, about, made = root / "sweep", [], []
+    for number, name in enumerate(tqdm(names, desc="sweep", unit="number", dynamic_ncols=True)):
+        travel = torch.zeros(len(levels), len(names))
+        travel[:, number] = torch.tensor(levels) * spread[number]
+        frames = imagined(world, travel)
+        path = folder / f"{number:02d}-{re.sub(r'[^a-zA-Z0-9_.-]+', '_', name)}.png"
+        titles = [f"{name} {value:+.3g}" if value else "at rest" for value in travel[:, number].tolist()]
+        picture = contact_sheet(frames, titles, section["pictures"])
+        _write(path, picture)
+        made.append(path)
+        moved = (frames.float() - frames[:1].float()).abs().mean((1, 2, 3, 4, 5))
+        about.append({"name": name, "travel": travel[:, number].tolist(), "changed": moved.tolist()})
+    write_text(folder / "sweep.json", json.dumps({**subject.about(), "numbers": about}, indent=1))
+    return made
+
+
+def usual_travel(store: ClipStore, cfg: Mapping[str, Any]) -> Tensor:
+    """How far each number of an action goes in recordings, float32 [A]: the standard deviation of absolute
+    commands, and of deltas that of the deltas themselves.
+    """
+    if store.spec.embodiment.delta:
+        return action_spread(store, mode_of(cfg))
+    return store.arrays["commands"].std(0)
+
+
+def commanded(spec: WorldSpec, start: Tensor, travel: Tensor, steps: int) -> Tensor:
+    """Commands float32 [B, steps, A] by which numbers go from where they are, `start` [B, A], by `travel`
+    [B, A] in a straight line; of a robot that takes deltas, that delta again and again.
+    """
+    if spec.embodiment.delta:
+        return travel[:, None].expand(-1, steps, -1)
+    share = torch.arange(1, steps + 1) / steps
+    return start[:, None] + share[None, :, None] * travel[:, None]
+
+
+@torch.no_grad()
+def imagined(world: TransformedEnv, travel: Tensor) -> Tensor:
+    """Frames uint8 [B, 1 + T, V, 3, H, W], the real first one among them, of a world whose B slots begin
+    alike and are moved by `travel` [B, A].
+    """
+    base = world.base_env
+    base.schedule([0] * len(travel))
+    now = world.reset()
+    plan = commanded(base.spec, now[COMMAND].cpu(), travel, base.horizon)
+    for begin in range(0, base.horizon, base.chunk):
+        in_force = now[COMMAND]
+        chunk = to_chunk(plan[:, begin : begin + base.chunk].to(in_force.device), in_force, base.mode)
+        now[CHUNK] = chunk
+        now = step_mdp(world.step(now), exclude_reward=True, exclude_done=True)
+    return torch.stack([base.video(slot) for slot in range(len(travel))])
+
+
+def contact_sheet(frames: Tensor, titles: list[str], count: int) -> NDArray[np.uint8]:
+    """A picture RGB [H, W, 3]: a row for each of frames uint8 [B, T, V, 3, H, W] with its title above,
+    `count` moments from the first to the last across, their views side by side.
+    """
+    at = torch.linspace(0, frames.shape[1] - 1, count).round().long().unique()
+    scale = max(1, round(_HEIGHT / frames.shape[-2]))
+    rows = []
+    for row, title in zip(frames[:, at], titles, strict=True):
+        moments = [np.concatenate(list(views.permute(0, 2, 3, 1).numpy()), 1) for views in row]
+        gap = np.full((moments[0].shape[0], 2, 3), 255, np.uint8)
+        line = np.concatenate([part for moment in moments for part in (moment, gap)], 1)
+        line = cv2.resize(line, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
+        framed = cv2.copyMakeBorder(line, _BAR, 0, 6, 0, cv2.BORDER_CONSTANT, value=(24, 24, 24))
+        where = (6, _BAR - 6)
+        cv2.putText(framed, title, where, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (230, 230, 230), 1, cv2.LINE_AA)
+        rows.append(framed)
+    return np.ascontiguousarray(np.concatenate(rows))
+
+
+def _write(path: Path, picture: NDArray[np.uint8]) -> None:
+    done, data = cv2.imencode(".png", picture[..., ::-1])
+    assert done, f"{path}: OpenCV cannot encode a picture of {picture.shape}"
+    write_atomically(path, lambda part: part.write_bytes(data.tobytes()))

@@ -1,0 +1,1 @@
+"""How like the truth generated video is, under true actions."""

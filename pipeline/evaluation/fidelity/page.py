@@ -1,0 +1,135 @@
+"""Fidelity of a simulator as text and as one page that a paper could print."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from markupsafe import Markup
+
+from pipeline.evaluation.charts import Curve, line_chart
+from pipeline.evaluation.report import templates
+
+# Figures of a row: key, heading and form.
+FIGURES = (
+    ("mse", "MSE", "{:.4f}"),
+    ("psnr", "PSNR dB", "{:.2f}"),
+    ("ssim", "SSIM", "{:.3f}"),
+    ("perceptual", "NLPD", "{:.3f}"),
+    ("arm_mse", "arm MSE", "{:.4f}"),
+    ("object_mse", "object MSE", "{:.4f}"),
+)
+_CURVES = ("psnr", "ssim", "perceptual", "arm_mse", "object_mse")
+
+
+def build_page(result: Mapping[str, Any]) -> str:
+    """One self-contained HTML page of fidelity.json."""
+    rows = {
+        "all": result["overall"],
+        **result["groups"],
+        **{f"view {k}": v for k, v in result["views"].items()},
+    }
+    return (
+        templates()
+        .get_template("fidelity.html.j2")
+        .render(
+            result=result,
+            headings=[title for _, title, _ in FIGURES],
+            rows={name: texts(row) for name, row in rows.items()},
+            curves=_curves(result),
+            long=_long(result["long"]) if result["long"] else [],
+            grid=_grid(result["grid"]) if result["grid"] else None,
+            collapse=collapse_text(result["long"]),
+        )
+    )
+
+
+def summary_text(result: Mapping[str, Any]) -> str:
+    """Markdown: overall figures, by source, Frechet distances, long rollouts, and the grid's optimum."""
+    titles = [title for _, title, _ in FIGURES]
+    lines = [
+        f"{result['simulator']} under the true actions of {result['episodes']} held-out episodes; perceptual"
+        f" distance: {result['perceptual']}",
+        "",
+        f"| | {' | '.join(titles)} |",
+        f"| --- |{' --- |' * len(titles)}",
+    ]
+    for name, row in {"all": result["overall"], **result["groups"]}.items():
+        lines.append(f"| {name} | {' | '.join(texts(row))} |")
+    lines.append("")
+    for one in result["frechet"]:
+        lines.append(f"Frechet distance {one['value']:.4g} of {one['samples']} samples by {one['extractor']}")
+    lines.append(collapse_text(result["long"]))
+    if result["grid"]:
+        table = _grid(result["grid"])
+        lines += ["", f"| {' | '.join(table['headings'])} |", f"|{' --- |' * len(table['headings'])}"]
+        lines += [f"| {' | '.join(cells)} |" for cells in table["rows"]]
+        lines += ["", table["best"]]
+    return "\n".join(lines)
+
+
+def texts(row: Mapping[str, Any]) -> list[str]:
+    """The texts of FIGURES; "-" for what is unknown."""
+    return ["-" if row.get(key) is None else form.format(row[key]) for key, _, form in FIGURES]
+
+
+def collapse_text(long: Mapping[str, Any] | None) -> str:
+    """What came of long rollouts, in a sentence."""
+    if long is None:
+        return "No long rollouts were made."
+    end = long["end"]
+    said = "the video has collapsed" if long["collapsed"] else "no collapse"
+    short = (
+        f" ({long['wanted']} were wanted; recordings are no longer)"
+        if long["frames"] < long["wanted"]
+        else ""
+    )
+    return (
+        f"After {long['frames']} frames{short} {said}: PSNR {end['psnr']:.1f} dB, sharpness"
+        f" {end['sharpness']:.2f} of the truth's over the last tenth of {long['episodes']} rollouts"
+    )
+
+
+def _curves(result: Mapping[str, Any]) -> list[Markup]:
+    titles = {key: title for key, title, _ in FIGURES}
+    charts = []
+    for key in _CURVES:
+        lines = [Curve("generated", *_points(result["by_frame"].get(key, [])))]
+        if key in result["still"]:
+            lines.append(Curve("first frame held", *_points(result["still"][key])))
+        charts.append(line_chart(lines, f"{titles[key]} against frame number", "frame", titles[key]))
+    return [chart for chart in charts if chart]
+
+
+def _long(long: Mapping[str, Any]) -> list[Markup]:
+    lines = [Curve("generated", *_points(long["by_frame"]["psnr"]))]
+    lines.append(Curve("first frame held", *_points(long["still"])))
+    if long["unrelated"]:
+        lines.append(Curve("another episode", *_points(long["unrelated"])))
+    sharp = [Curve("generated / true", *_points(long["sharpness"]))]
+    return [
+        line_chart(lines, "PSNR of long rollouts", "frame", "PSNR dB"),
+        line_chart(sharp, "Sharpness of long rollouts, 1 is the truth's", "frame", "mean gradient"),
+    ]
+
+
+def _points(values: Sequence[float | None]) -> tuple[list[float], list[float]]:
+    known = [(n + 1.0, value) for n, value in enumerate(values) if value is not None]
+    return [x for x, _ in known], [y for _, y in known]
+
+
+def _grid(grid: Mapping[str, Any]) -> dict[str, Any]:
+    """Headings, rows of texts, and the optimum in words."""
+    headings = [*grid["keys"], *(title for _, title, _ in FIGURES), "frames/s"]
+    rows = [
+        [
+            *(str(row["settings"][key]) for key in grid["keys"]),
+            *texts(row),
+            f"{row['frames_per_second']:.0f}",
+        ]
+        for row in grid["rows"]
+    ]
+    best = grid["rows"][grid["best"]]["settings"]
+    said = ", ".join(f"{key}={value}" for key, value in best.items())
+    name = grid["figure"].replace("_mse", " MSE").replace("mse", "MSE")
+    return {"headings": headings, "rows": rows, "best": f"Least {name}: {said}"}

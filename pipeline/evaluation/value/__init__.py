@@ -1,0 +1,1 @@
+"""Values of policies in an imagined world, beside their true ones."""

@@ -1,0 +1,117 @@
+"""Values of policies as a table of text and as one page with plots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from markupsafe import Markup
+
+from pipeline.evaluation.charts import Point, agreement_chart
+from pipeline.evaluation.report import templates
+from pipeline.evaluation.statistics import rate
+
+_SERIES = ("in distribution", "out of distribution")
+# Figures of an agreement: key, heading and form.
+FIGURES = (
+    ("pearson", "Pearson", "{:.2f}"),
+    ("spearman", "Spearman", "{:.2f}"),
+    ("mmrv", "MMRV", "{:.3f}"),
+    ("difference", "mean |dSR|, points", "{:.1f}"),
+)
+
+
+def build_page(result: Mapping[str, Any]) -> str:
+    """One self-contained HTML page of policy-value.json."""
+    tasks = list(result["starts"])
+    found = result["agreement"]
+    rows = found.get("tasks", {}) if found else {}
+    return (
+        templates()
+        .get_template("value.html.j2")
+        .render(
+            result=result,
+            verdict=verdict(result),
+            charts=_charts(result["cells"], tasks),
+            figures=[title for _, title, _ in FIGURES],
+            agreements=[
+                ("all", _figures(found), found),
+                *((t, _figures(row), row) for t, row in rows.items()),
+            ]
+            if found
+            else [],
+        )
+    )
+
+
+def table_text(result: Mapping[str, Any]) -> str:
+    """Markdown: a row for each policy, true and estimated values by task; then what they come to."""
+    tasks = list(result["starts"])
+    found = {(cell["policy"], cell["task"]): cell for cell in result["cells"]}
+    lines = [
+        f"Values of policies in {result['simulator']} by {result['judge']}, in percent: true -> estimated,"
+        f" +- standard error over {result['repeats']} repeats",
+        "",
+        f"| policy | {' | '.join(tasks)} |",
+        f"| --- |{' --- |' * len(tasks)}",
+    ]
+    for policy in dict.fromkeys(cell["policy"] for cell in result["cells"]):
+        cells = [_cell_text(found[policy, task]) for task in tasks]
+        lines.append(f"| {policy} | {' | '.join(cells)} |")
+    lines += ["", verdict(result), *result["notes"]]
+    return "\n".join(lines)
+
+
+def verdict(result: Mapping[str, Any]) -> str:
+    """What agreement there is, in one sentence."""
+    found = result["agreement"]
+    if not found:
+        return "Estimated values alone: without true ones nobody knows how far they can be trusted."
+    kept = found["order"]
+    said = ", ".join(f"{title} {value}" for title, value in zip(_titles(), _figures(found), strict=True))
+    sides = [
+        f"{100 * side['mean']:+.1f} points {_SERIES[name == 'out']}" for name, side in found["bias"].items()
+    ]
+    ranking = "ranking kept" if found["kept"] else "ranking not kept"
+    return (
+        f"{ranking} ({kept['kept']} of {kept['pairs']} pairs); {said}; estimated less true {', '.join(sides)}"
+    )
+
+
+def _titles() -> list[str]:
+    return [title for _, title, _ in FIGURES]
+
+
+def _figures(found: Mapping[str, Any]) -> list[str]:
+    """The texts of FIGURES; "-" for what cannot be said."""
+    out = []
+    for key, _, form in FIGURES:
+        value = found[key]
+        scale = 100 if key == "difference" else 1
+        out.append("-" if value is None else form.format(scale * value))
+    return out
+
+
+def _cell_text(cell: Mapping[str, Any]) -> str:
+    value, error = cell["estimated"], cell["standard_error"]
+    estimated = "nothing judged" if value is None else f"{100 * value:.0f}"
+    spread = "" if error is None or value is None else f" +- {100 * error:.1f}"
+    true = f"{100 * rate(cell['true']):.0f} -> " if "true" in cell else ""
+    return f"{true}{estimated}{spread}"
+
+
+def _charts(cells: Sequence[Mapping[str, Any]], tasks: Sequence[str]) -> list[Markup]:
+    """Estimated over true values: of all tasks, and of each of several; [] where no true value is known."""
+    known = [cell for cell in cells if "true" in cell and cell["estimated"] is not None]
+    if not known:
+        return []
+    shown = [("All cells", known)] if len(tasks) == 1 else [("All tasks", known)]
+    if len(tasks) > 1:
+        shown += [(task, [cell for cell in known if cell["task"] == task]) for task in tasks]
+    return [agreement_chart([_point(cell) for cell in some], _SERIES, title) for title, some in shown]
+
+
+def _point(cell: Mapping[str, Any]) -> Point:
+    label = f"{cell['policy']}, {cell['task']}: {_cell_text(cell)} percent"
+    series = 0 if cell["inside"] else 1
+    return Point(label, cell["true_value"], cell["estimated"], cell["standard_error"] or 0.0, series)

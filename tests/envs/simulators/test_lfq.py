@@ -1,0 +1,120 @@
+"""Lookup-free quantisation: tokens there and back, entropies, gradients, and a codebook that collapses."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from envs.simulators.tokenizers.errors import gradient_difference
+from envs.simulators.tokenizers.lfq import LookupFreeQuantiser, LookupFreeTokenizer
+from learners.stages.tokenizer import CodecAlarm
+
+OPTIONS: dict[str, Any] = {
+    "bits": 8,
+    "factors": 2,
+    "stride": 8,
+    "width": 16,
+    "gradients": 1.0,
+    "commitment": 0.25,
+    "entropy": 0.1,
+}
+
+
+def tokenizer(**changes: Any) -> LookupFreeTokenizer:
+    torch.manual_seed(0)
+    return LookupFreeTokenizer(**OPTIONS | changes)
+
+
+def pictures(count: int) -> torch.Tensor:
+    return torch.rand(count, 3, 32, 48, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize(("bits", "factors"), [(8, 1), (8, 2), (9, 3), (36, 4)])
+def test_tokens_are_signs_and_back(bits: int, factors: int) -> None:
+    quantiser = LookupFreeQuantiser(bits, factors)
+    z = torch.randn(5, bits, 2, 3)
+    tokens = quantiser.tokens(z)
+    assert tokens.shape == (5, 2, 3, factors) and int(tokens.max()) < quantiser.codes == 2 ** (
+        bits // factors
+    )
+    assert torch.equal(quantiser.latents(tokens), torch.where(z > 0, 1.0, -1.0))
+    every = torch.arange(quantiser.codes)[:, None, None, None].expand(-1, 1, 1, factors)
+    assert torch.equal(quantiser.tokens(quantiser.latents(every)), every)
+
+
+def test_a_bit_moves_the_token_of_its_factor_alone() -> None:
+    quantiser, z = LookupFreeQuantiser(8, 2), -torch.ones(1, 8, 1, 1)
+    for bit in range(8):
+        turned = z.clone()
+        turned[0, bit] = 1.0
+        wanted = [0, 0]
+        wanted[bit // 4] = 2 ** (bit % 4)
+        assert quantiser.tokens(turned).flatten().tolist() == wanted
+
+
+def test_entropies_of_sure_unsure_spread_and_collapsed_codes() -> None:
+    quantiser = LookupFreeQuantiser(6, 2)
+    spread = quantiser.latents(torch.cartesian_prod(torch.arange(8), torch.arange(8))[:, None, None])
+    each, whole = quantiser.entropies(8 * spread)
+    assert float(each) < 1e-3 and abs(float(whole) - 2 * math.log(8)) < 1e-3
+    each, whole = quantiser.entropies(torch.zeros(4, 6, 1, 1))
+    assert abs(float(each) - 6 * math.log(2)) < 1e-4 and abs(float(whole) - 6 * math.log(2)) < 1e-4
+    each, whole = quantiser.entropies(8 * spread[:1].expand(64, -1, -1, -1))
+    assert float(each) < 1e-3 and float(whole) < 1e-3
+    share, perplexity = quantiser.use(quantiser.tokens(spread))
+    assert float(share) == 1.0 and abs(float(perplexity) - 8) < 1e-3
+    share, perplexity = quantiser.use(torch.zeros(10, 2, dtype=torch.int64))
+    assert float(share) == 1 / 8 and abs(float(perplexity) - 1) < 1e-3
+
+
+def test_gradients_pass_the_signs_and_reach_every_weight() -> None:
+    codec = tokenizer()
+    value, figures = codec.loss(pictures(4))
+    value.backward()
+    assert bool(value.isfinite()) and {"psnr", "codebook_use", "perplexity"} == figures.keys()
+    assert not [name for name, p in codec.named_parameters() if p.grad is None or not p.grad.any()]
+
+
+def test_stills_are_encoded_alone_and_decoded_to_their_size() -> None:
+    codec, stills = tokenizer(stride=16), pictures(4)
+    with torch.no_grad():
+        tokens = codec.encode(stills)
+        assert tokens.shape == (4, 2, 3, 2) and codec.decode(tokens).shape == stills.shape
+        assert torch.equal(codec.encode(stills.flip(0)).flip(0), tokens)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"), [({"factors": 3}, r"codec\.bits=8"), ({"stride": 12}, r"codec\.stride=12")]
+)
+def test_options_that_cannot_work_are_named(change: dict[str, int], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        tokenizer(**change)
+
+
+def test_edges_cost_more_than_shades() -> None:
+    truth = torch.zeros(1, 3, 16, 16)
+    truth[..., 8:] = 1.0
+    blurred = truth.clone()
+    blurred[..., 6:10] = torch.tensor([0.2, 0.4, 0.6, 0.8])
+    assert float(gradient_difference(truth, truth)) == 0.0
+    assert float(gradient_difference(truth + 0.1, truth)) < 1e-6 < float(gradient_difference(blurred, truth))
+
+
+def test_a_collapsed_codebook_gives_one_alarm_that_says_what_to_do(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    codec = tokenizer()
+    alarm = CodecAlarm(codec, patience=3)
+    with torch.no_grad():
+        codec.encoder[-1].bias.fill_(100.0)  # whatever is seen, all signs are 1
+        for _ in range(8):
+            _, figures = codec.loss(pictures(2))
+            alarm.check({name: float(value) for name, value in figures.items()})
+    assert "simulator.codec.entropy" in alarm.said and "collapsed" in alarm.said
+    assert capsys.readouterr().err.count("ALARM tokenizer") + alarm.said.count("ALARM") <= 1
+    healthy = CodecAlarm(codec, patience=1)
+    healthy.check({"psnr": 20.0, "perplexity": 9.0})
+    assert not healthy.said and codec.warning(codec.figures(pictures(2)))

@@ -1,0 +1,97 @@
+"""Agreement of imagined and true values against cases that were worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import pearsonr, spearmanr
+
+from pipeline.evaluation.agreement import Cell, agreement, bias, correlation, macro, micro, mmrv, order
+
+TRUE = np.array([0.9, 0.5, 0.1])
+
+
+def bools(text: str) -> torch.Tensor:
+    return torch.tensor([letter == "1" for letter in text])
+
+
+def cell(policy: str, true: str | None, *repeats: str, inside: bool = True, task: str = "push") -> Cell:
+    imagined = torch.stack([bools(text) for text in repeats])
+    judged = torch.ones_like(imagined)
+    return Cell(policy, task, inside, imagined, judged, None if true is None else bools(true))
+
+
+def test_rank_violations_weigh_by_the_true_difference() -> None:
+    assert mmrv(TRUE, np.array([0.6, 0.3, 0.2])) == 0.0
+    # The last two change places: each is wrong about the other, by .4; the first is right about both.
+    assert mmrv(TRUE, np.array([0.6, 0.2, 0.3])) == pytest.approx((0.0 + 0.4 + 0.4) / 3)
+    # All turned round: .9 is wrong about .1, .5 about either end, .1 about .9.
+    assert mmrv(TRUE, -TRUE) == pytest.approx((0.8 + 0.4 + 0.8) / 3)
+    # Who estimates all alike does not say that the smaller of a pair is smaller: .5 beside .9, .1 beside .9.
+    assert mmrv(TRUE, np.zeros(3)) == pytest.approx((0.0 + 0.4 + 0.8) / 3)
+
+
+def test_correlations_are_those_of_the_textbook() -> None:
+    estimated = np.array([0.6, 0.2, 0.3])
+    # deviations .4, 0, -.4 and .2333, -.1667, -.0667: .12 / sqrt(.32 * .08667)
+    assert correlation(pearsonr, TRUE, estimated) == pytest.approx(0.12 / math.sqrt(0.32 * 0.26 / 3))
+    assert correlation(spearmanr, TRUE, estimated) == pytest.approx(0.5)
+    assert correlation(pearsonr, TRUE, np.full(3, 0.4)) is None
+    assert correlation(spearmanr, TRUE[:1], estimated[:1]) is None
+
+
+def test_pairs_that_tie_in_truth_say_nothing_and_those_that_tie_in_estimates_are_not_kept() -> None:
+    assert order(np.array([0.5, 0.5, 0.1]), np.array([0.3, 0.6, 0.2])) == {"kept": 2, "pairs": 2}
+    assert order(TRUE, np.array([0.4, 0.4, 0.1])) == {"kept": 2, "pairs": 3}
+
+
+def test_micro_counts_episodes_and_macro_cells() -> None:
+    large = {"tp": 8, "fp": 0, "fn": 0, "tn": 0}
+    small = {"tp": 0, "fp": 1, "fn": 1, "tn": 0}
+    assert micro([large, small]) == {"tp": 8, "fp": 1, "fn": 1, "tn": 0, "accuracy": 0.8}
+    assert macro([large, small]) == {"tp": 0.5, "fp": 0.25, "fn": 0.25, "tn": 0.0, "accuracy": 0.5}
+
+
+def test_a_cell_knows_its_value_and_how_sure_it_is() -> None:
+    one = cell("a", "1100", "1000", "1110")
+    # rates 1/4 and 3/4: their standard deviation is sqrt(1/8), the mean's error that over sqrt(2)
+    assert one.estimated == 0.5 and one.error == pytest.approx(0.25)
+    assert one.table == {"tp": 3, "fp": 1, "fn": 1, "tn": 3, "accuracy": 0.75}
+    assert cell("a", "1100", "1000").error is None
+    with pytest.raises(ValueError, match="nobody tried a on push"):
+        _ = cell("a", None, "1000").value
+
+
+def test_what_the_judge_dropped_counts_for_nothing() -> None:
+    judged = torch.tensor([[True, False, True, True], [False] * 4])
+    some = Cell("a", "push", True, bools("1100").repeat(2, 1), judged, bools("1100"))
+    assert some.rates == [pytest.approx(1 / 3)] and some.row()["dropped"] == 5
+    assert some.table == {"tp": 1, "fp": 0, "fn": 0, "tn": 2, "accuracy": 1.0}
+    nothing = Cell("b", "push", True, bools("11")[None], torch.zeros(1, 2, dtype=torch.bool), bools("11"))
+    assert nothing.row()["estimated"] is None and agreement([nothing]) == {}
+
+
+def test_kind_outside_and_hard_inside() -> None:
+    """As WPE found: under-estimated where the world knows policies, over-estimated under noise."""
+    cells = [
+        cell("good", "1111", "1110", "1110"),
+        cell("fair", "1100", "1000", "1000"),
+        cell("noise", "0000", "0000", "1000", inside=False),
+    ]
+    found = agreement(cells)
+    assert found["kept"] and found["mmrv"] == 0.0 and found["spearman"] == 1.0 and "tasks" not in found
+    assert found["bias"]["in"] == {"cells": 2, "mean": -0.25, "over": 0, "under": 2, "exact": 0}
+    assert found["bias"]["out"]["mean"] == 0.125 and found["bias"]["out"]["over"] == 1
+    assert found["difference"] == pytest.approx((0.25 + 0.25 + 0.125) / 3)
+
+
+def test_orders_are_compared_within_tasks_alone() -> None:
+    easy = [cell("a", "1111", "1111"), cell("b", "1110", "0111")]
+    hard = [cell("a", "0000", "0000", task="pull"), cell("b", "1000", "1111", task="pull")]
+    found = agreement([*easy, *hard, cell("c", None, "1111")])
+    assert found["order"] == {"kept": 2, "pairs": 2} and found["kept"] and found["cells"] == 4
+    assert set(found["tasks"]) == {"pull", "push"} and found["tasks"]["pull"]["difference"] == 0.375
+    assert bias(np.array([0.2]), np.array([0.2]))["exact"] == 1

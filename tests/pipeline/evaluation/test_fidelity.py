@@ -1,0 +1,258 @@
+"""Errors of generated video against hand-worked cases and reference implementations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import sqrtm
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torch.nn import functional
+
+from envs.episodes.clips import ClipStore
+from envs.perceptual import PerceptualDistance
+from envs.rng import constant_generator
+from envs.simulators.base import Simulator
+from envs.specs import WorldSpec
+from envs.targets import ConfigError
+from pipeline.evaluation.fidelity.extractors import I3D, Extractor, Inception, PyramidClips, PyramidFrames
+from pipeline.evaluation.fidelity.frames import by_frame, check_pair, frame_errors, psnr, summary
+from pipeline.evaluation.fidelity.frechet import Moments, check_comparable, frechet
+from pipeline.evaluation.fidelity.grid import combinations, optimum, with_settings
+from pipeline.evaluation.fidelity.long import drift
+from pipeline.evaluation.fidelity.masks import read_labels
+from pipeline.evaluation.fidelity.open_loop import OpenLoop, held_still
+from tests.moving_square import picture
+
+
+class Drawing(Simulator):
+    """A world of tests/moving_square.py that is right, or wrong in a known way.
+
+    Args:
+        how: frames uint8 [B, K, V, 3, H, W] that it makes of the right ones.
+    """
+
+    def __init__(self, spec: WorldSpec, how: str):
+        super().__init__(spec, 1)
+        self.how, self.feature_shape = how, (1,)
+
+    def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
+        places = inputs["future", "commands"][..., :2].double().numpy()
+        frames = torch.from_numpy(
+            np.stack([np.stack([picture(place, self.spec.views) for place in row]) for row in places])
+        )
+        if self.how == "noise":
+            frames = torch.randint(0, 255, frames.shape, generator=constant_generator(0), dtype=torch.uint8)
+        if self.how == "grey":
+            frames = torch.full_like(frames, 60)
+        return frames, torch.zeros(len(frames), 1)
+
+
+def video(*values: float) -> Tensor:
+    """One episode of one view whose frames are of one grey level each, 16 x 16."""
+    frames = torch.tensor(values).mul(255).round().to(torch.uint8)
+    return frames[None, :, None, None, None, None].expand(1, len(values), 1, 3, 16, 16).contiguous()
+
+
+def test_errors_of_plain_frames_are_known_by_hand() -> None:
+    made, true = video(0.2, 0.4), video(0.2, 0.6)
+    errors = frame_errors(made, true, PerceptualDistance())
+    assert errors["mse"].flatten().tolist() == pytest.approx([0.0, 0.04], abs=1e-6)
+    # Of plain pictures the structural part is 1, and the rest is the textbook's comparison of means.
+    light = (2 * 0.4 * 0.6 + 0.01**2) / (0.4**2 + 0.6**2 + 0.01**2)
+    assert errors["ssim"].flatten().tolist() == pytest.approx([1.0, light], abs=1e-3)
+    assert errors["perceptual"][0, 0, 0] == 0.0 < errors["perceptual"][0, 1, 0]
+    both = torch.ones(1, 2, dtype=torch.bool)
+    assert psnr(torch.tensor(0.04)) == pytest.approx(13.979, abs=1e-3)
+    assert summary(errors, both)["mse"] == pytest.approx(0.02, abs=1e-6)
+    assert by_frame(errors, torch.tensor([[True, False]]))["mse"] == [pytest.approx(0.0), None]
+
+
+def test_parts_are_measured_where_they_truly_are() -> None:
+    true = video(0.0)
+    made, labels = true.clone(), torch.zeros(1, 1, 1, 16, 16, dtype=torch.uint8)
+    labels[..., :4, :] = 1  # an arm above, nothing else known of
+    made[..., :2, :] = 255  # half of it is wrong
+    errors = frame_errors(made, true, PerceptualDistance(), labels)
+    assert float(errors["arm_mse"]) == 0.5 and float(errors["mse"]) == 0.125
+    assert torch.isnan(errors["object_mse"]).all()
+    assert summary(errors, torch.ones(1, 1, dtype=torch.bool))["object_mse"] is None
+
+
+def test_videos_of_unequal_length_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"2 frames and 3.*cut both"):
+        check_pair(video(0.1, 0.2), video(0.1, 0.2, 0.3))
+    with pytest.raises(ValueError, match="labels are"):
+        frame_errors(
+            video(0.1), video(0.1), PerceptualDistance(), torch.zeros(1, 1, 1, 8, 8, dtype=torch.uint8)
+        )
+
+
+class Numbers(Extractor):
+    """The first two numbers of each picture, as they are."""
+
+    name, clips = "numbers", False
+
+    def __call__(self, pictures: Tensor) -> Tensor:
+        return pictures[:, :2]
+
+
+def moments(values: Tensor, parts: int = 1) -> Moments:
+    out = Moments(Numbers())
+    for some in values.chunk(parts):
+        out.add(some)
+    return out
+
+
+def test_frechet_distances_are_those_of_the_textbook() -> None:
+    draw = torch.randn(200, 2, generator=torch.Generator().manual_seed(0)).double()
+    other = draw @ torch.tensor([[1.0, 0.6], [0.0, 0.5]]).double() + torch.tensor([1.0, -2.0])
+    found = frechet(moments(draw, 3), moments(other))
+    a, b = np.cov(draw.numpy().T), np.cov(other.numpy().T)
+    means = ((draw.mean(0) - other.mean(0)) ** 2).sum()
+    assert found["value"] == pytest.approx(float(means) + np.trace(a + b - 2 * sqrtm(a @ b).real), rel=1e-6)
+    assert found["samples"] == 200 and found["dim"] == 2 and found["extractor"] == "numbers"
+    # In one dimension it is (mean - mean)^2 + (spread - spread)^2: 3^2 and (1 - 2)^2 of these.
+    line = torch.tensor([[-1.0, 0.0], [1.0, 0.0]]).double() / 2**0.5
+    assert frechet(moments(line), moments(2 * line + torch.tensor([3.0, 0.0])))["value"] == pytest.approx(10)
+    assert frechet(moments(draw), moments(draw))["value"] < 1e-9
+
+
+def test_distances_of_different_extractors_are_never_mixed() -> None:
+    frames, clips = Moments(PyramidFrames()), Moments(PyramidClips())
+    pictures = torch.randint(0, 255, (8, 3, 32, 32), dtype=torch.uint8)
+    frames.add(pictures)
+    clips.add(pictures.unflatten(0, (4, 2)))
+    with pytest.raises(ValueError, match="have no distance"):
+        frechet(frames, clips)
+    with pytest.raises(ValueError, match="two samples"):
+        frechet(Moments(PyramidFrames()), frames)
+    rows = [frechet(one, one) for one in (frames, clips)]
+    with pytest.raises(ValueError, match="different extractors"):
+        check_comparable(rows, ["a", "b"])
+    check_comparable(rows[:1], ["a"])
+
+
+def test_blur_is_further_from_the_truth_than_the_truth(store: ClipStore) -> None:
+    true = store.frames(store.rows(torch.arange(8)))[:, 0]
+    sides = {
+        "true": true[::2],
+        "again": true[1::2],
+        "blurred": functional.avg_pool2d(true[1::2].float(), 5, 1, 2).to(torch.uint8),
+    }
+    gathered = {}
+    for name, frames in sides.items():
+        gathered[name] = Moments(PyramidFrames())
+        gathered[name].add(frames)
+    near, far = (frechet(gathered[name], gathered["true"])["value"] for name in ("again", "blurred"))
+    assert far > 5 * near
+
+
+class Network(nn.Module):
+    def __init__(self, width: int):
+        super().__init__()
+        self.width = width
+
+    def forward(self, x: Tensor, return_features: bool = False) -> Tensor:
+        return x.mean([1, 2, 3])[:, None].expand(len(x), self.width)
+
+
+class VideoNetwork(nn.Module):
+    def forward(
+        self, x: Tensor, rescale: bool = False, resize: bool = False, return_features: bool = False
+    ) -> Tensor:
+        return x.mean([1, 2, 3, 4])[:, None].expand(len(x), 400)
+
+
+def scripted(path: Path, network: nn.Module) -> str:
+    torch.jit.script(network).save(str(path))
+    return str(path)
+
+
+def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
+    right = Inception(scripted(tmp_path / "inception.pt", Network(2048)))
+    assert (
+        right(torch.zeros(3, 3, 32, 32, dtype=torch.uint8)).shape == (3, 2048) and "Inception" in right.name
+    )
+    with pytest.raises(ConfigError, match=r"another architecture: features \(2, 1000\)"):
+        Inception(scripted(tmp_path / "other.pt", Network(1000)))
+    with pytest.raises(ConfigError, match="are no I3D"):
+        I3D(scripted(tmp_path / "frames.pt", Network(2048)))
+    torch.save({"weight": torch.zeros(2)}, tmp_path / "state.pt")
+    with pytest.raises(ConfigError, match="are no Inception"):
+        Inception(str(tmp_path / "state.pt"))
+    with pytest.raises(ConfigError, match="is not there"):
+        Inception(str(tmp_path / "nowhere.pt"))
+    clips = I3D(scripted(tmp_path / "i3d.pt", VideoNetwork()))
+    assert clips(torch.zeros(2, 16, 3, 8, 8, dtype=torch.uint8)).shape == (2, 400)
+    with pytest.raises(ConfigError, match=r"10 frames or more, not 4; raise fidelity\.clip"):
+        clips(torch.zeros(2, 4, 3, 8, 8, dtype=torch.uint8))
+
+
+def test_a_right_world_is_measured_as_right(store: ClipStore) -> None:
+    labels = torch.ones(20, store.whole(torch.arange(20))[0].shape[1], 3, 32, 32, dtype=torch.uint8)
+    loop = OpenLoop(store, torch.arange(8), False, labels[:8], (PyramidFrames(), PyramidClips()), clip=4)
+    right = loop.measure(Drawing(store.spec, "right")).result(store.spec.embodiment.views, {})
+    wrong = loop.measure(Drawing(store.spec, "grey")).result(store.spec.embodiment.views, {})
+    assert right["episodes"] == 8 and len(right["by_frame"]["mse"]) == 12 and len(right["views"]) == 3
+    assert right["overall"]["psnr"] > 25 > wrong["overall"]["psnr"]  # recordings are encoded with loss
+    assert right["overall"]["arm_mse"] == pytest.approx(right["overall"]["mse"])
+    for one, other in zip(right["frechet"], wrong["frechet"], strict=True):
+        assert one["extractor"] == other["extractor"] and one["value"] < other["value"] / 10
+    assert {one["samples"] for one in right["frechet"]} == {8 * 12 * 3, 8 * 3 * 3}
+    still = held_still(store, torch.arange(8), loop.distance)
+    assert still["mse"][-1] > 5 * right["by_frame"]["mse"][-1]
+
+
+def test_collapse_is_seen_and_nothing_else_taken_for_it(store: ClipStore) -> None:
+    episodes = torch.arange(0, 20, 2)
+
+    def of(how: str) -> dict[str, object]:
+        return drift(Drawing(store.spec, how), store, episodes, False, PerceptualDistance())
+
+    right, noise, grey = of("right"), of("noise"), of("grey")
+    assert not right["collapsed"] and noise["collapsed"] and grey["collapsed"]
+    assert right["frames"] == 12 and len(right["still"]) == len(right["unrelated"]) == 12  # type: ignore[arg-type]
+    assert right["end"]["sharpness"] == pytest.approx(1, abs=0.2)  # type: ignore[index]
+    assert noise["end"]["sharpness"] > 2 and grey["end"]["sharpness"] < 0.1  # type: ignore[index]
+
+
+def test_masks_of_real_video_come_from_a_file(store: ClipStore, tmp_path: Path) -> None:
+    length = int(store.length[3])
+    good = {str(n): np.zeros((length, 3, 16, 16), np.uint8) for n in (3, 5)}
+    good["5"][:, :, :8] = 2
+    np.savez(tmp_path / "good.npz", **good)
+    labels = read_labels(tmp_path / "good.npz", store, torch.tensor([3, 5]))
+    assert labels.shape == (2, length - 1, 3, 32, 32)
+    assert (labels[1, :, :, :16] == 2).all() and not labels[0].any() and not labels[1, :, :, 16:].any()
+    with pytest.raises(ConfigError, match="holds no array '4'"):
+        read_labels(tmp_path / "good.npz", store, torch.tensor([4]))
+    np.savez(tmp_path / "short.npz", **{"3": good["3"][1:]})
+    with pytest.raises(ConfigError, match=rf"the episode takes \[{length}, 3, h, w\]"):
+        read_labels(tmp_path / "short.npz", store, torch.tensor([3]))
+    (tmp_path / "no.npz").write_text("no")
+    with pytest.raises(ConfigError, match=r"is no \.npz file"):
+        read_labels(tmp_path / "no.npz", store, torch.tensor([3]))
+
+
+def test_options_at_inference_in_all_combinations() -> None:
+    grid = {"simulator.context": [1, 2], "simulator.net.horizon": [4]}
+    assert list(combinations(grid)) == [
+        {"simulator.context": 1, "simulator.net.horizon": 4},
+        {"simulator.context": 2, "simulator.net.horizon": 4},
+    ]
+    cfg = {"simulator": {"context": 9, "net": {"horizon": 9}}}
+    changed = with_settings(cfg, {"simulator.net.horizon": 4})
+    assert changed["simulator"] == {"context": 9, "net": {"horizon": 4}} and cfg["simulator"]["net"] == {
+        "horizon": 9
+    }
+    for key in ("simulator.contexts", "simulator.nets.horizon"):
+        with pytest.raises(ConfigError, match="did you mean"):
+            with_settings(cfg, {key: 1})
+    with pytest.raises(ConfigError, match="options of the simulator"):
+        with_settings(cfg, {"task.chunk": 1})
+    assert optimum([{"mse": 0.2}, {"mse": 0.1}, {"mse": None}], "mse") == 1
+    assert optimum([{"mse": None}], "mse") is None

@@ -1,0 +1,70 @@
+"""Engines are counted on shapes alone, at sizes that no machine here could hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from envs.embodiment import ActionKind, Camera, Embodiment
+from envs.specs import WorldSpec
+from envs.targets import ConfigError
+from pipeline.benches.size import size, size_of
+from pipeline.config import load_config
+from tests.embodiments import BIMANUAL_POSES, world_spec
+from tests.envs.simulators.clips import clip, first_of, future_of
+from tests.envs.simulators.test_engines import ROBOTS, build_engine, section_of
+
+# One camera and seven numbers: what WPE's robots share.
+ARM = Embodiment(
+    robot="wpe",
+    action_names=("x", "y", "z", "roll", "pitch", "yaw", "gripper"),
+    action_kind=ActionKind.OTHER,
+    delta=True,
+    arms=(),
+    state_names=("x",),
+    cameras=(Camera("front", (256, 256)),),
+    fps=10.0,
+)
+
+
+def test_forcing_full_has_the_published_size_and_shapes() -> None:
+    found = size_of(section_of("forcing_full"), WorldSpec(ARM, (256, 256), 9))
+    assert found.trained == pytest.approx(609e6, rel=0.005)
+    # Tokens of 20 frames times two operations per weight that each of them meets, three times over; what
+    # modulates meets frames alone, and attention comes on top.
+    met = 16 * 2 * (4 + 8) * 1024**2
+    assert 1.0 < found.training / (3 * 2 * met * 20 * 256) < 1.25
+    # Nine frames before are read once, nine frames ahead ten times.
+    assert 1.0 < found.generating / (2 * met * (9 + 10 * 9) * 256) < 1.25
+    assert found.activations > 20 * 256 * 1024 * 4 * 16 * 2
+
+
+@pytest.mark.parametrize("name", ["forcing_small", "dit_small", "unet_small", "gesim_tiny"])
+def test_what_is_counted_without_numbers_is_what_is_computed_with_them(name: str) -> None:
+    spec = world_spec(ROBOTS[BIMANUAL_POSES.robot], chunk=5)
+    found = size_of(section_of(name), spec)
+    world, _ = build_engine(name, spec)
+    assert found.trained == sum(p.numel() for p in world.parameters() if p.requires_grad)
+    clips = clip(spec, 1, world.memory_frames)
+    state = world.reset(first_of(spec, clips), torch.tensor([1]))
+    with FlopCounterMode(display=False) as counter:
+        world.step(state, future_of(spec, clips))
+    assert found.generating == pytest.approx(counter.get_total_flops(), rel=0.1)
+    assert found.training > 2 * found.generating / 10 and found.activations > 0
+
+
+def test_an_engine_that_asks_for_numbers_is_named() -> None:
+    section: dict[str, Any] = section_of("forcing_small")
+    section["actions"] = {"_target_": "envs.conditioning.ActionText"}
+    with pytest.raises(ConfigError, match=r"ForcingSimulator\) cannot be counted on shapes alone"):
+        size_of(section, replace(WorldSpec(ARM, (256, 256), 4), size=(64, 64)))
+
+
+def test_the_bench_prints_what_an_engine_takes(capsys: pytest.CaptureFixture[str]) -> None:
+    size(load_config(["simulator=forcing_small"]))
+    said = capsys.readouterr().out
+    assert "ForcingSimulator: 3 x 64 x 64, chunks of 4" in said and "GB a sample" in said

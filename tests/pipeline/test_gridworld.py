@@ -1,0 +1,80 @@
+"""The study of how actions are told: squares are found in pictures, and the whole of it runs and goes on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from envs.physics.gridworld import EDGE, Gridworld
+from envs.targets import ConfigError
+from pipeline.commands.gridworld import gridworld, variant
+from pipeline.config import load_config
+from pipeline.evaluation.squares import find_squares
+from tests.pipeline.test_cli import worldloop
+
+TINY = [
+    *("experiment=gridworld", "task.horizon=3", "launch.workers=1"),
+    *("collect.episodes.train=3", "collect.episodes.held_out=2", "collect.episodes.calibration=1"),
+    *("tokenizer_fit.steps=2", "tokenizer_fit.batch=4"),
+    *("simulator_fit.first.fit.steps=2", "simulator_fit.first.fit.batch=2"),
+    *("simulator.net.layers=1", "simulator.net.heads=1", "simulator.codec.width=8"),
+]
+
+
+def suite(squares: int = 3, size: tuple[int, int] = (32, 32)) -> Gridworld:
+    return Gridworld(squares, size, ["above"], 10, 0.3)
+
+
+def test_squares_are_found_to_a_part_of_a_pixel_and_hidden_ones_are_not() -> None:
+    world, found = suite(), 0
+    for seed in range(20):
+        world.reset("centre", seed)
+        places, seen = find_squares(torch.from_numpy(world.render()[0]), 3)
+        true = torch.from_numpy(world.privileged()["object_poses"][:, :2] * EDGE).float()
+        apart = (true[:, None] - true).abs().amax(-1) > 64
+        clear = [k for k in range(3) if apart[k, torch.arange(3) != k].all()]
+        assert seen[clear].all() and ((places - true)[clear].norm(dim=-1) < 3.0).all()
+        found += len(clear)
+    assert found > 20
+    world._at[:] = EDGE / 2
+    assert find_squares(torch.from_numpy(world.render()[0]), 3)[1].tolist() == [False, False, True]
+
+
+def test_squares_move_by_the_action_and_stay_in_the_picture() -> None:
+    world = suite(2)
+    world.reset("centre", 3)
+    before = world.observe().state
+    action = np.array([10.0, -5.0, 3.0, 400.0]) * np.where(before > 128, -1, 1)
+    world.step(action)
+    moved = world.observe().state - before
+    assert np.allclose(moved[:3], action[:3]) and abs(moved[3]) == 64.0
+    for _ in range(9):
+        world.step(np.array([64.0, 64.0, -64.0, -64.0]))
+    assert world.observe().state.tolist() == [224.0, 224.0, 32.0, 32.0]
+    with pytest.raises(ConfigError, match=r"task\.suite\.squares=4"):
+        suite(4)
+
+
+def test_the_study_runs_and_goes_on_where_it_was(tmp_path: Path) -> None:
+    cfg = load_config(TINY)
+    told = variant(cfg, 3, "digits")
+    assert told["task"]["suite"]["squares"] == 3 and "ActionText" in told["simulator"]["actions"]["_target_"]
+    assert "ActionVector" in cfg["simulator"]["actions"]["_target_"]
+    out = gridworld(cfg, tmp_path, [1], None)
+    rows = json.loads((tmp_path / "gridworld.json").read_text())
+    assert [row["told"] for row in rows] == ["numbers", "digits"]
+    assert list(rows[0]["errors"]) == ["1"] and rows[0]["errors"]["1"]["finder"] < 3.0
+    assert "| 1 | numbers |" in out and "| 1 | digits |" in out
+    made = {path: path.stat().st_mtime_ns for path in tmp_path.glob("stages/*/weights.safetensors")}
+    assert len(made) == 4 and len(list(tmp_path.glob("stages/collect-*"))) == 1
+    assert gridworld(cfg, tmp_path, [1], None) == out
+    assert {path: path.stat().st_mtime_ns for path in made} == made
+
+
+def test_numbers_of_squares_are_checked() -> None:
+    done = worldloop("gridworld", "squares=one")
+    assert done.returncode == 1 and "squares=one: say whole numbers" in done.stderr

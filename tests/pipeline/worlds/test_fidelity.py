@@ -1,0 +1,85 @@
+"""Fidelity and sweeps by one command each: pages, figures, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+
+from actors.factory import open_clips
+from envs.embodiment import Embodiment
+from envs.targets import ConfigError
+from pipeline.commands.worlds.fidelity import fidelity
+from pipeline.commands.worlds.sweep import commanded, sweep
+from pipeline.config import load_config
+from pipeline.evaluation.fidelity.masks import part_labels
+from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
+from tests.worlds import scripted_set, untrained_world
+
+SOAK = ["experiment=soak", "track=disabled", "launch.workers=1", "cameras=main"]
+
+
+def test_fidelity_with_masks_from_physics(tmp_path: Path) -> None:
+    cfg = load_config(SOAK)
+    data = scripted_set(cfg, tmp_path / "set", 3)
+    words = [*SOAK, *untrained_world(cfg, tmp_path), f"imagined.data=[{data}]"]
+    words += ["fidelity.long={frames: 30, episodes: 1, noise_level: 1.0}"]
+    tried = load_config([*words, "fidelity.grid={simulator.motion: [1.0, 2.0]}"])
+    said = fidelity(tried, tmp_path / "run")
+    result = json.loads((tmp_path / "run/fidelity.json").read_text())
+    assert result["masks"] == {"source": "physics", "episodes": 3}
+    assert set(result["overall"]) == {
+        *("mse", "psnr", "ssim", "perceptual", "arm_mse", "object_mse"),
+    }
+    assert None not in result["overall"].values() and set(result["groups"]) == {"noisy"}
+    assert len(result["frechet"]) == 2 and "no learned weights" in result["frechet"][0]["extractor"]
+    assert result["long"]["frames"] == 32 and len(result["long"]["by_frame"]["mse"]) == 32
+    assert [row["settings"] for row in result["grid"]["rows"]] == [
+        {"simulator.motion": 1.0},
+        {"simulator.motion": 2.0},
+    ]
+    assert result["grid"]["figure"] == "arm_mse" and "Least arm MSE: simulator.motion=" in said
+    page = (tmp_path / "run/fidelity.html").read_text()
+    assert "Frechet distances" in page and not re.findall(r'(?:src|href)=(?!"#)', page)
+    with pytest.raises(ConfigError, match="another architecture"):
+        fidelity(load_config([*words, "fidelity.grid={simulator.width: [48]}"]), tmp_path / "run")
+    with pytest.raises(ConfigError, match=r"fidelity\.frames_extractor\._target_=.*single frames"):
+        clips = "fidelity.frames_extractor._target_=pipeline.evaluation.fidelity.extractors.PyramidClips"
+        fidelity(load_config([*words, clips]), tmp_path / "run")
+    # Masks of episodes that physics cannot repeat are masks of something else.
+    store = open_clips(cfg, [data])
+    for row in store.episodes[1:]:
+        row["seed"] += 1000
+    labels = part_labels(cfg, store, torch.arange(3), None)
+    assert labels is not None and (labels[0] != 255).any() and (labels[1:] == 255).all()
+
+
+@pytest.mark.parametrize("robot", [ARM_DELTAS, BIMANUAL_POSES], ids=lambda robot: robot.robot)
+def test_a_contact_sheet_for_each_number_of_any_robot(
+    robot: Embodiment, tmp_path: Path, tiny_data: Callable[[Embodiment], Path]
+) -> None:
+    words = ["experiment=smoke", "track=disabled", "task=lerobot", f"task.data=[{tiny_data(robot)}]"]
+    words += ["task.size=[32,32]", "task.chunk=4", "task.horizon=8", "sweep.chunks=1", "sweep.pictures=3"]
+    words += [*untrained_world(load_config(words), tmp_path), "sweep.levels=[-1.0,1.0]"]
+    sheets = sweep(load_config(words), tmp_path / "run")
+    assert [path.stem for path in sheets] == [f"{n:02d}-{name}" for n, name in enumerate(robot.action_names)]
+    wide = 6 + 4 * 3 * (32 * len(robot.cameras) + 2)
+    assert cv2.imread(str(sheets[0])).shape == (3 * (20 + 4 * 32), wide, 3)
+    rows = json.loads((tmp_path / "run/sweep/sweep.json").read_text())["numbers"]
+    assert all(row["changed"][0] == 0.0 for row in rows) and any(row["changed"][1] > 0 for row in rows)
+    with pytest.raises(ConfigError, match=r"sweep\.episode=99: there are 20"):
+        sweep(load_config([*words, "sweep.episode=99"]), tmp_path / "run")
+
+
+def test_deltas_are_repeated_and_absolute_numbers_go_there() -> None:
+    start, travel = torch.ones(1, 4), torch.tensor([[0.0, 0.4, 0.0, 0.0]])
+    assert commanded(world_spec(ARM_DELTAS), start, travel, 4)[0, :, 1].tolist() == pytest.approx([0.4] * 4)
+    poses = torch.zeros(1, 14)
+    poses[0, 1] = 0.4
+    path = commanded(world_spec(BIMANUAL_POSES), torch.ones(1, 14), poses, 4)
+    assert path[0, :, 1].tolist() == pytest.approx([1.1, 1.2, 1.3, 1.4]) and bool((path[0, :, 0] == 1).all())

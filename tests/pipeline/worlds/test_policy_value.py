@@ -1,0 +1,87 @@
+"""Values of policies by one command: with physics and without it, resumed, and refused where it cannot be."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from actors.factory import build_physics, build_pool
+from actors.policies.recorded import Commands, RecordedActions
+from actors.rollouts.evaluate import evaluate
+from envs.embodiment import Embodiment
+from envs.targets import ConfigError
+from pipeline.commands.worlds.policy_value import policy_value
+from pipeline.config import load_config
+from pipeline.evaluation.value.trials import scripted_outcomes
+from tests.embodiments import ARM_DELTAS
+from tests.worlds import scripted_set, untrained_world
+
+SOAK = ["experiment=soak", "track=disabled", "launch.workers=1", "cameras=main"]
+
+
+def test_recorded_actions_succeed_where_they_did(tmp_path: Path) -> None:
+    cfg = load_config(SOAK)
+    seeds = [3, 4, 5]
+    pool, physics = build_pool(cfg), build_physics(cfg, 3)
+    try:
+        made = scripted_outcomes(pool.script([(3, 0.0), (4, 1.0), (5, 0.0)], cfg["task"]["chunk"]))
+        commands = Commands(made["commands"], made["length"])
+        policy = RecordedActions(commands, physics.spec, physics.mode, lambda: physics.elapsed)
+        assert evaluate(physics, policy, seeds).success.tolist() == made["success"].tolist()
+    finally:
+        pool.close()
+        physics.close()
+    assert made["success"].tolist() == [True, False, True]
+
+
+def test_values_beside_true_ones_and_nothing_is_tried_twice(tmp_path: Path) -> None:
+    cfg = load_config(SOAK)
+    data = scripted_set(cfg, tmp_path / "set", 3)
+    words = [*SOAK, *untrained_world(cfg, tmp_path), f"imagined.data=[{data}]"]
+    words += [f"policy_value.policies=[{tmp_path / 'policy'}]", "policy_value.starts=3"]
+    words += ["policy_value.noise=[0.5]", "policy_value.experts=[0.0,1.0]"]
+    root = tmp_path / "run"
+    policy_value(load_config([*words, "policy_value.repeats=1"]), root)
+    said = policy_value(load_config([*words, "policy_value.repeats=2"]), root)
+    assert said.endswith("8 parts were reused")  # true outcomes and the first repeat of four candidates
+    result = json.loads((root / "policy-value.json").read_text())
+    rows = {cell["policy"]: cell for cell in result["cells"]}
+    assert list(rows) == ["policy", "policy + noise 0.5", "expert 0", "expert 1"]
+    assert rows["expert 0"]["true_value"] == 1.0 and rows["expert 1"]["true_value"] == 0.0
+    assert rows["policy"]["inside"] and not rows["policy + noise 0.5"]["inside"]
+    assert all(row["episodes"] == 6 and row["standard_error"] is not None for row in rows.values())
+    table = result["agreement"]["micro"]
+    assert sum(table[name] for name in ("tp", "fp", "fn", "tn")) == 24
+    assert any("open loop" in note for note in result["notes"])
+    page = (root / "policy-value.html").read_text()
+    assert page.count("<title>") == 5 and "expert 0, push: 100 -&gt; " in page
+    assert not re.findall(r'(?:src|href)=(?!"#)', page)
+
+
+def test_without_physics_values_are_estimated_alone(
+    tmp_path: Path, tiny_data: Callable[[Embodiment], Path]
+) -> None:
+    words = ["experiment=smoke", "track=disabled", "task=lerobot", f"task.data=[{tiny_data(ARM_DELTAS)}]"]
+    words += ["task.size=[32,32]", "task.chunk=4", "task.horizon=8", "policy_value.repeats=1"]
+    words += untrained_world(load_config(words), tmp_path)
+    words += [f"policy_value.policies=[{tmp_path / 'policy'}]", "policy_value.noise=[0.1,0.5]"]
+    said = policy_value(load_config(words), tmp_path / "run")
+    result = json.loads((tmp_path / "run/policy-value.json").read_text())
+    assert result["agreement"] == {} and "nobody knows" in said and "expert" not in said.split("\n\n")[1]
+    assert [cell["policy"] for cell in result["cells"]] == [
+        *("policy", "policy + noise 0.1", "policy + noise 0.5")
+    ]
+    assert all("true" not in cell for cell in result["cells"])
+    assert "Fewer held-out starts than policy_value.starts=32" in said
+    other = "policy_value.others={mine: {_target_: actors.policies.vla.ChunkPolicy, nope: 1}}"
+    with pytest.raises(ConfigError, match=r"policy_value\.others\.mine\.nope is not an option"):
+        load_config([*words, other])
+    nobody = load_config([*words, "policy_value.policies=[nobody]"])
+    with pytest.raises(ConfigError, match=r"policy_value\.policies=nobody: .* does not exist"):
+        policy_value(nobody, tmp_path / "run")
+    with pytest.raises(ConfigError, match="at least two candidates"):
+        policy_value(load_config([*words, "policy_value.noise=[]"]), tmp_path / "run")
