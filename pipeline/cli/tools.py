@@ -92,8 +92,8 @@ def inspect(words: Words) -> None:
 
 def bench(words: Words) -> None:
     """measure performance: worldloop bench
-    conditioning|collection|experts|world|actors|learning|serving|gesim|size|overfit|pretrained; of serving
-    also for how long: worldloop bench serving seconds=7200
+    conditioning|collection|experts|world|actors|learning|serving|gesim|size|distil|strides|overfit|pretrained;
+    of serving also for how long: worldloop bench serving seconds=7200
     """
     from pipeline.benches.bench import run_bench
 
