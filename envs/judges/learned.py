@@ -18,6 +18,8 @@ from envs.language import TextEncoder
 from envs.ranges import Count, Discount, Natural, Share
 from envs.specs import WorldSpec
 
+_TEXT = 32  # numbers that an instruction is encoded as
+
 
 class LearnedJudge(FrameJudge):
     """Convolutional frame judge with a success and a progress head.
@@ -28,7 +30,6 @@ class LearnedJudge(FrameJudge):
         hold, margin, discount: see FittedJudge.
         width: channels of the encoder at half resolution.
         points: soft key-points of the encoder.
-        text: size of the encoded instruction.
         hidden: width of the last layers.
         asked: key-points per view that look for what the instruction says.
     """
@@ -41,7 +42,6 @@ class LearnedJudge(FrameJudge):
         discount: Discount,
         width: Count,
         points: Count,
-        text: Count,
         hidden: Count,
         cameras: str | Sequence[str],
         asked: Natural,
@@ -49,12 +49,12 @@ class LearnedJudge(FrameJudge):
         super().__init__(hold, margin, discount)
         self.spec = spec
         self.encoder = MultiViewEncoder(
-            spec, points, width, pictures=2, cameras=cameras, asked=asked, words=text
+            spec, points, width, pictures=2, cameras=cameras, asked=asked, words=_TEXT
         )
         self.asked = asked
-        self.words = TextEncoder(text)
+        self.words = TextEncoder(_TEXT)
         self.head = nn.Sequential(
-            nn.Linear(self.encoder.out_features + text, hidden),
+            nn.Linear(self.encoder.out_features + _TEXT, hidden),
             nn.SiLU(),
             nn.Linear(hidden, hidden),
             nn.SiLU(),

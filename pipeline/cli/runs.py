@@ -95,7 +95,7 @@ def trust(words: Words) -> None:
     """how far a round's imagined world tells better actions from worse ones: worldloop trust round=1
     [moments=160] [futures=8] [depth=3] experiment=...
     """
-    from pipeline.commands.trust import trust as table
+    from pipeline.commands.worlds.trust import trust as table
 
     own, rest = {"round": 1, "moments": 160, "futures": 8, "depth": 3}, []
     for word in words:

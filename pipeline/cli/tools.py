@@ -105,7 +105,7 @@ def judge(words: Words) -> None:
     shown: worldloop judge judge=vlm judge.chat.model=<name> [data=<LeRobot set>] [split=held_out|all]
     [episodes=N] [frames=all,4,ends] experiment=...
     """
-    from pipeline.commands.judge import Selection, judge_study
+    from pipeline.commands.worlds.judge import Selection, judge_study
 
     own, rest = {}, []
     for word in words:

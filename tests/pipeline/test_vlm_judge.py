@@ -16,7 +16,7 @@ from envs.judges import JudgeError
 from envs.judges.vlm.ledger import _ledger
 from envs.targets import ConfigError
 from pipeline.cli.words import prepared
-from pipeline.commands.judge import Selection, judge_study
+from pipeline.commands.worlds.judge import Selection, judge_study
 from pipeline.config import load_config
 from pipeline.graph.stage import Inputs
 from pipeline.loop import build_loop
