@@ -28,7 +28,7 @@ from torch import Tensor
 from actors.factory import build_judge
 from actors.policies.contract import device_of
 from actors.process import prepare_process
-from envs.judges.base import Judge, Judgement
+from envs.judges.base import Judge, JudgeError, Judgement
 from envs.ranges import Count, Natural, NonNegative, Positive
 from envs.specs import Status
 from envs.targets import ConfigError
@@ -113,7 +113,9 @@ class JudgeServer:
         self.waiting.append((clip, future))
         if self.worker is None or self.worker.done():
             self.worker = asyncio.create_task(self._work())
-        answer = await future
+        answer: tuple[np.ndarray, np.ndarray, int] = await future
+        if answer[2] == Status.ERROR.value:
+            return answer  # it may fare better the next time
         self.cache[key] = answer
         while len(self.cache) > self.options.cache:
             self.cache.popitem(last=False)
@@ -190,14 +192,20 @@ class JudgeClient(Judge):
         return arrays, ref, frames.device
 
     def fetch(self, ticket: Any) -> Judgement:
-        """See Judge.fetch; what no attempt answered is an ERROR."""
+        """See Judge.fetch; what no attempt answered is an ERROR.
+
+        Raises:
+            JudgeError: if the judge itself says that it cannot go on.
+        """
         arrays, ref, device = ticket
         for attempt in range(self.options.retries + 1):
             try:
                 if ref is None:
                     ref = ray.get_actor(self.service).score.remote(*arrays)
                 success, progress, status = ray.get(ref, timeout=self.options.deadline)
-            except (ValueError, RayActorError, RayTaskError, GetTimeoutError):
+            except (ValueError, RayActorError, RayTaskError, GetTimeoutError) as error:
+                if isinstance(error, RayTaskError) and isinstance(error.cause, JudgeError):
+                    raise JudgeError(str(error.cause)) from None
                 ref = None
                 if attempt < self.options.retries:
                     time.sleep(self.options.pause * 2**attempt)

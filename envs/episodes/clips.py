@@ -242,10 +242,10 @@ class ClipStore:
             TensorDict [B] with memory (index [L, M], frames uint8 [L, M, V, 3, H, W], commands [L, M, A]),
             future (frames uint8 [L*K, V, 3, H, W], commands [L*K, A], states [L*K, S], valid bool [L*K],
             success float32 [L*K], NaN where nobody labelled the episode), now (command [A], state [S]),
-            history (commands, states [spec.history, ...]), begin []; memory and future have c2w [..., V, 4,
-            4] too, and the clip intrinsic [V, 3, 3], if the robot is calibrated, and pose_map uint8 [..., V,
-            3, H, W] if the spec asks for it. Frames past the episode's end repeat its last; they and frames
-            without a picture are not valid.
+            history (commands, states [spec.history, ...]), begin [], stride int64 []; memory and future have
+            c2w [..., V, 4, 4] too, and the clip intrinsic [V, 3, 3], if the robot is calibrated, and pose_map
+            uint8 [..., V, 3, H, W] if the spec asks for it. Frames past the episode's end repeat its last;
+            they and frames without a picture are not valid.
         """
         total = spec.chunks * spec.chunk
         last, base, size = self.length[episode] - 1, self.start[episode], episode.shape
@@ -259,16 +259,16 @@ class ClipStore:
         memory = base[:, None, None] + torch.minimum(at, last[:, None, None])
         recent = begin[:, None] - spec.stride * torch.arange((spec.history or spec.memory) - 1, -1, -1)
         before, now = base[:, None] + recent.clamp(min=0), base + begin
-        commands, states = self.arrays["commands"], self.arrays["states"]
+        states = self.arrays["states"]
         remembered = {
             "index": index,
             "frames": self.frames(memory),
-            "commands": commands[memory],
+            "commands": self.commands(memory, base, spec.stride),
             **self._conditioning(memory),
         }
         future = {
             "frames": self.frames(rows),
-            "commands": commands[rows],
+            "commands": self.commands(rows, base, spec.stride),
             "states": states[rows],
             "valid": (ahead <= last[:, None]) & self.arrays["present"][rows],
             "success": self.success(episode, rows),
@@ -277,13 +277,35 @@ class ClipStore:
         out = {
             "memory": TensorDict(remembered, size),
             "future": TensorDict(future, size),
-            "now": TensorDict({"command": commands[now], "state": states[now]}, size),
-            "history": TensorDict({"commands": commands[before], "states": states[before]}, size),
+            "now": TensorDict({"command": self.commands(now, base, spec.stride), "state": states[now]}, size),
+            "history": TensorDict(
+                {"commands": self.commands(before, base, spec.stride), "states": states[before]}, size
+            ),
             "begin": begin // spec.stride,
+            "stride": torch.full(size, spec.stride),
         }
         if self.spec.embodiment.calibrated:
             out["intrinsic"] = self.intrinsic[episode]
         return TensorDict(out, size)
+
+    def commands(self, rows: Tensor, first: Tensor, stride: int) -> Tensor:
+        """Commands [*rows.shape, A] of rows [B, ...] of which one in `stride` is shown: those in force there,
+        of changes the sum since the row shown before. Grippers are as they are at the row.
+
+        Args:
+            first: rows [B] of the episodes' first frames, before which nothing was commanded.
+        """
+        commands, robot = self.arrays["commands"], self.spec.embodiment
+        out = commands[rows]
+        if not robot.delta or stride == 1:
+            return out
+        summed = torch.ones(robot.action_dim, dtype=torch.bool)
+        summed[list(robot.grippers)] = False
+        begin = first.reshape(-1, *[1] * (rows.ndim - 1))
+        for back in range(1, stride):
+            earlier = rows - back
+            out = out + (earlier >= begin)[..., None] * summed * commands[earlier.clamp(min=0)]
+        return out
 
     def sample(self, episodes: Tensor, count: int, spec: ClipSpec, generator: torch.Generator) -> TensorDict:
         """`count` random clips of the given episodes, every frame that has a successor being equally likely

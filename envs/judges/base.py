@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -9,6 +11,13 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from envs.specs import Status
+
+
+class JudgeError(RuntimeError):
+    """A judge cannot go on, and asking it again would not help: its budget is spent, or nobody is there.
+
+    The run stops; the message names the config key and the fix.
+    """
 
 
 class Judgement(NamedTuple):
@@ -37,6 +46,7 @@ class Judge(nn.Module):
     Attributes:
         reads_features: whether `score` must be given the simulator's features of the frames.
         discount: per frame, of the progress that `loss` is given: discount ** (frames until success).
+        calibrates: whether the threshold is to be set on recorded video (learners/stages/judge.py).
 
     Raises:
         ValueError: if hold is less than one frame.
@@ -45,6 +55,7 @@ class Judge(nn.Module):
     threshold: Tensor
     reads_features = False
     discount = 1.0
+    calibrates = True
 
     def __init__(self, hold: int, threshold: float = 0.5):
         super().__init__()
@@ -99,6 +110,28 @@ class Judge(nn.Module):
         """The judgement on what `submit` was given."""
         return self.score(*ticket)
 
+    @classmethod
+    def check(cls, options: Mapping[str, Any]) -> None:
+        """See that a judge of these options (section judge) can work here, before hours are spent on others.
+
+        Raises:
+            ConfigError: naming the key and the fix.
+        """
+
+    @classmethod
+    def files(cls, options: Mapping[str, Any]) -> tuple[Path, ...]:
+        """Files whose contents decide judgements, by options that name one: when they change, what was made
+        with the judge is out of date.
+        """
+        return tuple(Path(value) for value in options.values() if isinstance(value, str) and _is_file(value))
+
+    @classmethod
+    def spent(cls, options: Mapping[str, Any]) -> dict[str, float]:
+        """What judges of these options have asked for and paid so far, over all processes; {} if they are
+        free.
+        """
+        return {}
+
     def streak(self, success: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         """Whether `hold` frames in a row were successes by the end of each frame.
 
@@ -128,6 +161,13 @@ class Judge(nn.Module):
         masked = torch.where(valid, success, 0.0)
         done, _ = self.streak(masked, torch.zeros(len(success), dtype=torch.int64, device=success.device))
         return done.any(1)
+
+
+def _is_file(name: str) -> bool:
+    try:
+        return Path(name).is_file()
+    except OSError:  # too long for a name
+        return False
 
 
 def judgement_status(success: Tensor) -> Tensor:

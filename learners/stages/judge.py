@@ -15,6 +15,7 @@ from torch import Tensor
 from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge, MissingFeatures
 from envs.judges.labels import progress_to_success, success_labels
+from envs.specs import Status
 from learners.stages.pictures import augment
 from learners.stages.simulator import owners
 from learners.training.fit import FitConfig, fit
@@ -185,7 +186,8 @@ def train_judge(
 def judge_recordings(
     judge: Judge, store: ClipStore, episodes: Tensor, features: Tensor | None = None, batch: int = 32
 ) -> Tensor:
-    """Success probabilities of recorded episodes, frame by frame, float32 [N, T]; 0 where they are over.
+    """Success probabilities of recorded episodes, frame by frame, float32 [N, T]; 0 where they are over, NaN
+    throughout those that the judge could not judge.
 
     Args:
         features: of a judge that reads them, see simulators.features.features_of_episodes.
@@ -196,8 +198,10 @@ def judge_recordings(
     for some in torch.arange(len(episodes)).split(batch):
         texts = [store.instructions[number] for number in episodes[some].tolist()]
         seen = () if features is None else (features[some],)
-        parts.append(judge.score(store.frames(rows[some]), first[some], texts, *seen).success.float())
-    return torch.where(valid, torch.cat(parts), 0.0)
+        judgement = judge.score(store.frames(rows[some]), first[some], texts, *seen)
+        known = (judgement.status == Status.OK.value).unsqueeze(-1)
+        parts.append(torch.where(known, valid[some] * judgement.success.float(), torch.nan))
+    return torch.cat(parts)
 
 
 def calibrate(judge: Judge, success: Tensor, succeeded: Tensor) -> bool:
@@ -211,15 +215,17 @@ def calibrate(judge: Judge, success: Tensor, succeeded: Tensor) -> bool:
 
     Args:
         success: frame probabilities [N, T] of recorded episodes that it did not learn from, 0 where they are
-            over.
+            over; those with NaN, which nobody could judge, are left out.
         succeeded: bool [N], whether they did.
 
     Returns:
-        Whether it was set. It stays as it is where no episode succeeded, or none failed, or scores are not
-        finite or do not rise with success.
+        Whether it was set. It stays as it is where no episode succeeded, or none failed, or scores do not
+        rise with success.
     """
+    known = torch.isfinite(success).all(1)
+    success, succeeded = success[known], succeeded[known]
     hits = float(succeeded.sum())
-    if hits in (0.0, float(len(succeeded))) or not torch.isfinite(success).all():
+    if hits in (0.0, float(len(succeeded))):
         return False
     score = torch.logit(judge.confidence(success.double()).clamp(0.01, 0.99)).numpy()
     targets = (

@@ -93,7 +93,7 @@ def learn(seed: int, limit: int, folder: Path, envs: int = 256) -> tuple[float, 
 
 def learning(cfg: Mapping[str, Any]) -> None:
     """GRPO on ToyVLAEnv to 60% greedy success over 100 episodes with targets never seen, three seeds."""
-    prepare_process(0)
+    prepare_process(0, 0)
     seconds = []
     for seed in SEEDS:
         with tempfile.TemporaryDirectory() as folder:

@@ -136,7 +136,7 @@ def study(words: Words) -> None:
     from pipeline.study.run import run_study
 
     device_of(made.cfg)
-    prepare_process(made.cfg["seed"])
+    prepare_process(made.cfg["seed"], made.cfg["threads"])
     with owning(made.root, "study"):
         text = run_study(made)
     print(f"\n{text}\n{made.root}/study.md, study.json, study.html")

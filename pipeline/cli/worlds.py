@@ -5,7 +5,7 @@ words of their own.
 from __future__ import annotations
 
 from envs.targets import ConfigError, nearest
-from pipeline.cli.words import Words, listed, prepared
+from pipeline.cli.words import Words, listed, prepared, without_given
 
 
 def policy_value(words: Words) -> None:
@@ -82,3 +82,21 @@ def rewards(words: Words) -> None:
     with owning(root, "rewards"), tracking(cfg, root) as tracker:
         print(compare_rewards(cfg, root, Plan(configs, int(own["episodes"]), variants), tracker))
     print(f"{root}/rewards.html, {root}/rewards.json")
+
+
+def gridworld(words: Words) -> None:
+    """how actions should be told to a world, by squares that move as they are told: worldloop gridworld
+    experiment=gridworld [squares=1,3]
+    """
+    own = [word.removeprefix("squares=") for word in words if word.startswith("squares=")]
+    counts = (own[-1] if own else "1,3").split(",")
+    if not all(count.isdigit() and int(count) for count in counts):
+        raise ConfigError(f"squares={own[-1]}: say whole numbers above 0, as in squares=1,3")
+    rest = [word for word in words if not word.startswith("squares=")]
+    cfg, root = prepared([*without_given(["experiment=gridworld"], rest), *rest])
+    from pipeline.commands.worlds.gridworld import gridworld as study
+    from pipeline.graph.owner import owning
+    from pipeline.track import tracking
+
+    with owning(root, "gridworld"), tracking(cfg, root) as tracker:
+        print(study(cfg, root, [int(count) for count in counts], tracker))

@@ -12,14 +12,23 @@ from envs.judges.base import Judge
 from envs.simulators.base import Simulator
 from envs.simulators.features import features_of_episodes
 from envs.simulators.replay import Replay
+from envs.specs import Status
 from pipeline.evaluation.statistics import confusion
 
 
 class Scores(NamedTuple):
-    """Probabilities of success and progress, float32 [N, T] each in 0..1."""
+    """Probabilities of success and progress, float32 [N, T] each in 0..1, and status int64 [N]: where it is
+    not OK the numbers mean nothing.
+    """
 
     success: Tensor
     progress: Tensor
+    status: Tensor
+
+    @property
+    def judged(self) -> Tensor:
+        """Which episodes the judge could judge, bool [N]."""
+        return self.status == Status.OK.value
 
 
 def labelled(store: ClipStore, episodes: Tensor) -> Tensor:
@@ -55,14 +64,15 @@ def judge_frames(
         texts = [store.instructions[n] for n in episodes[some].tolist()]
         seen = (features[some].to(device),) if judge.reads_features and features is not None else ()
         verdict = judge.score(frames[some].to(device), first.to(device), texts, *seen)
-        scores.append((verdict.success.cpu(), verdict.progress.cpu()))
+        scores.append([value.cpu() for value in verdict])
     return Scores(*(torch.cat(parts) for parts in zip(*scores, strict=True)))
 
 
 def judge_table(
     judge: Judge, scores: Scores, valid: Tensor, store: ClipStore, episodes: Tensor
 ) -> dict[str, Any]:
-    """Confusion of the judge's episode verdicts with recorded success; {} if no episode is labelled.
+    """Confusion of the judge's episode verdicts with recorded success, and as "dropped" how many labelled
+    episodes it gave none on; {} if no episode is labelled.
 
     Args:
         scores: of frames, recorded or generated, of the N episodes.
@@ -71,9 +81,11 @@ def judge_table(
     known = torch.isin(episodes, labelled(store, episodes))
     if not known.any():
         return {}
+    dropped = int((known & ~scores.judged).sum())
+    known &= scores.judged
     device = judge.threshold.device
     verdicts = judge.episode(scores.success[known].to(device), valid[known].to(device))
-    return confusion(verdicts.cpu(), episode_success(store, episodes[known]))
+    return {**confusion(verdicts.cpu(), episode_success(store, episodes[known])), "dropped": dropped}
 
 
 class Views(NamedTuple):

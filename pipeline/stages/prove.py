@@ -30,12 +30,14 @@ from pipeline.evaluation.judging import episode_success, judge_both, judge_frame
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import PHYSICS, WORLD, Cfg, load_world, open_store
+from pipeline.stages.judge_cost import priced
 
 EPISODES = "episodes.json"  # of the stage measure
 _SIDE_BY_SIDE = 64  # imagined episodes
 
 
 @stage(reads=(*WORLD, "policy", "measure"), place=Place.EVALUATOR)
+@priced
 def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """How far imagination and truth lie apart for the policy just deployed: same starts, same stochastic
     policy.
@@ -110,6 +112,7 @@ def _true_success(cfg: Cfg, folder: Path, inputs: Inputs, changes: Mapping[str, 
 
 
 @stage(reads=(*WORLD, "policy", "evaluate"), place=Place.EVALUATOR)
+@priced
 def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Deterministic success in the last imagined world, of the policies in the roles before and after, from
     the starts of held-out episodes first.
@@ -149,6 +152,7 @@ def _gap(truth: Tensor, success: Tensor, counted: Tensor) -> dict[str, Any]:
 
 
 @stage(reads=(*WORLD, "measure"), place=Place.EVALUATOR)
+@priced
 def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Rollout error, state error, speed and the judge's tables on held-out episodes of every source; and
     episodes.json, how far imagination and truth disagree in each of them (see disagreement.py).

@@ -39,12 +39,14 @@ from pipeline.stages.given import (
     rl_options,
     successful_episodes,
 )
+from pipeline.stages.judge_cost import priced
 from pipeline.stages.trials import true_success
 
 LEARNING = ("policy", "algorithm", "rl", "imitation", "microbatches")
 
 
 @stage(reads=(*WORLD, *LEARNING, "extra_starts.share"), place=Place.LEARNERS)
+@priced
 def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Reinforcement learning inside the simulator; the role `starts`, if somebody plays it, holds first
     frames that nothing more was recorded of.

@@ -32,6 +32,7 @@ from pipeline.evaluation.result import build_result
 from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.collect import run_recorded
 from pipeline.stages.given import EVERYTHING, WORLD, Cfg, open_store
+from pipeline.stages.judge_cost import priced
 from pipeline.stages.prove import EPISODES
 
 WORST = "worst"  # the label of episodes chosen for their disagreement
@@ -103,6 +104,7 @@ class Studio:
 
 
 @stage(reads=(*WORLD, "policy", "measure.videos", "measure.worst"))
+@priced
 def videos(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Paired videos: held-out episodes in which imagination and truth disagreed most, and of each task some
     of the policies in the roles before and after, in physics, and the same actions in the simulator.
@@ -124,6 +126,7 @@ def videos(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 
 @stage(reads=(*WORLD, "measure.videos", "measure.worst"))
+@priced
 def replays(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Paired videos without physics: recordings, held-out ones if there are any, and their actions in the
     simulator; first those in which imagination and truth disagreed most.

@@ -43,6 +43,6 @@ def true_success(cfg: Cfg, settings: RLConfig, policy: Path | None) -> Watch | N
                 outcome = evaluate(env, replica, seeds, label=f"physics after {iteration + 1}")
             finally:
                 env.close()
-        return {"true_success": outcome.rate, "true_episodes": float(len(seeds))}, False
+        return {"true_success": outcome.rate, "true_episodes": float(outcome.counted.sum())}, False
 
     return Watch(settings.evaluate_every, look)

@@ -35,8 +35,7 @@ def variant_episodes(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         tracks = pool.script(list(zip(seeds, levels, strict=True)), task["chunk"])
     finally:
         pool.close()
-    made = [
-        Episode.from_track(track, source, robot) for track, (*_, source) in zip(tracks, jobs, strict=True)
-    ]
+    sources = dict(zip(seeds, (source for *_, source in jobs), strict=True))
+    made = [Episode.from_track(track, sources[track.seed], robot) for track in tracks]
     LeRobotWriter(data, robot).write(made)
     return {"episodes": len(made), "successes": sum(bool(track.rows["success"][-1]) for track in tracks)}

@@ -41,6 +41,7 @@ from pipeline.stages.given import (
     newest_episodes,
     open_store,
 )
+from pipeline.stages.judge_cost import priced
 
 SIMULATOR = ("seed", "threads", *TASK, "simulator", "microbatches")
 
@@ -111,7 +112,7 @@ def distil(
     section = dict(cfg["distill"][key.rpartition(".")[2]])
     fit = fit_options(cfg, section.pop("fit"), f"{key}.fit")
     how = options(SimulatorFitConfig, section, key)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     teacher = build_simulator(cfg, inputs.weights("simulator"))
     weights = inputs.weights("warm") or inputs.weights("simulator")
     model = build_simulator(acting(cfg), weights)
@@ -143,7 +144,7 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return stats
 
 
-@stage(reads=(*ROBOT, "judge.text_world", "text_world_fit", "microbatches"), place=Place.LEARNERS)
+@stage(reads=(*ROBOT, "threads", "judge.text_world", "text_world_fit", "microbatches"), place=Place.LEARNERS)
 def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The text world of a judge that asks for one, with its tokenizer, going on from the role `warm` if there
     is one.
@@ -152,7 +153,7 @@ def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     phase, section = inputs.settings["phase"], cfg["text_world_fit"]
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_text_world(cfg, inputs.weights("warm"))
     fit = fit_options(cfg, section[phase], f"text_world_fit.{phase}")
     tokenizer = fit_options(cfg, section["tokenizer"], "text_world_fit.tokenizer")
@@ -165,6 +166,7 @@ def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 
 @stage(reads=(*WORLD, "judge_fit.{phase}", "rl.starts", "rl.chunks", "microbatches"), place=Place.LEARNERS)
+@priced
 def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The judge on recorded and on generated frames; its threshold on recorded video that no judge learns
     from. A judge without weights is only calibrated. One with a text world takes over what the role
@@ -212,7 +214,11 @@ def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor)
 
 
 def _calibrate(model: Judge, store: ClipStore, world: Simulator, bf16: bool) -> None:
-    """Set the judge's threshold on the calibration split, where its scores tell success."""
+    """Set the judge's threshold on the calibration split, where its scores tell success; a judge that says
+    (judge.votes.calibrate=false) that its answers need none is not asked.
+    """
+    if not model.calibrates:
+        return
     unseen = labelled(store, store.split("calibration"))
     if not len(unseen):
         return

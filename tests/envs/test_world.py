@@ -71,14 +71,16 @@ class Fixed(Judge):
         return Judgement(filled, filled, torch.full(frames.shape[:1], self.said.value))
 
 
-def world(name: str, batch: int, judge: Judge | None = None, horizon: int = 12) -> TransformedEnv:
+def world(
+    name: str, batch: int, judge: Judge | None = None, horizon: int = 12, progress: float = 1.0
+) -> TransformedEnv:
     spec = world_spec(EMBODIMENTS[name])
     simulator, decoder = build_engine("unet_small", spec)
     first = first_of(spec, clip(spec, STARTS, simulator.memory_frames))
     starts = InitialStates(first, [f"do task {k}" for k in range(STARTS)])
     mode = ActionMode.ABSOLUTE if spec.embodiment.delta else ActionMode.RELATIVE
     base = WorldEnv(simulator, starts, batch, horizon, mode, shared_noise=False, bf16=False)
-    return TransformedEnv(base, world_transforms(spec, decoder, judge or Fixed(0.1), Rewards(1.0, 1.0)))
+    return TransformedEnv(base, world_transforms(spec, decoder, judge or Fixed(0.1), Rewards(progress, 1.0)))
 
 
 def play(env: TransformedEnv, seeds: list[int], steps: int = 2) -> torch.Tensor:
@@ -194,6 +196,27 @@ def test_a_judge_that_reads_features_is_given_those_of_the_chunk_and_before_it_o
     assert judge.read[2].shape == (2, 1, *env.base_env.simulator.feature_shape)
     assert not torch.allclose(judge.read[2], judge.read[1], atol=1e-3)
     assert torch.equal(session["length"], torch.ones(2, dtype=torch.int64))  # asking changes no session
+
+
+def test_episodes_from_a_beginning_that_nobody_could_judge_are_dropped() -> None:
+    judge = Fixed(0.1, Status.ABSTAIN)
+    env = world("one_arm_deltas", 2, judge)
+    env.base_env.schedule([0, 1])
+    td = env.reset()
+    judge.said = Status.OK
+    td[CHUNK] = torch.zeros_like(env.action_spec.zero()[CHUNK])
+    after = env.step(td)["next"]
+    assert after[JUDGE_STATUS].flatten().tolist() == [Status.ABSTAIN.value] * 2 and bool(after["done"].all())
+
+
+def test_nobody_is_asked_how_far_a_beginning_is_where_progress_is_worth_nothing() -> None:
+    judge = Fixed(0.9, Status.ABSTAIN)
+    env = world("one_arm_deltas", 2, judge, progress=0.0)
+    env.base_env.schedule([0, 1])
+    assert not bool(env.reset()[PROGRESS].any()) and not judge.asked
+    judge.said = Status.OK
+    after = play(env, [0, 1], 1)
+    assert torch.allclose(after["reward"], torch.ones(2, 1)) and len(judge.asked) == 1
 
 
 def test_success_must_hold_across_chunks() -> None:

@@ -164,4 +164,4 @@ def _domain(
 def _cut(scores: Scores, truth: Truth) -> Scores:
     """Scores of the frames that the longest episode has; whole chunks were generated."""
     count = truth.valid.shape[1]
-    return Scores(scores.success[:, :count], scores.progress[:, :count])
+    return Scores(scores.success[:, :count], scores.progress[:, :count], scores.status)

@@ -18,6 +18,7 @@ from envs.episodes.privileged import read_privileged
 from envs.judges.base import Judge
 from envs.judges.labels import progress_to_success
 from envs.rng import resampling_generator
+from envs.specs import Status
 from pipeline.evaluation.judging import Scores, episode_success
 
 PROGRESS = "progress"  # privileged: a suite's own progress in 0..1
@@ -58,7 +59,8 @@ def by_rule(truth: Truth) -> Scores:
     """The rule's own scores: true progress, and success in the last frame of those episodes that had any."""
     last = truth.valid.long().cumsum(1).argmax(1)
     at_end = torch.arange(truth.valid.shape[1])[None] == last[:, None]
-    return Scores((at_end & truth.success[:, None]).float(), truth.progress)
+    known = torch.full_like(last, Status.OK.value)
+    return Scores((at_end & truth.success[:, None]).float(), truth.progress, known)
 
 
 def figures(judge: Judge, scores: Scores, truth: Truth, seed: int) -> dict[str, Any]:
@@ -69,18 +71,23 @@ def figures(judge: Judge, scores: Scores, truth: Truth, seed: int) -> dict[str, 
         over the episodes in which true progress varies (a reward that does not vary there counts as 0);
         pooled: the same over all frames of all episodes; auc: of its confidence that an episode succeeded,
         against true success. Each of within and auc is [value, low, high], 95% by resampling episodes; None
-        where it cannot be said.
+        where it cannot be said. dropped: how many episodes it could not judge, which are left out.
     """
+    told, dropped = scores.judged, int((~scores.judged).sum())
+    scores = Scores(*(values[told] for values in scores))
+    truth = Truth(truth.progress[told], truth.success[told], truth.valid[told], truth.source)
     over = ~truth.valid
     confidence = judge.confidence(scores.success.masked_fill(over, 0.0)).double().numpy()
     each = np.array([_rank(*pair) for pair in _episodes(scores, truth)])
     flat = (scores.progress[truth.valid].numpy(), truth.progress[truth.valid].numpy())
-    pooled = None if any(np.ptp(side) == 0 for side in flat) else float(spearmanr(*flat).statistic)
+    constant = not len(flat[0]) or any(np.ptp(side) == 0 for side in flat)
+    pooled = None if constant else float(spearmanr(*flat).statistic)
     success = truth.success.numpy()
     return {
         "within": _interval(each[np.isfinite(each)], np.mean, seed),
         "pooled": pooled,
         "auc": _interval(np.stack((confidence, success), 1), lambda rows: auc(*rows.T), seed),
+        "dropped": dropped,
     }
 
 

@@ -184,6 +184,15 @@ def test_scores_that_do_not_tell_set_no_threshold(best: list[float], succeeded: 
     assert float(judge.threshold) == 0.5
 
 
+def test_episodes_that_nobody_could_judge_set_no_threshold() -> None:
+    judge, alone = RuleJudge(hold=2), RuleJudge(hold=2)
+    best, succeeded = [0.1, 0.2, 0.8, 0.9], [False, False, True, True]
+    assert calibrate(alone, runs(best), torch.tensor(succeeded))
+    more = runs([*best, float("nan"), float("nan")])
+    assert calibrate(judge, more, torch.tensor([*succeeded, True, False]))
+    assert torch.equal(judge.threshold, alone.threshold)
+
+
 def test_pictures_are_disturbed_alike_in_all_views_and_by_the_generator_alone() -> None:
     pictures = torch.randint(60, 200, (8, 1, 3, 32, 32), dtype=torch.uint8).expand(-1, 2, -1, -1, -1)
     out = augment(pictures, torch.Generator().manual_seed(0), shift=0.1)
