@@ -3,9 +3,8 @@ how near they come to that.
 
 At reset the text world goes on from the first frame as the instruction says until it says that the task is
 done; that frame is the goal. Progress is dense, by a perceptual distance to the goal; success is sparse, by
-the text world's own word on each frame. What they are worth is judge.rewards; the paper pays the likeness
-itself in every step, where ours pays what was gained of it, which sums to the same at an episode's end and
-cannot be farmed by waiting.
+the text world's own word on each frame. What they are worth is judge.rewards; the paper pays likeness itself
+in every step, ours pays what was gained of it, so that nobody earns by waiting near the goal.
 """
 
 from __future__ import annotations

@@ -73,7 +73,11 @@ def rewards(words: Words) -> None:
     from pipeline.track import tracking
 
     others = [word for word in rest if not word.startswith(("judge=", "judge."))]
-    configs = {name: cfg if name == "rule" else load_config([*others, f"judge={name}"]) for name in names}
+    configs = {name: load_config([*others, f"judge={name}"]) for name in names if name != "rule"}
+    for name, other in configs.items():  # what is said of the run's own judge by judge.<option> stays said
+        configs[name] = cfg if other["judge"]["_target_"] == cfg["judge"]["_target_"] else other
+    if "rule" in names:
+        configs["rule"] = cfg
     variants = listed(own["variants"]) if own["variants"] else list(cfg["task"].get("variants", {}))
     with owning(root, "rewards"), tracking(cfg, root) as tracker:
         print(compare_rewards(cfg, root, Plan(configs, int(own["episodes"]), variants), tracker))

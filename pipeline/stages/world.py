@@ -158,7 +158,7 @@ def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     fit = fit_options(cfg, section[phase], f"text_world_fit.{phase}")
     tokenizer = fit_options(cfg, section["tokenizer"], "text_world_fit.tokenizer")
     stats = train_text_world(
-        *(model, store, learning_episodes(store), section["stride"], fit, folder),
+        *(model, store, store.split("train"), section["stride"], fit, folder),
         tokenizer=tokenizer if phase == "first" else None,
     )
     save_weights(model, folder)
