@@ -85,11 +85,16 @@ class JudgeServer:
         return dict(self.counts)
 
     async def score(
-        self, frames: np.ndarray, first: np.ndarray, instruction: list[str], features: np.ndarray
+        self,
+        frames: np.ndarray,
+        first: np.ndarray,
+        instruction: list[str],
+        features: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Success and progress [B, T] and status [B] of clips; see Judge.score."""
+        seen = np.zeros((len(frames), 0, 0), np.float32) if features is None else features
         answers = await asyncio.gather(
-            *(self._clip(parts) for parts in zip(frames, first, instruction, features, strict=True))
+            *(self._clip(parts) for parts in zip(frames, first, instruction, seen, strict=True))
         )
         success, progress, status = zip(*answers, strict=True)
         return np.stack(success), np.stack(progress), np.array(status)
@@ -184,8 +189,8 @@ class JudgeClient(Judge):
         self, frames: Tensor, first: Tensor, instruction: list[str], features: Tensor | None = None
     ) -> Any:
         """See Judge.submit; the service begins at once."""
-        seen = torch.zeros(len(frames), 0, 0) if features is None else features.float()
-        arrays = (frames.cpu().numpy(), first.cpu().numpy(), list(instruction), seen.cpu().numpy())
+        seen = None if features is None else features.float().cpu().numpy()
+        arrays = (frames.cpu().numpy(), first.cpu().numpy(), list(instruction), seen)
         ref: Any = None  # stays so if it is down just now; `fetch` asks again
         with contextlib.suppress(ValueError, RayActorError):
             ref = ray.get_actor(self.service).score.remote(*arrays)

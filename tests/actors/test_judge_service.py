@@ -64,6 +64,27 @@ def test_service_agrees_remembers_and_gathers(cfg: dict[str, Any], weights: str,
     assert stats["batches"] < 4  # two callers' clips were judged together
 
 
+def test_a_judge_that_reads_features_is_served_them(tmp_path: Path) -> None:
+    cfg = load_config(["experiment=smoke", "judge=embedding"])
+    torch.manual_seed(0)
+    save_weights(build_judge(cfg), tmp_path)
+    path = tmp_path / "weights.safetensors"
+    inline, server = build_judge(cfg, path).eval(), JudgeServer(cfg, str(path), OPTIONS, 1)
+    frames, first, texts = clips(3, 0)
+    size = inline.norm.normalized_shape[0]
+    features = torch.randn(2, 3, 1, size, generator=torch.Generator().manual_seed(1))
+
+    async def ask() -> list[Any]:
+        assert (await server.describe())["reads_features"]
+        given = (frames.numpy(), first.numpy(), texts)
+        return [await server.score(*given, some.numpy()) for some in features]
+
+    one, other = asyncio.run(ask())
+    assert torch.allclose(torch.tensor(one[0]), inline.score(frames, first, texts, features[0]).success)
+    assert not torch.allclose(torch.tensor(one[0]), torch.tensor(other[0]))
+    assert server.counts["judged"] == 6 and not server.counts["remembered"]
+
+
 def test_spent_budget_abstains(service: Any) -> None:
     said = JudgeClient("judge-test", OPTIONS).score(*clips(40, 7))
     assert set(said.status.tolist()) == {Status.OK.value, Status.ABSTAIN.value}
