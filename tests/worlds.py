@@ -20,8 +20,7 @@ def untrained_world(cfg: Mapping[str, Any], root: Path) -> list[str]:
     """Weights of simulator, state expert, judge and policy of a config; words by which `imagined` names the
     first three.
     """
-    # two threads that wait for each other on a busy core cost many times as much
-    prepare_process(cfg["seed"], threads=1)
+    prepare_process(cfg["seed"], cfg["threads"])
     simulator = build_simulator(cfg)
     with torch.no_grad():
         for parameter in simulator.parameters():

@@ -2,6 +2,7 @@
 
 from envs.conditioning.action_text import ActionText
 from envs.conditioning.action_vector import ActionVector
+from envs.conditioning.pace import Pace
 from envs.conditioning.pose_map import CANVAS, PoseMapStyle, render_pose_map
 from envs.conditioning.poses import end_effector_poses
 from envs.conditioning.ray_map import render_ray_map
@@ -10,6 +11,7 @@ __all__ = [
     "CANVAS",
     "ActionText",
     "ActionVector",
+    "Pace",
     "PoseMapStyle",
     "end_effector_poses",
     "render_pose_map",

@@ -72,7 +72,8 @@ class Simulator(nn.Module):
                 future: commands [K, A], and pose_map, c2w likewise;
                 now: command [A], state [S];
                 intrinsic [V, 3, 3] in pixels, if cameras are calibrated;
-                seed int64 [], chunk_index int64 [].
+                seed int64 [], chunk_index int64 [];
+                stride int64 [], the robot's frames from one frame to the next, here and in memory.
 
         Returns:
             frames uint8 [B, K, V, 3, H, W] and features float32 [B, *feature_shape] for the state expert.
@@ -82,6 +83,15 @@ class Simulator(nn.Module):
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """Training loss of a clip (see episodes/clips.py) and figures to log."""
         raise NotImplementedError
+
+    @classmethod
+    def stepped_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
+        """A config section with so many undistilled steps a chunk.
+
+        Raises:
+            ValueError: of an engine that does not denoise in steps.
+        """
+        raise ValueError(f"{cls.__name__} does not denoise in steps; choose simulator=dit or gesim")
 
     @classmethod
     def student_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
@@ -130,7 +140,7 @@ class Simulator(nn.Module):
         """The sessions of `mask` [B] end; what is held for them elsewhere can go. Here nothing is."""
 
     # -- the contract
-    def reset(self, first: TensorDict, seed: Tensor, capacity: int = 1) -> TensorDict:
+    def reset(self, first: TensorDict, seed: Tensor, capacity: int = 1, stride: int = 1) -> TensorDict:
         """Begin sessions from first frames.
 
         Args:
@@ -140,24 +150,30 @@ class Simulator(nn.Module):
             seed: int64 [B].
             capacity: frames to keep room for, where it is known how long sessions last; longer ones make
                 more.
+            stride: the robot's frames from one generated frame to the next: a chunk covers so many times
+                more time. Commands are then those of the frames that are shown, of changes their sums.
 
         Returns:
             The sessions' state, a TensorDict [B].
         """
-        return self.resume(first.unsqueeze(1), torch.ones(len(first), dtype=torch.int64), seed, capacity)
+        return self.resume(
+            first.unsqueeze(1), torch.ones(len(first), dtype=torch.int64), seed, capacity, stride
+        )
 
-    def resume(self, past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1) -> TensorDict:
+    def resume(
+        self, past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1, stride: int = 1
+    ) -> TensorDict:
         """Begin sessions that go on from recorded frames.
 
         Args:
             past: TensorDict [B, P] with what `reset` takes of a first frame, of every frame so far.
             length: int64 [B], how many of them there are, in 1..P.
-            seed, capacity: see reset.
+            seed, capacity, stride: see reset; `past` has one frame in `stride`.
 
         Returns:
             The sessions' state, a TensorDict [B].
         """
-        return memory.new_sessions(past, length, seed, capacity)
+        return memory.new_sessions(past, length, seed, capacity, stride)
 
     @torch.no_grad()
     def step(self, state: TensorDict, future: TensorDict) -> tuple[Tensor, Tensor, TensorDict]:

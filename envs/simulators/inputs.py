@@ -53,6 +53,7 @@ def build_inputs(
             "now": TensorDict(now, size),
             "seed": seed.to(clip.device),
             "chunk_index": zero.to(clip.device),
+            "stride": clip["stride"],
         },
         size,
     )

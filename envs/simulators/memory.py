@@ -2,8 +2,8 @@
 from.
 
 The state of B sessions is a TensorDict [B]: history (rows of frames, commands, states, and pose_map, c2w
-where there are any), length int64, intrinsic if cameras are calibrated, seed int64, chunk_index int64. Rows
-of the history past a session's length hold anything and are never read.
+where there are any), length int64, intrinsic if cameras are calibrated, seed, chunk_index and stride int64.
+Rows of the history past a session's length hold anything and are never read.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ _FIRST = {"frames": "frames", "command": "commands", "state": "states", "pose_ma
 _MEMORY = ("frames", "commands", "pose_map", "c2w")
 
 
-def new_sessions(past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1) -> TensorDict:
+def new_sessions(
+    past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1, stride: int = 1
+) -> TensorDict:
     """The state of sessions that go on from `past` [B, P]; see Simulator.resume."""
     size, device = past.shape[:1], past["frames"].device
     rows = {_FIRST[name]: value for name, value in past.items() if name in _FIRST}
@@ -31,6 +33,7 @@ def new_sessions(past: TensorDict, length: Tensor, seed: Tensor, capacity: int =
             "length": length.to(device, copy=True),
             "seed": seed.reshape(size).to(device),
             "chunk_index": torch.zeros(size, dtype=torch.int64, device=device),
+            "stride": torch.full(size, stride, device=device),
         },
         size,
     )
@@ -59,6 +62,7 @@ def build_inputs(state: TensorDict, remembered: TensorDict, future: TensorDict) 
             "now": TensorDict({"command": now["commands"], "state": now["states"]}, state.shape),
             "seed": state["seed"],
             "chunk_index": state["chunk_index"],
+            "stride": state["stride"],
         },
         state.shape,
     )

@@ -11,6 +11,7 @@ from torch import Tensor
 from envs.episodes.clips import ClipStore
 from envs.precision import mixed_precision
 from envs.simulators.base import Simulator
+from envs.simulators.features import pooled
 from envs.simulators.state_experts.base import StateDecoder
 
 
@@ -18,13 +19,14 @@ class Replay(NamedTuple):
     """Generated episodes beside the rows of the true ones.
 
     frames uint8 [N, T, V, 3, H, W] generated, rows int64 [N, T] of the true frames, valid bool [N, T], states
-    float32 [N, T, S] decoded.
+    float32 [N, T, S] decoded, features float32 [N, C, D] of the generated chunks, pooled.
     """
 
     frames: Tensor
     rows: Tensor
     valid: Tensor
     states: Tensor
+    features: Tensor
 
 
 @torch.no_grad()
@@ -36,6 +38,7 @@ def replay(
     batch: int = 32,
     bf16: bool = True,
     alone: int | None = None,
+    stride: int = 1,
 ) -> Replay:
     """Generate the given episodes from their first frames on, to the end of the longest.
 
@@ -43,33 +46,36 @@ def replay(
         alone: chunks after which it goes on from true frames again; None for never.
         decoder: decodes the robot's states along the way; without one `states` repeats the first.
         batch: episodes generated side by side.
+        stride: recorded frames from one generated frame to the next; T is then so many times smaller.
     """
     device, chunk = simulator.device, simulator.spec.chunk
-    steps = -(-(int(store.length[episodes].max()) - 1) // chunk)
+    steps = -(-(int(store.length[episodes].max()) - 1) // (chunk * stride))
     simulator.eval()
     parts = []
     for ids in episodes.split(batch):
         start, last = store.start[ids], store.length[ids][:, None] - 1
         first = store.first(ids)
         # Whoever asks the same simulator twice gets the same noise.
-        state = simulator.reset(first.to(device), ids.to(device), capacity=1 + steps * chunk)
+        state = simulator.reset(first.to(device), ids.to(device), capacity=1 + steps * chunk, stride=stride)
         made: list[tuple[Tensor, ...]] = []
         for step in range(steps):
             if alone and step and step % alone == 0:
-                past = store.at(ids[:, None].expand(-1, 1 + step * chunk), torch.arange(1 + step * chunk))
-                length = torch.full_like(ids, 1 + step * chunk)
-                state = simulator.resume(
-                    past.to(device), length.to(device), ids.to(device), past.shape[1] + chunk * alone
-                )
-            ahead = step * chunk + torch.arange(1, chunk + 1)[None]
+                known = stride * torch.arange(1 + step * chunk)
+                past = store.at(ids[:, None].expand(-1, len(known)), known)
+                length, room = torch.full_like(ids, len(known)), len(known) + chunk * alone
+                state = simulator.resume(past.to(device), length.to(device), ids.to(device), room, stride)
+            ahead = stride * (step * chunk + torch.arange(1, chunk + 1)[None])
             rows = start[:, None] + torch.minimum(ahead.expand(len(ids), -1), last)
+            shown = future_of(simulator, store, rows)
+            shown["commands"] = store.commands(rows, start, stride)
             with mixed_precision(device, bf16):
-                frames, features, state = simulator.step(state, future_of(simulator, store, rows).to(device))
+                frames, features, state = simulator.step(state, shown.to(device))
             if decoder is None:
                 states = first["state"][:, None].expand(-1, chunk, -1)
             else:
                 states = decoder.follow(state, chunk, features)
-            made.append((frames.cpu(), rows, (ahead <= last), states.cpu()))
+            shown = pooled(features)[:, None].cpu()
+            made.append((frames.cpu(), rows, (ahead <= last), states.cpu(), shown))
         parts.append(Replay(*(torch.cat(values, 1) for values in zip(*made, strict=True))))
     return Replay(*(torch.cat(values) for values in zip(*parts, strict=True)))
 

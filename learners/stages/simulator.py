@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -33,7 +34,7 @@ class SimulatorFitConfig:
             unrolls.
         unroll: chunks predicted from own predictions after that; the batch shrinks so that a step costs the
             same.
-        strides: frame strides to draw from, uniformly.
+        strides: frame strides, of which a batch has equal shares, as far as it can; networks are told.
         recent_fraction: share of each batch drawn from the newest data, so that what the policy now does is
             seen often; 0 draws by size.
         lora: rank of the adapters that learn instead of all weights (transformers only); 0 trains all
@@ -98,18 +99,28 @@ class ClipBatches:
 
     def __call__(self, step: int, generator: torch.Generator) -> TensorDict:
         """The clips [B] of one microbatch of a step."""
-        config, store = self.config, self.store
+        config = self.config
         chunks = 1 if step < config.single_chunk_fraction * self.options.steps else config.unroll
-        stride = config.strides[int(torch.randint(len(config.strides), (1,), generator=generator))]
-        memory, chunk = self.simulator.memory_frames, self.simulator.spec.chunk
-        spec = ClipSpec(memory, chunk, chunks, stride, recent=self.simulator.recent_memory)
         count = max(1, self.options.part // chunks)
-        newest = self.newest
-        recent = round(count * config.recent_fraction) if newest is not None and len(newest) else 0
-        parts = [store.sample(self.episodes, count - recent, spec, generator)] if recent < count else []
-        if recent and newest is not None:
-            parts.append(store.sample(newest, recent, spec, generator))
+        newest = self.newest if self.newest is not None and len(self.newest) else None
+        recent = 0 if newest is None else round(count * config.recent_fraction)
+        first = int(torch.randint(len(config.strides), (1,), generator=generator))
+        parts = list(self._sampled(self.episodes, count - recent, chunks, first, generator))
+        if newest is not None:
+            parts += self._sampled(newest, recent, chunks, first + count - recent, generator)
         return torch.cat(parts) if len(parts) > 1 else parts[0]
+
+    def _sampled(
+        self, episodes: Tensor, count: int, chunks: int, first: int, generator: torch.Generator
+    ) -> Iterator[TensorDict]:
+        """`count` clips of some episodes, of one stride after the other, beginning with the `first`-th."""
+        memory, chunk = self.simulator.memory_frames, self.simulator.spec.chunk
+        most = len(self.config.strides)
+        for number, stride in enumerate(self.config.strides):
+            share = len(range((number - first) % most, count, most))
+            spec = ClipSpec(memory, chunk, chunks, stride, recent=self.simulator.recent_memory)
+            if share:
+                yield self.store.sample(episodes, share, spec, generator)
 
 
 def units(store: ClipStore, episodes: Tensor) -> tuple[Tensor, Tensor, Tensor]:

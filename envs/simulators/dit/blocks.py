@@ -31,17 +31,17 @@ class VisionBlock(nn.Module):
         rope: tuple[Tensor, Tensor],
         views: int,
     ) -> Tensor:
-        """Tokens [B * V, L, D]; `text` is a prompt, or its keys and values; with `views` > 1 self-attention
-        joins the tokens of all views.
+        """Tokens [B * V, L, D]; `text` is a prompt, or its keys and values; `rope` as of video_rope; with
+        `views` > 1 self-attention joins the tokens of all views.
         """
         shift, scale, gate = self.norm1.parts(embedded, temb)
         h = self.norm1(x, shift, scale)
         if views > 1:
             joined = h.unflatten(0, (-1, views)).flatten(1, 2)
-            cos, sin = (part.repeat(views, 1) for part in rope)
+            cos, sin = (_of_all_views(part, views) for part in rope)
             h = self.attn1(joined, rope=(cos, sin)).unflatten(1, (views, -1)).flatten(0, 1)
         else:
-            h = self.attn1(h, rope=rope)
+            h = self.attn1(h, rope=(_over_heads(rope[0]), _over_heads(rope[1])))
         x = _add_gated(x, gate, h)
         if text is not None:
             x = self._read_text(x, text, embedded, temb)
@@ -56,6 +56,18 @@ class VisionBlock(nn.Module):
         if known[1].shape[2] == 1:
             return _add_gated(x, gate, self.attn2.of_one_token(known[1]))
         return _add_gated(x, gate, self.attn2(self.norm2(x, shift, scale), known=known))
+
+
+def _of_all_views(positions: Tensor, views: int) -> Tensor:
+    """Positions of the joined tokens of all views, from one's [L, D] or each one's [B * V, L, D]."""
+    if positions.ndim == 2:
+        return positions.repeat(views, 1)
+    return _over_heads(positions.unflatten(0, (-1, views)).flatten(1, 2))
+
+
+def _over_heads(positions: Tensor) -> Tensor:
+    """Positions [L, D], or [B, L, D] of each row, so that they broadcast over heads [B, heads, L, D]."""
+    return positions if positions.ndim == 2 else positions[:, None]
 
 
 def _add_gated(x: Tensor, gate: Tensor, update: Tensor) -> Tensor:

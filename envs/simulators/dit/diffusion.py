@@ -39,8 +39,10 @@ class Given:
         memory: clean latents [B, V, C, M, h, w] of remembered frames.
         channels: beside the latents, [B, V, C', M + T', h, w].
         actions: action vectors [B, M + T', action_size], of a network that reads them.
+        fps: shown frames per second, one for all or [B].
     """
 
     memory: Tensor
     channels: Tensor
     actions: Tensor | None
+    fps: float | Tensor

@@ -138,6 +138,11 @@ class DiTSimulator(LatentWorld):
             trunk.proj_out.weight.mul_(0.05)
 
     @classmethod
+    def stepped_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
+        """See Simulator.stepped_section."""
+        return {**section, "denoising": {**section["denoising"], "sampler": "euler", "steps": steps}}
+
+    @classmethod
     def student_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
         """See Simulator.student_section."""
         own = section["denoising"]

@@ -197,7 +197,10 @@ class LatentWorld(Simulator):
 
     def _given(self, inputs: TensorDict, memory: Tensor) -> Given:
         latent_hw = (memory.shape[-2], memory.shape[-1])
-        return Given(memory, self.conditioning(inputs, latent_hw), self.actions(inputs))
+        stride = inputs["stride"]
+        alike = bool((stride == stride[0]).all())  # as in sessions: one set of positions serves all
+        fps = self.spec.fps / (int(stride[0]) if alike else stride)
+        return Given(memory, self.conditioning(inputs, latent_hw), self.actions(inputs), fps)
 
     def _weight(self, truth: Tensor, valid: Tensor) -> Tensor:
         """Loss weights [B, V, 1, T', h, w] of true frames [B, K, V, 3, H, W] and valid [B, K]."""
@@ -220,7 +223,7 @@ class LatentWorld(Simulator):
             latents.flatten(0, 1),
             self.diffusion.time_scale * steps.repeat_interleave(views, 0),
             None if self.prompt is None else self.prompt.expand(len(future), -1, -1),
-            self.spec.fps,
+            given.fps.repeat_interleave(views, 0) if isinstance(given.fps, Tensor) else given.fps,
             None if actions is None else actions.repeat_interleave(views, 0),
             layers,
         )

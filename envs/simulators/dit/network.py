@@ -103,7 +103,7 @@ class MultiViewDiT(nn.Module):
         latents: Tensor,
         timestep: Tensor,
         text: Tensor | None,
-        fps: float,
+        fps: float | Tensor,
         actions: Tensor | None = None,
         layers: list[Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
@@ -114,7 +114,7 @@ class MultiViewDiT(nn.Module):
                 side.
             timestep: [B * V, 1, T, 1, 1] or [B * V, T] noise level of every latent frame.
             text: [B, L, D] or [B * V, L, D] prompt embedding; None where the network reads no text.
-            fps: of the video.
+            fps: of the video, or [B * V] of each.
             actions: [B * V, T, action_size] action vector of every latent frame, embedded and added to the
                 time step's embedding, which modulates every block (adaLN); None where there are none.
             layers: takes the output of every block, each [B * V, tokens, width], for training the mix.

@@ -66,11 +66,14 @@ class DiTShape:
 
 
 def video_rope(
-    shape: DiTShape, frames: int, height: int, width: int, fps: float, device: torch.device
+    shape: DiTShape, frames: int, height: int, width: int, fps: float | Tensor, device: torch.device
 ) -> tuple[Tensor, Tensor]:
     """Cosines and sines [T * H * W, head_dim] of three-axis rotary positions; time runs at fps against a base
-    of 24.
+    of 24. Of fps [B] they are [B, T * H * W, head_dim].
     """
+    if isinstance(fps, Tensor):
+        each = [video_rope(shape, frames, height, width, one, device) for one in fps.tolist()]
+        return torch.stack([cos for cos, _ in each]), torch.stack([sin for _, sin in each])
     size = shape.attention_head_dim
     across = size // 6 * 2
     sizes = (size - 2 * across, across, across)

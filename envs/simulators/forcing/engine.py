@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.conditioning import render_ray_map
+from envs.conditioning import Pace, render_ray_map
 from envs.ranges import Count, NonNegative, Share
 from envs.simulators import memory
 from envs.simulators.base import Simulator, noise_generator, to_bytes
@@ -108,6 +108,7 @@ class ForcingSimulator(Simulator):
         self.schedule = options(Sigmoid, self.denoising.schedule, "simulator.denoising.schedule")
         self.prediction: Prediction = build(prediction, "simulator.prediction")
         self.actions = build(actions, "simulator.actions", embodiment=spec.embodiment)
+        self.pace = Pace(self.actions.size)
         self.codec = Autoencoder(**codec).requires_grad_(False)
         latents, maps = self.codec.channels, 3 * spec.pose_map + 6 * spec.ray_map
         none = torch.zeros(1, 1, 1, 1, 1, 1)
@@ -242,6 +243,8 @@ class ForcingSimulator(Simulator):
         commands = frames["commands"][:, window]
         before = torch.cat([commands[:, :1], commands[:, :-1]], 1)
         vectors = self.actions(commands.flatten(0, 1)[:, None], before.flatten(0, 1))
+        vectors = vectors.squeeze(1).unflatten(0, commands.shape[:2])
+        vectors = vectors + self.pace(inputs["stride"])[:, None].to(vectors.dtype)
         latent_hw = tuple(side // STRIDE for side in self.spec.size)
         channels = [torch.zeros(*commands.shape[:2], self.spec.views, 0, *latent_hw, device=commands.device)]
         if self.spec.pose_map:
@@ -253,7 +256,7 @@ class ForcingSimulator(Simulator):
             c2w = frames["c2w"][:, window].transpose(1, 2)
             rays = render_ray_map(inputs["intrinsic"], c2w, self.spec.size, stride=STRIDE)
             channels.append(rays.transpose(1, 2))
-        return torch.cat(channels, 3), vectors.squeeze(1).unflatten(0, commands.shape[:2])
+        return torch.cat(channels, 3), vectors
 
     def _base(self, z: Tensor, level: Tensor) -> Tensor | None:
         return self.prediction.base(z, _wide(level))

@@ -155,6 +155,11 @@ class GESimulator(LatentWorld):
         self.parity, net.checkpointing = PARITY[parity], options.checkpointing
 
     @classmethod
+    def stepped_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
+        """See Simulator.stepped_section."""
+        return {**section, "sampling": {"kind": "edm", "steps": steps}}
+
+    @classmethod
     def student_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
         """See Simulator.student_section; the levels are the released student's first ones."""
         if steps > len(DISTILLED):

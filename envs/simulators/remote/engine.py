@@ -75,16 +75,20 @@ class RemoteSimulator(Simulator):
         self._pool = ThreadPoolExecutor(_PARALLEL)
         self._end = weakref.finalize(self, _close_all, self._connections)
 
-    def resume(self, past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1) -> TensorDict:
+    def resume(
+        self, past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1, stride: int = 1
+    ) -> TensorDict:
         """See Simulator.resume; opens a session for every row, or for none.
 
         Raises:
-            RemoteError: if the servers do not have that many places, or refuse; if more than one frame is
-                given, which the protocol has no word for.
+            RemoteError: if the servers do not have that many places, or refuse; if more than one frame or
+                another stride is given, which the protocol has no word for.
         """
+        if stride != 1:
+            raise RemoteError(f"a server's sessions show every frame, and stride={stride} was asked for")
         if bool((length > 1).any()):
             raise RemoteError("a server's sessions begin with one frame; set rl.starts=first")
-        state, first = super().resume(past, length, seed, capacity), past[:, 0]
+        state, first = super().resume(past, length, seed, capacity, stride), past[:, 0]
         places, free = self._free()
         if len(free) < len(first):
             raise RemoteError(
@@ -139,6 +143,17 @@ class RemoteSimulator(Simulator):
         return (
             torch.from_numpy(np.stack(frames)).to(device),
             torch.from_numpy(np.stack(states)).to(device),
+        )
+
+    def features(self, inputs: TensorDict) -> Tensor:
+        """Refused: a server says nothing of what its network makes of inputs, and each step counts.
+
+        Raises:
+            RemoteError: always.
+        """
+        raise RemoteError(
+            "simulator=remote has no features to learn from; choose a simulator that runs here, or a judge"
+            " that looks at pictures, such as judge=learned"
         )
 
     def close(self) -> None:

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from envs.conditioning import ActionVector, render_ray_map
+from envs.conditioning import ActionVector, Pace, render_ray_map
 from envs.ranges import Count
 from envs.rng import noise_generator
 from envs.simulators import memory
@@ -89,6 +89,7 @@ class TokensSimulator(Simulator):
             nn.SiLU(),
             RowLinear(width, self.video.told_tokens * width),
         )
+        self.pace = Pace(self.video.told_tokens * width)
         self.pose_embed = RowLinear(3 * (stride // 2) ** 2, width) if spec.pose_map else None
         self.ray_embed = RowLinear(6, width) if spec.ray_map else None
         self.feature_shape = ((spec.chunk + spec.views) * width,)
@@ -103,9 +104,11 @@ class TokensSimulator(Simulator):
         self.action_vector.normalise(commands, moves)
 
     # -- contract
-    def resume(self, past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1) -> TensorDict:
+    def resume(
+        self, past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1, stride: int = 1
+    ) -> TensorDict:
         """See Simulator.resume."""
-        state = super().resume(past, length, seed, capacity)
+        state = super().resume(past, length, seed, capacity, stride)
         state["done"] = torch.zeros(len(state), self.spec.chunk, device=state["length"].device)
         return state
 
@@ -171,7 +174,9 @@ class TokensSimulator(Simulator):
         commands = torch.cat([inputs["memory", "commands"], inputs["future", "commands"]], 1)
         before = torch.cat((commands[:, :1], commands[:, :-1]), 1)
         vectors = self.action_vector(commands.unsqueeze(-2), before).squeeze(-2)
-        return self.action_embed(vectors).unflatten(-1, (self.video.told_tokens, -1))
+        embedded = self.action_embed(vectors)
+        embedded = embedded + self.pace(inputs["stride"])[:, None].to(embedded.dtype)
+        return embedded.unflatten(-1, (self.video.told_tokens, -1))
 
     def _beside(self, inputs: TensorDict) -> Tensor | None:
         """Pose maps and rays of all frames as [B, T, P, width]; None where there are none."""

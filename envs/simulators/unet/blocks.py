@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from envs.conditioning import ActionVector
+from envs.conditioning import ActionVector, Pace
 from envs.precision import working_dtype
 from envs.simulators.row_linear import RowLinear
 from envs.simulators.unet.folding import fold
@@ -100,6 +100,7 @@ class ActionEncoder(nn.Module):
         self.layers = nn.Sequential(
             RowLinear(size, cond), nn.SiLU(), RowLinear(cond, cond), nn.SiLU(), RowLinear(cond, cond)
         )
+        self.pace = Pace(cond)
         cut = nn.Unflatten(1, (_MAPS, *cells))
         self.map = nn.Sequential(nn.SiLU(), RowLinear(cond, _MAPS * cells[0] * cells[1]), cut)
         self.lift = nn.Conv2d(_MAPS, width, 1)
@@ -110,13 +111,14 @@ class ActionEncoder(nn.Module):
         self.state_mean.copy_(states.mean(0))
         self.state_std.copy_(states.std(0).clamp(min=0.02))
 
-    def forward(self, commands: Tensor, now: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """[B, cond] and [B, width, *cells] of commands [B, K, A], the one in force [B, A] and the state [B,
-        S].
+    def forward(self, commands: Tensor, now: Tensor, state: Tensor, stride: Tensor) -> tuple[Tensor, Tensor]:
+        """[B, cond] and [B, width, *cells] of commands [B, K, A], the one in force [B, A], the state [B, S],
+        and the robot's frames from one shown frame to the next [B].
         """
         told = self.vector(commands, now).flatten(1)
         joints = ((state - self.state_mean) / self.state_std).clamp(-5, 5)
         cond = self.layers(torch.cat((told, joints), 1))
+        cond = cond + self.pace(stride).to(cond.dtype)
         return cond, self.lift(self.map(cond))
 
 

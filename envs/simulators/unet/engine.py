@@ -142,7 +142,7 @@ class UNetSimulator(Simulator):
     def _encode(self, inputs: TensorDict) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Maps at a half, a quarter and an eighth of the resolution, and the action embedding."""
         memory, future, now = inputs["memory"], inputs["future"], inputs["now"]
-        cond, action_map = self.actions(future["commands"], now["command"], now["state"])
+        cond, action_map = self.actions(future["commands"], now["command"], now["state"], inputs["stride"])
         parts = [memory["frames"], *([memory["pose_map"], future["pose_map"]] if self.spec.pose_map else [])]
         deep = [action_map]
         if self.rays is not None:

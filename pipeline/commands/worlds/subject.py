@@ -49,6 +49,7 @@ class Subject:
             ConfigError: if what is named is not there.
         """
         graph, section = build_loop(cfg, root), cfg["imagined"]
+        cfg = graph.cfg  # of the world that is acted in
         inputs = graph.inputs("evaluate-imagined")
         weights = {
             role: weights_at(graph, section[role], f"imagined.{role}")

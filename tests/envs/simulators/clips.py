@@ -64,6 +64,7 @@ def clip(spec: WorldSpec, batch: int, memory: int, chunks: int = 1, seed: int = 
                 {"commands": commands[:, : begin + 1], "states": states[:, : begin + 1]}, [batch]
             ),
             "begin": torch.full((batch,), begin),
+            "stride": torch.ones(batch, dtype=torch.int64),
         },
         [batch],
     )

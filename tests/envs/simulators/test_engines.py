@@ -181,6 +181,7 @@ def test_a_session_resumed_from_one_frame_is_a_new_one(engine: tuple[Simulator, 
 def test_the_loss_falls_and_every_weight_is_used(engine: tuple[Simulator, StateDecoder]) -> None:
     simulator, _ = engine
     clips = clip(simulator.spec, 8, simulator.memory_frames, chunks=2)
+    clips["stride"] = 1 + torch.arange(8) % 4
     commands = clips["future", "commands"]
     moves = (commands - clips["now", "command"][:, None]).flatten(0, 1)
     units = (commands.flatten(0, 1), moves, clips["future", "states"].flatten(0, 1))
@@ -270,6 +271,20 @@ def test_any_subset_of_conditioning_is_read_and_learned(name: str, given: tuple[
     assert bool(loss.isfinite())
     unread = [key for key, p in simulator.named_parameters() if p.requires_grad and p.grad is None]
     assert not unread
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_networks_are_told_how_much_time_passes_between_frames(name: str) -> None:
+    simulator, _ = build_engine(name, world_spec(BIMANUAL_POSES, chunk=CHUNK))
+    clips = clip(simulator.spec, 2, simulator.memory_frames)
+    inputs = build_inputs(simulator.spec, clips, 0)
+    inputs[1] = inputs[0]
+    with torch.no_grad():
+        alike = simulator.features(inputs)
+        inputs["stride"] = torch.tensor([1, 3])
+        mixed = simulator.features(inputs)
+    assert torch.equal(alike[0], alike[1])
+    assert torch.allclose(mixed[0], alike[0], atol=1e-4) and not torch.allclose(mixed[1], alike[1], atol=1e-3)
 
 
 @pytest.mark.parametrize("lacking", MAPS)

@@ -47,6 +47,9 @@ def test_frames_may_go_on_from_true_ones_again(tiny_store: Stores) -> None:
     for parameter in simulator.parameters():  # an untrained one repeats its last frame
         torch.nn.init.normal_(parameter, std=0.05, generator=torch.Generator().manual_seed(0))
     whole = replay(simulator, store, some, bf16=False)
+    skipping = replay(simulator, store, some, bf16=False, stride=2)
+    assert torch.equal(skipping.rows[:, 0], store.start[some] + 2)
+    assert 2 * (skipping.rows.shape[1] - store.spec.chunk) < whole.rows.shape[1]
     short = replay(simulator, store, some, bf16=False, alone=1)
     assert torch.equal(whole.rows, short.rows)
     assert torch.equal(whole.frames[:, :chunk], short.frames[:, :chunk])

@@ -41,11 +41,11 @@ def test_clips_are_single_at_first_and_the_newest_have_their_share(
     tiny_store: Stores, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unrolled: bool
 ) -> None:
     store = tiny_store(ARM_DELTAS)
-    drawn: list[tuple[int, list[int], int]] = []
+    drawn: list[tuple[int, list[int], int, int]] = []
     sample = store.sample
 
     def watched(episodes: torch.Tensor, count: int, spec: ClipSpec, generator: torch.Generator) -> object:
-        drawn.append((spec.chunks, episodes.tolist(), count))
+        drawn.append((spec.chunks, episodes.tolist(), count, spec.stride))
         return sample(episodes, count, spec, generator)
 
     monkeypatch.setattr(store, "sample", watched)
@@ -53,10 +53,15 @@ def test_clips_are_single_at_first_and_the_newest_have_their_share(
     simulator = simulator_of("unet_small", store.spec)
     options = FitConfig(2, 8, 1e-3, bf16=False)
     train_simulator(simulator, store, torch.arange(6), config, options, tmp_path, newest=torch.tensor([5]))
+    counts: dict[tuple[int, int], int] = {}
+    for chunks, episodes, count, _ in drawn:
+        counts[chunks, len(episodes)] = counts.get((chunks, len(episodes)), 0) + count
     if unrolled:
-        assert drawn == [(1, [*range(6)], 6), (1, [5], 2), (2, [*range(6)], 3), (2, [5], 1)]
+        assert counts == {(1, 6): 6, (1, 1): 2, (2, 6): 3, (2, 1): 1}
     else:
-        assert drawn == [(1, [5], 8), (2, [5], 4)]
+        assert counts == {(1, 1): 8, (2, 1): 4}
+    for stride in (1, 2):  # each has its half
+        assert sum(count for *_, count, own in drawn if own == stride) == 6
 
 
 def test_a_simulator_learns_and_keeps_its_units_when_it_goes_on(tiny_store: Stores, tmp_path: Path) -> None:

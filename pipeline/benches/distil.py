@@ -1,0 +1,130 @@
+"""worldloop bench distil: what each number of function evaluations a chunk costs and buys, of a teacher and
+of the students that two methods make of it.
+
+Every part is a stage of a graph of its own, so the bench goes on where it was stopped.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchmetrics.functional.image import structural_similarity_index_measure as ssim
+
+from actors.factory import build_simulator, build_state_decoder
+from actors.process import prepare_process
+from envs.episodes.clips import ClipStore
+from envs.files import write_text
+from envs.simulators.replay import Replay, replay
+from envs.targets import ConfigError, target
+from pipeline.acting import acting
+from pipeline.cli.words import root_of
+from pipeline.evaluation.measurement import rollout_error, speed
+from pipeline.graph.graph import Graph
+from pipeline.graph.stage import Inputs, Place, stage
+from pipeline.loop import has_physics
+from pipeline.stages import collect, world
+from pipeline.stages.given import TASK, Cfg, open_store
+
+TEACHER, STUDENT = (15, 8, 4, 2, 1), (4, 2, 1)
+_EPISODES = 8  # held-out ones that are measured
+_TRAJECTORY = {"_target_": "learners.stages.distill.trajectory.TrajectoryRegression"}
+_FIGURES = {
+    "frames/s at 1": "{speed_1:.0f}",
+    "at 32": "{speed_32:.0f}",
+    "PSNR of a chunk": "{chunk_psnr:.2f}",
+    "SSIM": "{chunk_ssim:.3f}",
+    "PSNR of {frames} frames": "{rollout_psnr:.2f}",
+    "SSIM ": "{rollout_ssim:.3f}",
+    "state error": "{state:.3f}",
+}
+
+
+def distil(cfg: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Print the table, and leave it in distil.json of the run's folder; returns the figures by row.
+
+    Raises:
+        ConfigError: if the task has no physics, or the simulator no steps.
+    """
+    prepare_process(cfg["seed"], cfg["threads"])
+    root = root_of(cfg)
+    graph, rows = build_table(cfg, root / "distil")
+    graph.run(list(rows.values()))
+    found = {title: graph.result(name) for title, name in rows.items()}
+    write_text(root / "distil.json", json.dumps(found, indent=1))
+    frames = next(iter(found.values()))["frames"]
+    print(f"| | {' | '.join(_FIGURES).format(frames=frames)} |\n|{' --- |' * (1 + len(_FIGURES))}")
+    for title, figures in found.items():
+        print(f"| {title} | {' | '.join(form.format(**figures) for form in _FIGURES.values())} |")
+    return found
+
+
+def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, str]]:
+    """The stages, and the names of those that measure, by the titles of their rows.
+
+    A student learns to take any number of steps up to distill.steps, so there is one of each method.
+    """
+    if not has_physics(cfg):
+        raise ConfigError(
+            "bench distil records its own episodes; choose a task with a suite, such as task=push"
+        )
+    engine, most = target(cfg["simulator"], "simulator"), cfg["distill"]["steps"]
+    if not most:
+        raise ConfigError("distill.steps=0 is without a student; say distill.steps=4")
+    acting(cfg)  # says what cannot be distilled
+    graph = Graph(cfg, root)
+    data = [graph.add("collect", collect.collect)]
+    warm = graph.add("tokenizer", world.tokenizer, {"data": data}) if "codec" in cfg["simulator"] else ""
+    teacher = graph.add("simulator", world.simulator, {"data": data, "warm": warm}, phase="first")
+    rows = {}
+
+    def measured(title: str, name: str, simulator: str, section: Mapping[str, Any]) -> None:
+        own, roles = graph.under({**cfg, "simulator": section}), {"data": data, "simulator": simulator}
+        state = own.add(f"state-{name}", world.state, roles, phase="first")
+        rows[title] = own.add(f"measure-{name}", measure, {**roles, "state": state})
+
+    for steps in TEACHER:
+        section = engine.stepped_section(cfg["simulator"], steps)  # type: ignore[attr-defined]
+        measured(f"teacher, {steps}", f"teacher-{steps}", teacher, section)
+    for method in (cfg["distill"]["method"], _TRAJECTORY):
+        name = str(method["_target_"]).rpartition(".")[2]
+        given = {**cfg, "distill": {**cfg["distill"], "method": method}}
+        roles = {"data": data, "simulator": teacher}
+        student = graph.under(given).add(f"student-{name}", world.student, roles, phase="first")
+        for steps in (n for n in STUDENT if n <= most):
+            few = acting({**given, "distill": {**given["distill"], "steps": steps}})
+            measured(f"{name}, {steps}", f"{name}-{steps}", student, few["simulator"])
+    return graph, rows
+
+
+@stage(reads=("seed", *TASK, "simulator", "measure.speed_chunks"), place=Place.EVALUATOR)
+def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """Speed, and errors of held-out episodes: chunk by chunk from true frames, and rolled out as a whole."""
+    prepare_process(cfg["seed"], cfg["threads"])
+    simulator = build_simulator(cfg, inputs.weights("simulator"))
+    decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
+    store, bf16 = open_store(cfg, inputs), cfg["simulator"]["bf16"]
+    held = store.split("held_out")[:_EPISODES]
+    chunks, whole = (replay(simulator, store, held, decoder, bf16=bf16, alone=n) for n in (1, None))
+    return {
+        "frames": whole.frames.shape[1],
+        **{f"chunk_{name}": value for name, value in _pictures(store, chunks).items()},
+        **{f"rollout_{name}": value for name, value in _pictures(store, whole).items()},
+        "state": rollout_error(store, held, whole)["state"]["median"],
+        **{f"speed_{n}": speed(simulator, store, n, cfg["measure"]["speed_chunks"]) for n in (1, 32)},
+    }
+
+
+def _pictures(store: ClipStore, made: Replay) -> dict[str, float]:
+    """PSNR in dB and SSIM, means over the frames of all views that exist."""
+    psnr, alike = [], []
+    for frames, rows, valid in zip(made.frames, made.rows, made.valid, strict=True):
+        one, other = (some[valid].flatten(0, 1).float() / 255 for some in (frames, store.frames(rows)))
+        psnr.append(-10 * (one - other).square().mean((1, 2, 3)).clamp(min=1e-8).log10())
+        found = ssim(one, other, data_range=1.0, reduction="none")
+        assert isinstance(found, torch.Tensor)
+        alike.append(found)
+    return {"psnr": float(torch.cat(psnr).mean()), "ssim": float(torch.cat(alike).mean())}

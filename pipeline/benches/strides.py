@@ -1,0 +1,97 @@
+"""worldloop bench strides: one world that shows every, every second or every fourth frame: how far a chunk
+reaches, what a rollout costs, and how well it agrees with the truth at the frames that all of them show.
+
+Open loop, under recorded actions. Every part is a stage of a graph of its own, so the bench goes on where it
+was stopped.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from actors.factory import build_simulator
+from actors.process import prepare_process
+from envs.files import write_text
+from envs.simulators.replay import replay
+from envs.targets import ConfigError
+from pipeline.cli.words import root_of
+from pipeline.graph.graph import Graph
+from pipeline.graph.stage import Inputs, Place, stage
+from pipeline.loop import has_physics
+from pipeline.stages import collect, world
+from pipeline.stages.given import TASK, Cfg, open_store
+
+_EPISODES = 16  # held-out ones that are measured
+
+
+def strides(cfg: dict[str, Any]) -> dict[int, dict[str, Any]]:
+    """Print the table, and leave it in strides.json of the run's folder; returns the figures by stride.
+
+    Raises:
+        ConfigError: if the task has no physics.
+    """
+    prepare_process(cfg["seed"], cfg["threads"])
+    root = root_of(cfg)
+    graph, rows = build_table(cfg, root / "strides")
+    graph.run(list(rows.values()))
+    found = {number: graph.result(name) for number, name in rows.items()}
+    write_text(root / "strides.json", json.dumps(found, indent=1))
+    print("| stride | a chunk covers | seconds per episode | PSNR, all shown | PSNR, frames shown by all |")
+    print("| --- | --- | --- | --- | --- |")
+    for number, row in found.items():
+        print(
+            f"| {number} | {row['covers']:.1f} s | {row['seconds']:.3f} | {row['psnr']:.2f} |"
+            f" {row['psnr_common']:.2f} |"
+        )
+    return found
+
+
+def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[int, str]]:
+    """The stages, and the names of those that measure, by stride: simulator_fit.first.strides."""
+    if not has_physics(cfg):
+        raise ConfigError("bench strides records its own episodes; choose a task with a suite (task=push)")
+    graph = Graph(cfg, root)
+    data = [graph.add("collect", collect.collect)]
+    warm = graph.add("tokenizer", world.tokenizer, {"data": data}) if "codec" in cfg["simulator"] else ""
+    roles = {"data": data, "warm": warm}
+    simulator = graph.add("simulator", world.simulator, roles, phase="first")
+    numbers = sorted(cfg["simulator_fit"]["first"]["strides"])
+    roles = {"data": data, "simulator": simulator}
+    return graph, {n: graph.add(f"stride-{n}", measure, roles, stride=n, common=numbers[-1]) for n in numbers}
+
+
+@stage(reads=("seed", *TASK, "simulator"), place=Place.EVALUATOR)
+def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """Rollouts of held-out episodes.
+
+    Settings: stride, and common, a multiple of it, at whose frames strides are compared.
+    """
+    stride, common = inputs.settings["stride"], inputs.settings["common"]
+    prepare_process(cfg["seed"], cfg["threads"])
+    simulator, store = build_simulator(cfg, inputs.weights("simulator")), open_store(cfg, inputs)
+    held, bf16 = store.split("held_out")[:_EPISODES], cfg["simulator"]["bf16"]
+    replay(simulator, store, held[:1], bf16=bf16, stride=stride)  # a warm-up
+    began = time.perf_counter()
+    made = replay(simulator, store, held, bf16=bf16, stride=stride)
+    seconds = (time.perf_counter() - began) / len(held)
+    error = torch.stack(
+        [
+            ((a.float() - b.float()) / 255).square().mean((-4, -3, -2, -1))
+            for a, b in zip(made.frames, store.frames(made.rows), strict=True)
+        ]
+    )
+    psnr = -10 * error.clamp(min=1e-8).log10()
+    shown = stride * torch.arange(1, psnr.shape[1] + 1)
+    alike = made.valid & (shown % common == 0)
+    return {
+        "covers": stride * store.spec.chunk / store.fps,
+        "seconds": seconds,
+        "psnr": float(psnr[made.valid].mean()),
+        "psnr_common": float(psnr[alike].mean()),
+    }
