@@ -52,7 +52,7 @@ lint: setup
 	$(BIN)/mypy
 
 test: lint
-	$(BIN)/python -m pytest -n $(TEST_WORKERS) --dist loadfile
+	$(BIN)/python -m pytest -n $(TEST_WORKERS) --dist loadgroup
 
 quickstart: setup
 	$(BIN)/worldloop run experiment=quickstart seed=$(SEED)

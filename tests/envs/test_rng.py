@@ -63,5 +63,6 @@ def test_episode_seeds_of_every_purpose() -> None:
         30_000_005,
         34_000_005,
         36_000_005,
+        38_000_005,
         9_000_005,
     ]

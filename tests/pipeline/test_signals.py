@@ -57,6 +57,32 @@ LASTS = {
     ),
     "trust": (["trust", *SOAK, "name=known", "depth=1", "futures=300"], r"carried out: +\d"),
     "controls": (["controls", *SOAK, "name=known"], r"deploy: +\d"),
+    "study": (
+        [
+            "study",
+            *SOAK,
+            "name=new",
+            "study.rows=[imitation]",
+            "study.against=[]",
+            "collect.episodes.train=5000",
+        ],
+        r"collect: +\d",
+    ),
+    "policy-value": (
+        ["policy-value", *SOAK, "name=known", "policy_value.starts=2", "policy_value.repeats=400"],
+        r"imagined \w|true \w",
+    ),
+    "fidelity": (["fidelity", *SOAK, "name=known", "fidelity.long.frames=90000"], r"\d+%"),
+    "sweep": (["sweep", *SOAK, "name=known"], r"\w"),
+    "rewards": (
+        [
+            *["rewards", *SOAK, "name=known", "rewards=[learned]", "variants=[]"],
+            *["episodes=2", "judge_fit.first.fit.steps=90000"],
+        ],
+        r"judge: +\d+%.*loss",
+    ),
+    "gridworld": (["gridworld", "track=disabled", "collect.episodes.train=5000"], r"collect: +\d"),
+    "judge": (["judge", *SOAK, "name=known", "frames=all"], r"\w"),
     "finetune": (
         [
             "finetune",
@@ -77,7 +103,7 @@ LASTS = {
     "inspect": (["inspect"], r"\w"),
     "verify": (["verify"], r"verify: +\d"),
 }
-SHORT = ("inspect", "verify")  # may have ended before they are asked to, or be about to
+SHORT = ("inspect", "verify", "sweep", "judge")  # may have ended before they are asked to, or be about to
 SERVERS = ("serve", "play")  # this is how they end
 # answer from what is there, or hand over to a cluster
 AT_ONCE = {"convert", "stages", "compare", "submit", "tasks", "config", "doctor", "completion"}

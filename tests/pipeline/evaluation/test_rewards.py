@@ -15,6 +15,7 @@ from envs.episodes.clips import ClipStore
 from envs.episodes.privileged import read_privileged
 from envs.judges import RuleJudge
 from envs.physics.suite import build_suite, scene_of
+from envs.specs import Status
 from envs.targets import ConfigError
 from pipeline.commands.worlds.rewards import Plan, compare_rewards
 from pipeline.config import load_config
@@ -41,28 +42,41 @@ def test_the_truth_follows_itself_and_its_reverse_does_not() -> None:
     mine = figures(RuleJudge(hold=1), by_rule(true), true, seed=0)
     assert mine["within"][0] == pytest.approx(1.0) and mine["pooled"] == pytest.approx(1.0)
     assert mine["auc"] == [1.0, 1.0, 1.0]
-    turned = Scores(1 - by_rule(true).success, 1 - true.progress)
+    turned = Scores(1 - by_rule(true).success, 1 - true.progress, by_rule(true).status)
     worst = figures(RuleJudge(hold=12), turned, true, seed=0)
     assert worst["within"][0] == pytest.approx(-1.0) and worst["pooled"] == pytest.approx(-1.0)
 
 
 def test_a_reward_that_says_nothing_is_chance() -> None:
     true, generator = truth(200), torch.Generator().manual_seed(1)
-    noise = Scores(*torch.rand(2, *true.progress.shape, generator=generator))
+    noise = Scores(*torch.rand(2, *true.progress.shape, generator=generator), by_rule(true).status)
     found = figures(RuleJudge(hold=2), noise, true, seed=0)
     for name, chance in (("within", 0.0), ("auc", 0.5)):
         value, low, high = found[name]
         assert low < chance < high and low < value < high
-    constant = Scores(torch.zeros_like(true.progress), torch.full_like(true.progress, 0.4))
+    constant = Scores(
+        torch.zeros_like(true.progress), torch.full_like(true.progress, 0.4), by_rule(true).status
+    )
     still = figures(RuleJudge(hold=2), constant, true, seed=0)
-    assert still == {"within": [0.0, 0.0, 0.0], "pooled": None, "auc": [0.5, 0.5, 0.5]}
+    assert still == {"within": [0.0, 0.0, 0.0], "pooled": None, "auc": [0.5, 0.5, 0.5], "dropped": 0}
+
+
+def test_what_could_not_be_judged_is_counted_and_left_out() -> None:
+    true = truth()
+    scores = by_rule(true)
+    status = scores.status.clone()
+    status[0] = Status.ABSTAIN.value
+    wild = scores.progress.clone()
+    wild[0] = torch.rand(wild.shape[1], generator=torch.Generator().manual_seed(2))
+    found = figures(RuleJudge(1), Scores(scores.success, wild, status), true, 0)
+    assert found["dropped"] == 1 and found["within"][0] == pytest.approx(1.0)
 
 
 def test_what_is_past_an_episodes_end_does_not_count() -> None:
     true = truth()
     scores = by_rule(true)
-    spoilt = Scores(scores.success.clone(), scores.progress.clone())
-    for part in spoilt:
+    spoilt = Scores(scores.success.clone(), scores.progress.clone(), scores.status)
+    for part in (spoilt.success, spoilt.progress):
         part[~true.valid] = 0.77
     assert figures(RuleJudge(1), spoilt, true, 0) == figures(RuleJudge(1), scores, true, 0)
 
