@@ -14,13 +14,12 @@ from envs.episodes.clips import ClipStore
 from tests.embodiments import BIMANUAL_POSES, world_spec
 from tests.moving_square import SIZE, episodes_of
 
-
 # Their Rays would starve each other: workers of Ray are nice, and wait long for a core that others want.
 WITH_RAY = ("test_ray_fleet", "test_cluster", "test_judge_service", "test_chaos", "test_stage_workers")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Test files stay together in one of the processes of `pytest -n`, and those that start Rays in the same."""
+    """Files stay together in one of the processes of `pytest -n`, and those that start Rays in the same."""
     for item in items:
         group = "ray" if item.path.stem in WITH_RAY else str(item.path)
         item.add_marker(pytest.mark.xdist_group(group))
