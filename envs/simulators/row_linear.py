@@ -23,8 +23,13 @@ class RowLinear(nn.Linear):
 
     def forward(self, rows: Tensor) -> Tensor:
         """[..., out_features] of [..., in_features]."""
-        flat = rows.flatten(0, -2)
-        if missing := -len(flat) % _ROWS:
-            flat = F.pad(flat, (0, 0, 0, missing))
-        out = F.linear(flat, self.weight, self.bias)
-        return out[: len(out) - missing].unflatten(0, rows.shape[:-1])
+        return row_linear(rows, self.weight, self.bias)
+
+
+def row_linear(rows: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """[..., out] of rows [..., in] and a weight [out, in]; see RowLinear."""
+    flat = rows.flatten(0, -2)
+    if missing := -len(flat) % _ROWS:
+        flat = F.pad(flat, (0, 0, 0, missing))
+    out = F.linear(flat, weight, bias)
+    return out[: len(out) - missing].unflatten(0, rows.shape[:-1])

@@ -46,10 +46,8 @@ class LookupFreeQuantiser(nn.Module):
             raise ValueError(f"codec.bits={bits} must be a multiple of codec.factors={factors}")
         self.bits, self.factors, self.each = bits, factors, bits // factors
         self.codes = 2**self.each
-        powers = 2 ** torch.arange(self.each)
-        signs = (torch.arange(self.codes)[:, None] // powers % 2) * 2 - 1
-        self.register_buffer("powers", powers, persistent=False)
-        self.register_buffer("table", signs.float(), persistent=False)  # [codes, bits of a factor]
+        self.register_buffer("powers", 2 ** torch.arange(self.each), persistent=False)
+        self.register_buffer("table", bit_signs(self.each), persistent=False)
 
     def signs(self, z: Tensor) -> Tensor:
         """Numbers [N, bits, h, w] as -1 and 1; gradients pass as if they were left as they are."""
@@ -93,6 +91,12 @@ class LookupFreeQuantiser(nn.Module):
         return torch.stack(shares).mean(), torch.stack(perplexities).mean()
 
 
+def bit_signs(bits: int) -> Tensor:
+    """Signs float32 [2 ** bits, bits] of all codes of so many bits, the lowest bit first."""
+    powers = 2 ** torch.arange(bits)
+    return ((torch.arange(2**bits)[:, None] // powers % 2) * 2 - 1).float()
+
+
 class LookupFreeTokenizer(nn.Module):
     """Convolutional autoencoder of stills whose latents are signs; pictures are float in 0..1.
 
@@ -134,9 +138,9 @@ class LookupFreeTokenizer(nn.Module):
         return self.quantiser.factors
 
     @property
-    def codes(self) -> int:
-        """Different tokens of a factor."""
-        return self.quantiser.codes
+    def bits(self) -> int:
+        """Of a token."""
+        return self.quantiser.each
 
     def encode(self, frames: Tensor) -> Tensor:
         """Stills [N, 3, H, W] -> tokens int64 [N, H / stride, W / stride, factors]."""
@@ -169,11 +173,11 @@ class LookupFreeTokenizer(nn.Module):
 
     def warning(self, figures: Mapping[str, float]) -> str:
         """What to do where figures of `loss` or `figures` say that the codebook has collapsed, else ""."""
-        floor = max(_FEWEST, _COLLAPSED * self.codes)
+        floor = max(_FEWEST, _COLLAPSED * self.quantiser.codes)
         if figures["perplexity"] >= floor:
             return ""
         return (
-            f"the codebook has collapsed: of {self.codes} codes a factor, as if"
+            f"the codebook has collapsed: of {self.quantiser.codes} codes a factor, as if"
             f" {figures['perplexity']:.2f} were in use (least {floor:.2f}); raise simulator.codec.entropy,"
             " lower tokenizer_fit.lr or simulator.codec.bits, or see whether all pictures are alike"
         )

@@ -40,10 +40,17 @@ class Memory:
     Args:
         blocks: a cache for each.
         frames: known so far, those beyond the window included.
+        last: tokens [B, P, F] of the last of them.
     """
 
     blocks: list[FrameCache]
     frames: int = 0
+    last: Tensor | None = None
+
+    def newest(self) -> Tensor:
+        """Tokens [B, P, F] of the last known frame."""
+        assert self.last is not None, "a frame is asked for before any is known"
+        return self.last
 
 
 class STBlock(nn.Module):

@@ -13,13 +13,15 @@ import torch
 from torch import Tensor, nn
 
 from envs.ranges import Count
-from envs.simulators.row_linear import RowLinear
+from envs.simulators.row_linear import RowLinear, row_linear
+from envs.simulators.tokenizers.lfq import bit_signs
 from envs.simulators.tokens.blocks import FrameCache, Memory, STBlock
 from envs.simulators.tokens.conditioning import Conditioning
 
 MASKED = -1  # stands for a token that is not known
 
 _SMALL = 0.02
+_KEEP = 3.0  # nats by which a token that was there is likelier at first
 
 
 @dataclass(frozen=True)
@@ -53,19 +55,59 @@ class Vocabulary:
     Args:
         views, rows, columns: of the places of a frame.
         factors: tokens of a place.
-        codes: different tokens of a factor.
+        bits: of a token.
     """
 
     views: int
     rows: int
     columns: int
     factors: int
-    codes: int
+    bits: int
+
+    @property
+    def codes(self) -> int:
+        """Different tokens of a factor."""
+        return 2**self.bits
 
     @property
     def places(self) -> int:
         """Of a frame, view by view and row by row, P."""
         return self.views * self.rows * self.columns
+
+
+class TokenHead(nn.Module):
+    """From a place's features to the logits of its tokens: a sum of what is said of each bit, of each code,
+    and of keeping the token that was there in the frame before.
+
+    Most places stay as they are, and codes that are seldom seen share bits with others: with whole codes
+    alone both had to be learned for every one of them.
+
+    Args:
+        width: of the features.
+        vocabulary: the tokens of a frame.
+        signs: float32 [codes, bits] of the codes.
+    """
+
+    signs: Tensor
+
+    def __init__(self, width: int, vocabulary: Vocabulary, signs: Tensor):
+        super().__init__()
+        v = vocabulary
+        self.vocabulary = v
+        self.register_buffer("signs", signs, persistent=False)
+        self.bits, self.codes = (RowLinear(width, v.factors * size, bias=False) for size in (v.bits, v.codes))
+        self.keep = RowLinear(width, v.factors)
+        nn.init.constant_(self.keep.bias, _KEEP)
+
+    def forward(self, features: Tensor, before: Tensor) -> Tensor:
+        """Logits float32 [..., factors, codes] of features [..., width]; the frame before had the tokens
+        `before` [..., factors].
+        """
+        v = self.vocabulary
+        bits = self.bits(features).float().unflatten(-1, (v.factors, v.bits))
+        codes = self.codes(features).float().unflatten(-1, (v.factors, v.codes))
+        logits = row_linear(bits, self.signs) + codes
+        return logits.scatter_add(-1, before[..., None], self.keep(features).float()[..., None])
 
 
 class SpatioTemporalTransformer(nn.Module):
@@ -85,6 +127,10 @@ class SpatioTemporalTransformer(nn.Module):
         super().__init__()
         self.vocabulary, width, v = vocabulary, trunk.width, vocabulary
         self.embed = nn.Embedding(v.factors * v.codes, width)
+        signs = bit_signs(v.bits)
+        with torch.no_grad():  # codes that differ in few bits mean much the same: they begin close together
+            directions = torch.randn(v.factors, v.bits, width) / v.bits**0.5
+            self.embed.weight.copy_((signs @ directions).flatten(0, 1))
         self.register_buffer("offset", v.codes * torch.arange(v.factors), persistent=False)
         self.view, self.row, self.column = (
             nn.Parameter(_SMALL * torch.randn(count, width)) for count in (v.views, v.rows, v.columns)
@@ -94,7 +140,7 @@ class SpatioTemporalTransformer(nn.Module):
             STBlock(width, trunk.heads, trunk.ratio, window, conditioning) for _ in range(trunk.layers)
         )
         self.norm_seen, self.norm_asked = nn.LayerNorm(width), nn.LayerNorm(width)
-        self.head = RowLinear(width, v.factors * v.codes)
+        self.head = TokenHead(width, v, signs)
 
     def forward(
         self, tokens: Tensor, shown: Tensor, told: Tensor, beside: Tensor | None, causal: bool
@@ -114,7 +160,7 @@ class SpatioTemporalTransformer(nn.Module):
         for block, cache in self._each(self.memory()):
             x, known = block.observe(x, told, cache, 0)
             y = block.ask(y, told[:, 1:], known, causal)
-        return self._logits(y), self.norm_seen(x)
+        return self._logits(y, tokens[:, :-1]), self.norm_seen(x)
 
     # -- rollouts, frame by frame
     def memory(self) -> Memory:
@@ -128,14 +174,17 @@ class SpatioTemporalTransformer(nn.Module):
             x, _ = block.observe(x, told, cache, memory.frames)
             cache.space = None
         memory.frames += tokens.shape[1]
+        memory.last = tokens[:, -1]
         return self.norm_seen(x)
 
     def ask(self, shown: Tensor, told: Tensor, beside: Tensor | None, memory: Memory) -> Tensor:
-        """Logits [B, P, F, codes] of the frame after those of a memory; `shown` [B, P, F] is given of it."""
+        """Logits float32 [B, P, F, codes] of the frame after those of a memory; `shown` [B, P, F] is given of
+        it.
+        """
         y = self._input(shown[:, None], beside) + self.asked
         for block, cache in self._each(memory):
             y = block.ask_next(y, told, cache, memory.frames)
-        return self._logits(y)[:, 0]
+        return self._logits(y, memory.newest()[:, None])[:, 0]
 
     def ask_place(
         self, place: int, shown: Tensor, told: Tensor, beside: Tensor | None, memory: Memory
@@ -149,7 +198,7 @@ class SpatioTemporalTransformer(nn.Module):
             y = y + beside[:, :, place : place + 1]
         for block, cache in self._each(memory):
             y = block.ask_place(y, told, cache, place, memory.frames)
-        return self._logits(y)[:, 0, 0]
+        return self._logits(y, memory.newest()[:, None, place : place + 1])[:, 0, 0]
 
     # -- parts
     def _each(self, memory: Memory) -> Iterator[tuple[STBlock, FrameCache]]:
@@ -169,6 +218,5 @@ class SpatioTemporalTransformer(nn.Module):
         x = self._embed(tokens) + self._places()
         return x if beside is None else x + beside
 
-    def _logits(self, y: Tensor) -> Tensor:
-        v = self.vocabulary
-        return self.head(self.norm_asked(y)).unflatten(-1, (v.factors, v.codes))
+    def _logits(self, y: Tensor, before: Tensor) -> Tensor:
+        return self.head(self.norm_asked(y), before)

@@ -98,7 +98,7 @@ class TokenVideo(nn.Module):
                 f"task.size={list(spec.size)} must be multiples of {stride}, which is {key}.codec.stride"
             )
         rows, columns = (side // stride for side in spec.size)
-        self.vocabulary = Vocabulary(spec.views, rows, columns, self.codec.factors, self.codec.codes)
+        self.vocabulary = Vocabulary(spec.views, rows, columns, self.codec.factors, self.codec.bits)
         self.trunk = options(Trunk, net, f"{key}.net")
         self.training_options = options(TokenTraining, training, f"{key}.training")
         self.decoding: Decoding = build(decoding, f"{key}.decoding")
@@ -145,7 +145,7 @@ class TokenVideo(nn.Module):
         shown, asked = self.decoding.shown(tokens[:, 1:], generator)
         known = self._corrupted(tokens, generator)
         logits, features = self.net(known, shown, told, beside, self.decoding.causal)
-        error = F.cross_entropy(logits.float().flatten(0, 3), tokens[:, 1:].flatten(), reduction="none")
+        error = F.cross_entropy(logits.flatten(0, 3), tokens[:, 1:].flatten(), reduction="none")
         error = error.view(tokens[:, 1:].shape).sum(-1)
         moved = (tokens[:, 1:] != tokens[:, :-1]).any(-1)
         weight = (1 + how.motion * moved) * (asked & lesson.counted[..., None])

@@ -18,7 +18,7 @@ from tests.envs.simulators.clips import clip, first_of, future_of
 from tests.learners.models import section_of
 from tests.sections import merged
 
-VOCABULARY = Vocabulary(views=2, rows=2, columns=3, factors=2, codes=8)
+VOCABULARY = Vocabulary(views=2, rows=2, columns=3, factors=2, bits=3)
 WAYS: list[Conditioning] = [CrossAttention(2), AdaLN()]
 CHUNK = 3
 
