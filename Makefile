@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 # Extra words for pip, such as an index with CPU builds of torch: make quickstart PIP_ARGS="--extra-index-url URL"
 PIP_ARGS ?=
 SEED ?= 0
+# Processes that share the test files. Many tests wait for others, so two take little more than half of one's time.
+TEST_WORKERS ?= 2
 METAWORLD := metaworld==3.1.1
 ALOHA := dm_control==1.0.41 gym-aloha==0.1.5
 OGBENCH := dm_control==1.0.41 ogbench==1.2.2
@@ -50,7 +52,7 @@ lint: setup
 	$(BIN)/mypy
 
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n $(TEST_WORKERS) --dist loadfile
 
 quickstart: setup
 	$(BIN)/worldloop run experiment=quickstart seed=$(SEED)

@@ -6,10 +6,12 @@ world that it shall work in is handed to it as a WorldSpec.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
@@ -27,9 +29,11 @@ from envs.simulators.base import WORLD_OPTIONS, Simulator
 from envs.simulators.state_experts.base import StateDecoder
 from envs.simulators.tokens.text_world import TextWorld
 from envs.specs import ActionMode
-from envs.targets import ConfigError, build
+from envs.targets import ConfigError, build, target, to_plain
 from envs.transforms import world_transforms
 from envs.world import WorldEnv
+
+_shapes: dict[str, tuple[int, ...]] = {}  # of the features of simulators that judges asked for
 
 
 def open_clips(cfg: Mapping[str, Any], folders: Iterable[Path | str]) -> ClipStore:
@@ -59,8 +63,22 @@ def build_state_decoder(
 def build_judge(cfg: Mapping[str, Any], weights: Path | None = None) -> Judge:
     """The judge of the judge section."""
     section = {name: value for name, value in cfg["judge"].items() if name != "rewards"}
-    judge: Judge = build(section, "judge", spec=world_spec(cfg))
+    context: dict[str, Any] = {"spec": world_spec(cfg)}
+    if getattr(target(section, "judge"), "reads_features", False):
+        context["feature_shape"] = _feature_shape(cfg)
+    judge: Judge = build(section, "judge", **context)
     return load(judge, weights).to(device_of(cfg))
+
+
+def _feature_shape(cfg: Mapping[str, Any]) -> tuple[int, ...]:
+    """Of the simulator's features of a chunk; building one is the only way to know, and its first weights
+    shall draw none of the numbers that others go on with.
+    """
+    known = json.dumps([to_plain(cfg["simulator"]), to_plain(cfg["task"])], sort_keys=True, default=str)
+    if known not in _shapes:
+        with torch.random.fork_rng(devices=[]):
+            _shapes[known] = build_simulator(cfg).feature_shape
+    return _shapes[known]
 
 
 def build_text_world(cfg: Mapping[str, Any], weights: Path | None = None) -> TextWorld:

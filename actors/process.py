@@ -14,7 +14,7 @@ from envs.rng import seed_process
 from envs.targets import ConfigError
 
 
-def prepare_process(seed: int, threads: int = 0) -> None:
+def prepare_process(seed: int, threads: int) -> None:
     """Settings every process needs before heavy work: seeds, threads, and an allocator that keeps its memory.
 
     Args:

@@ -14,7 +14,7 @@ from envs.episodes.formats.lerobot_info import from_info
 from envs.geometry.kinematics import Kinematics, KinematicsError
 from envs.physics.suite import SuiteError, build_suite, check_task, task_names
 from envs.specs import Rewards, WorldSpec
-from envs.targets import TARGET, ConfigError, options, to_plain
+from envs.targets import TARGET, ConfigError, options, target, to_plain
 
 _suites: dict[str, tuple[Embodiment, tuple[str, ...]]] = {}  # robot and tasks of each section
 
@@ -54,7 +54,8 @@ def _suite(section: Mapping[str, Any]) -> tuple[Embodiment, tuple[str, ...]]:
 
 
 def check_world(cfg: Mapping[str, Any]) -> None:
-    """See that robot and tasks are there as the config names them, which reading the config cannot tell.
+    """See that robot, tasks and judge are there as the config names them, which reading the config cannot
+    tell.
 
     Raises:
         ConfigError: with a line for each thing that is wrong.
@@ -74,6 +75,11 @@ def check_world(cfg: Mapping[str, Any]) -> None:
                 robot.views_of(section["cameras"])
             except ValueError as error:
                 wrong.append(f"{key}{error}")
+    try:
+        judge: Any = target(cfg["judge"], "judge")
+        judge.check(cfg["judge"])
+    except ConfigError as error:
+        wrong.append(str(error))
     if wrong:
         raise ConfigError("\n".join(wrong))
 

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from envs.specs import WorldSpec
 
 _NATIVE = 64  # pixels of a view's shorter side that the encoder is laid out for; larger ones are halved first
+_LOOK = 4  # features said of each key-point
 
 
 class ResidualBlock(nn.Module):
@@ -42,7 +43,6 @@ class MultiViewEncoder(nn.Module):
         pictures: of each view that are looked at as one, channel on channel.
         blocks: residual blocks at the lowest resolution.
         grid: rows and columns of the coarse grid.
-        look: features said of each key-point.
         cameras: which are looked through (Embodiment.views_of); the others cost nothing.
         asked: key-points per view that look for what the words say, beside `points`.
         words: numbers that an instruction is encoded as, of `asked` key-points.
@@ -59,7 +59,6 @@ class MultiViewEncoder(nn.Module):
         pictures: int = 1,
         blocks: int = 1,
         grid: int = 4,
-        look: int = 4,
         cameras: str | Sequence[str] = "all",
         asked: int = 0,
         words: int = 0,
@@ -82,7 +81,7 @@ class MultiViewEncoder(nn.Module):
         self.heat = nn.Parameter(torch.randn(views, points, width) / width**0.5)
         # Sharp from the start: over a near-uniform softmax, key-points sit in the middle and hardly learn.
         self.temperature = nn.Parameter(torch.full((views, points + asked, 1), 2.3))
-        self.look = nn.Parameter(torch.randn(views, points + asked, width, look) / width**0.5)
+        self.look = nn.Parameter(torch.randn(views, points + asked, width, _LOOK) / width**0.5)
         if asked:
             self.ask = nn.Sequential(
                 nn.Linear(words, words), nn.SiLU(), nn.Linear(words, views * asked * width)
@@ -91,7 +90,7 @@ class MultiViewEncoder(nn.Module):
         self.grid = nn.Sequential(
             nn.AdaptiveAvgPool2d(grid), nn.Conv2d(deep, width, 1), nn.SiLU(), nn.Flatten()
         )
-        self.out_features = views * ((points + asked) * (2 + look) + width * grid * grid)
+        self.out_features = views * ((points + asked) * (2 + _LOOK) + width * grid * grid)
 
     def forward(self, pictures: Tensor, words: Tensor | None = None) -> Tensor:
         pictures = pictures[:, self.chosen]

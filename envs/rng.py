@@ -77,6 +77,11 @@ def episode_stream(seed: int) -> torch.Generator:
     return _generator(seed)
 
 
+def vote_generator(vote: int) -> torch.Generator:
+    """The generator by which a judge's vote is sampled; equal questions get equal answers."""
+    return _generator(vote)
+
+
 # -- learning
 def step_generator(seed: int, step: int, part: int = 0) -> torch.Generator:
     """The generator of microbatch `part` of training step `step`."""

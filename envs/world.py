@@ -18,6 +18,7 @@ from envs.initial_states import InitialStates
 from envs.precision import mixed_precision
 from envs.simulators import memory
 from envs.simulators.base import Simulator
+from envs.simulators.features import features_of_sessions
 from envs.specs import (
     C2W,
     CHUNK_C2W,
@@ -153,6 +154,14 @@ class WorldEnv(ChunkedEnv):
         """
         assert self.session is not None
         return self.session["history", "frames"][:, 0]
+
+    def features_now(self) -> torch.Tensor:
+        """Pooled features float32 [B, D] of where episodes are, for judges that read features: of a chunk
+        that would change nothing.
+        """
+        assert self.session is not None
+        with mixed_precision(self.device, self.bf16):
+            return features_of_sessions(self.simulator, self.session)
 
     def video(self, slot: int) -> torch.Tensor:
         """All frames of the episode in a slot so far, uint8 [T, V, 3, H, W], the first ones real."""

@@ -1,6 +1,6 @@
 """Everything that can be seen to be wrong with a config before any work, found at once.
 
-Names, types and ranges come from pipeline/sections.py and from the classes that sections become; what no
+Names, types and ranges come from pipeline/sections and from the classes that sections become; what no
 single option can tell stands in `_together`.
 """
 
@@ -19,35 +19,35 @@ from envs.targets import ConfigError, nearest, options, section_faults, unknown_
 from learners.rl.algorithm import RLConfig
 from learners.stages.simulator import SimulatorFitConfig
 from learners.training.fit import FitConfig
-from pipeline import sections
 from pipeline.acting import acting
+from pipeline.sections import learning, measuring, running
 
 Cfg = Mapping[str, Any]
 
 _SECTIONS = {
-    "task": sections.TaskSection,
-    "collect": sections.CollectSection,
-    "imitation": sections.ImitationSection,
-    "rounds": sections.RoundsSection,
-    "extra_starts": sections.ExtraStartsSection,
-    "clone": sections.CloneSection,
-    "judge_fit.first": sections.JudgeFitSection,
-    "judge_fit.refresh": sections.JudgeFitSection,
-    "text_world_fit": sections.TextWorldFitSection,
-    "state_fit.first": sections.StateFitSection,
-    "state_fit.refresh": sections.StateFitSection,
-    "finetune": sections.FinetuneSection,
-    "distill": sections.DistillSection,
-    "chaos": sections.ChaosSection,
-    "evaluate": sections.EvaluateSection,
-    "measure": sections.MeasureSection,
-    "study": sections.StudySection,
-    "imagined": sections.ImaginedSection,
-    "policy_value": sections.PolicyValueSection,
-    "fidelity": sections.FidelitySection,
-    "fidelity.long": sections.LongSection,
-    "sweep": sections.SweepSection,
-    "track": sections.TrackSection,
+    "task": learning.TaskSection,
+    "collect": learning.CollectSection,
+    "imitation": learning.ImitationSection,
+    "rounds": learning.RoundsSection,
+    "extra_starts": learning.ExtraStartsSection,
+    "clone": learning.CloneSection,
+    "judge_fit.first": learning.JudgeFitSection,
+    "judge_fit.refresh": learning.JudgeFitSection,
+    "text_world_fit": learning.TextWorldFitSection,
+    "state_fit.first": learning.StateFitSection,
+    "state_fit.refresh": learning.StateFitSection,
+    "finetune": learning.FinetuneSection,
+    "distill": learning.DistillSection,
+    "chaos": running.ChaosSection,
+    "evaluate": measuring.EvaluateSection,
+    "measure": measuring.MeasureSection,
+    "study": measuring.StudySection,
+    "imagined": measuring.ImaginedSection,
+    "policy_value": measuring.PolicyValueSection,
+    "fidelity": measuring.FidelitySection,
+    "fidelity.long": measuring.LongSection,
+    "sweep": measuring.SweepSection,
+    "track": running.TrackSection,
     "serve": ServeConfig,
     "judge.rewards": Rewards,
     "simulator.pose_map_style": PoseMapStyle,
@@ -85,14 +85,14 @@ def faults(cfg: Cfg) -> list[str]:
 
 def _alone(cfg: Cfg) -> Iterator[str]:
     """What is wrong with each option by itself."""
-    known = {field.name for field in fields(sections.Top)} | _TOP
+    known = {field.name for field in fields(running.Top)} | _TOP
     yield from (f"{key} is not a key{nearest(key, known)}" for key in cfg if key not in known)
     yield from (f"{key} is missing from the config" for key in sorted(known - cfg.keys()))
     odd = [key for key in sorted(_TOP & cfg.keys()) if not isinstance(cfg[key], Mapping)]
     yield from (f"{key}={cfg[key]!r} should be a section" for key in odd)
     if odd or known - cfg.keys():
         return
-    yield from value_faults(sections.Top, cfg, "")
+    yield from value_faults(running.Top, cfg, "")
     if not re.fullmatch(r"\w[\w.-]*", str(cfg["name"])):
         yield f"name={cfg['name']!r} should be of letters, digits, '_', '-' and '.': it names a folder"
     for key, kind in _SECTIONS.items():
@@ -122,7 +122,7 @@ def _alone(cfg: Cfg) -> Iterator[str]:
         if isinstance(section, Mapping):
             yield from section_faults(section, f"policy_value.others.{name}", ("weights",))
     world = {name: value for name, value in cfg["simulator"].items() if name in WORLD_OPTIONS}
-    yield from _of(sections.WorldSection, world, "simulator")
+    yield from _of(learning.WorldSection, world, "simulator")
 
 
 def _of(kind: type[Any], section: Any, key: str, given: tuple[str, ...] = ()) -> Iterator[str]:
@@ -146,7 +146,7 @@ def _study(section: Any) -> Iterator[str]:
         section.get(key) if isinstance(section, Mapping) else None for key in ("methods", "measures")
     )
     for name, row in rows.items() if isinstance(rows, Mapping) else ():
-        yield from _of(sections.RowSection, row, f"study.methods.{name}")
+        yield from _of(measuring.RowSection, row, f"study.methods.{name}")
         if isinstance(row, Mapping) and isinstance(row.get("policy"), Mapping):
             yield from section_faults(row["policy"], f"study.methods.{name}.policy")
     for name, column in columns.items() if isinstance(columns, Mapping) else ():
@@ -158,13 +158,13 @@ def _launch(launch: Cfg) -> Iterator[str]:
     if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", str(launch.get("device"))):
         yield f"launch.device={launch.get('device')!r} should be auto, cpu, cuda or cuda:<number>"
     if launch.get("backend") != "ray":
-        yield from _of(sections.LocalSection, launch, "launch")
+        yield from _of(running.LocalSection, launch, "launch")
         return
     # Ray takes seconds to import, which runs in one process need not spend.
     from actors.fleets.fleet import Patience
     from actors.serving.judge_service import ServiceConfig
 
-    yield from _of(sections.RaySection, launch, "launch")
+    yield from _of(running.RaySection, launch, "launch")
     yield from _of(ServiceConfig, launch.get("service"), "launch.service")
     yield from _of(Patience, launch.get("patience"), "launch.patience")
 
@@ -203,6 +203,8 @@ def _together(cfg: Cfg) -> Iterator[str]:
             f"rl.envs / rl.shards = {rl['envs'] // rl['shards']} must be a multiple of"
             f" algorithm.group={cfg['algorithm']['group']}, or groups would be torn apart"
         )
+    if rl["evaluate_every"] and not task.get("suite"):
+        yield f"rl.evaluate_every={rl['evaluate_every']} needs physics, which this task has not; set it to 0"
     try:
         acting(cfg)
     except ConfigError as error:

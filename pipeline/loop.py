@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from envs.manifest import digest_of
+from envs.targets import target
 from pipeline.acting import acting
 from pipeline.graph.graph import Graph
 from pipeline.graph.workers import learners_of
@@ -171,8 +173,17 @@ def _refresh(graph: Graph, cfg: Cfg, data: list[str], before: World, number: int
         roles = {"data": data, "warm": before.text_world}
         golden = graph.add(f"text_world-{number}", world.text_world, roles, phase=phase)
     roles = {**inputs, "warm": before.judge, "text_world": golden}
-    judge = graph.add(f"judge-{number}", world.judge, roles, phase=phase)
+    judge = graph.add(f"judge-{number}", world.judge, roles, phase=phase, **_judge_files(cfg))
     return World(teacher, simulator, state, judge, golden)
+
+
+def _judge_files(cfg: Cfg) -> dict[str, Any]:
+    """A setting with the hashes of files that decide what the judge says, if there are any: when one changes,
+    what it judged is out of date.
+    """
+    kind: Any = target(cfg["judge"], "judge")
+    found = {path.name: digest_of(path) for path in kind.files(cfg["judge"])}
+    return {"files": found} if found else {}
 
 
 def _learn(

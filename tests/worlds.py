@@ -20,7 +20,7 @@ def untrained_world(cfg: Mapping[str, Any], root: Path) -> list[str]:
     """Weights of simulator, state expert, judge and policy of a config; words by which `imagined` names the
     first three.
     """
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     simulator = build_simulator(cfg)
     with torch.no_grad():
         for parameter in simulator.parameters():

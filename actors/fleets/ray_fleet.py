@@ -32,6 +32,7 @@ from actors.fleets.fleet import EpisodeLedger, FleetError, Patience, Result
 from actors.fleets.host_actor import HostActor, Member
 from actors.rollouts.host import Job, Stopwatch, Weights, size_of, unpack
 from actors.rollouts.recipe import Recipe
+from envs.judges.base import JudgeError
 from envs.targets import options
 
 
@@ -220,6 +221,8 @@ class RayFleet:
         if job is None:  # the host could not be built
             self._died(member, error)
             return
+        if isinstance(error.cause, JudgeError):
+            raise FleetError(str(error.cause))
         tries = self._tries[job.number] = self._tries.get(job.number, 0) + 1
         if tries <= self.patience.retries:
             self._queue.appendleft(job)

@@ -28,12 +28,13 @@ from torch import Tensor
 from actors.factory import build_judge
 from actors.policies.contract import device_of
 from actors.process import prepare_process
-from envs.judges.base import Judge, Judgement
+from envs.judges.base import Judge, JudgeError, Judgement
 from envs.ranges import Count, Natural, NonNegative, Positive
 from envs.specs import Status
 from envs.targets import ConfigError
 
-Clip = tuple[np.ndarray, np.ndarray, str]  # frames [T, V, 3, H, W], first [V, 3, H, W], instruction
+# Frames [T, V, 3, H, W], first [V, 3, H, W], instruction, features [C, D] (empty if the judge reads none).
+Clip = tuple[np.ndarray, np.ndarray, str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -74,28 +75,35 @@ class JudgeServer:
         self.worker: asyncio.Task[None] | None = None
 
     async def describe(self) -> dict[str, Any]:
-        """Threshold and hold of the judge, by which callers turn frames into episodes."""
-        return {"threshold": float(self.judge.threshold), "hold": self.judge.hold}
+        """Threshold and hold of the judge, by which callers turn frames into episodes, and what it reads."""
+        judge = self.judge
+        about = {"threshold": float(judge.threshold), "hold": judge.hold}
+        return about | {"reads_features": judge.reads_features}
 
     async def stats(self) -> dict[str, int]:
         """How many clips came, were judged or remembered, in how many batches."""
         return dict(self.counts)
 
     async def score(
-        self, frames: np.ndarray, first: np.ndarray, instruction: list[str]
+        self,
+        frames: np.ndarray,
+        first: np.ndarray,
+        instruction: list[str],
+        features: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Success and progress [B, T] and status [B] of clips; see Judge.score."""
+        seen = np.zeros((len(frames), 0, 0), np.float32) if features is None else features
         answers = await asyncio.gather(
-            *(self._clip(parts) for parts in zip(frames, first, instruction, strict=True))
+            *(self._clip(parts) for parts in zip(frames, first, instruction, seen, strict=True))
         )
         success, progress, status = zip(*answers, strict=True)
         return np.stack(success), np.stack(progress), np.array(status)
 
     async def _clip(self, clip: Clip) -> tuple[np.ndarray, np.ndarray, int]:
         self.counts["clips"] += 1
-        frames, first, instruction = clip
+        frames, first, instruction, features = clip
         digest = hashlib.blake2b(instruction.encode(), digest_size=16)
-        for part in (frames, first):
+        for part in (frames, first, features):
             digest.update(str(part.shape).encode())
             digest.update(np.ascontiguousarray(part).tobytes())
         key = digest.digest()
@@ -110,7 +118,9 @@ class JudgeServer:
         self.waiting.append((clip, future))
         if self.worker is None or self.worker.done():
             self.worker = asyncio.create_task(self._work())
-        answer = await future
+        answer: tuple[np.ndarray, np.ndarray, int] = await future
+        if answer[2] == Status.ERROR.value:
+            return answer  # it may fare better the next time
         self.cache[key] = answer
         while len(self.cache) > self.options.cache:
             self.cache.popitem(last=False)
@@ -145,11 +155,11 @@ class JudgeServer:
     def _judge(self, clips: list[Clip]) -> Judgement:
         """Judge clips of equal shape on the judge's device."""
         device = device_of(self.judge)
-        frames, first = (
-            torch.from_numpy(np.stack(parts)).to(device)
-            for parts in ([clip[0] for clip in clips], [clip[1] for clip in clips])
+        frames, first, features = (
+            torch.from_numpy(np.stack([clip[part] for clip in clips])).to(device) for part in (0, 1, 3)
         )
-        return self.judge.score(frames, first, [clip[2] for clip in clips])
+        seen = (features,) if self.judge.reads_features else ()
+        return self.judge.score(frames, first, [clip[2] for clip in clips], *seen)
 
 
 class JudgeClient(Judge):
@@ -173,24 +183,34 @@ class JudgeClient(Judge):
                 " launch.judge_service=false"
             ) from error
         super().__init__(about["hold"], about["threshold"])
+        self.reads_features = about["reads_features"]
 
-    def submit(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Any:
+    def submit(
+        self, frames: Tensor, first: Tensor, instruction: list[str], features: Tensor | None = None
+    ) -> Any:
         """See Judge.submit; the service begins at once."""
-        arrays = (frames.cpu().numpy(), first.cpu().numpy(), list(instruction))
+        seen = None if features is None else features.float().cpu().numpy()
+        arrays = (frames.cpu().numpy(), first.cpu().numpy(), list(instruction), seen)
         ref: Any = None  # stays so if it is down just now; `fetch` asks again
         with contextlib.suppress(ValueError, RayActorError):
             ref = ray.get_actor(self.service).score.remote(*arrays)
         return arrays, ref, frames.device
 
     def fetch(self, ticket: Any) -> Judgement:
-        """See Judge.fetch; what no attempt answered is an ERROR."""
+        """See Judge.fetch; what no attempt answered is an ERROR.
+
+        Raises:
+            JudgeError: if the judge itself says that it cannot go on.
+        """
         arrays, ref, device = ticket
         for attempt in range(self.options.retries + 1):
             try:
                 if ref is None:
                     ref = ray.get_actor(self.service).score.remote(*arrays)
                 success, progress, status = ray.get(ref, timeout=self.options.deadline)
-            except (ValueError, RayActorError, RayTaskError, GetTimeoutError):
+            except (ValueError, RayActorError, RayTaskError, GetTimeoutError) as error:
+                if isinstance(error, RayTaskError) and isinstance(error.cause, JudgeError):
+                    raise JudgeError(str(error.cause)) from None
                 ref = None
                 if attempt < self.options.retries:
                     time.sleep(self.options.pause * 2**attempt)
@@ -204,9 +224,11 @@ class JudgeClient(Judge):
         nothing = torch.zeros(batch, count, device=device)
         return Judgement(nothing, nothing.clone(), torch.full((batch,), Status.ERROR.value, device=device))
 
-    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Judgement:
+    def score(
+        self, frames: Tensor, first: Tensor, instruction: list[str], features: Tensor | None = None
+    ) -> Judgement:
         """See Judge.score."""
-        return self.fetch(self.submit(frames, first, instruction))
+        return self.fetch(self.submit(frames, first, instruction, features))
 
 
 def start_service(

@@ -1,7 +1,7 @@
 """Judges: from video and an instruction to success and progress."""
 
-from envs.judges.base import Judge, Judgement
+from envs.judges.base import Judge, JudgeError, Judgement, MissingFeatures
 from envs.judges.learned import LearnedJudge
 from envs.judges.rule import RuleJudge
 
-__all__ = ["Judge", "LearnedJudge", "RuleJudge", "Judgement"]
+__all__ = ["Judge", "JudgeError", "LearnedJudge", "RuleJudge", "Judgement", "MissingFeatures"]

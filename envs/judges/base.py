@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor, nn
 
 from envs.specs import Status
+
+
+class JudgeError(RuntimeError):
+    """A judge cannot go on, and asking it again would not help: its budget is spent, or nobody is there.
+
+    The run stops; the message names the config key and the fix.
+    """
 
 
 class Judgement(NamedTuple):
@@ -22,18 +32,30 @@ class Judgement(NamedTuple):
     status: Tensor
 
 
+class MissingFeatures(ValueError):
+    """A judge that reads a simulator's features was shown video that has none."""
+
+
 class Judge(nn.Module):
-    """Scores video against an instruction; subclasses implement `score`.
+    """Scores video against an instruction; subclasses implement `score`, and `loss` if they learn.
 
     Args:
         hold: frames in a row that must count as success before the episode does.
         threshold: probability from which a frame counts as success; calibration sets it later.
+
+    Attributes:
+        reads_features: whether `score` must be given the simulator's features of the frames.
+        discount: per frame, of the progress that `loss` is given: discount ** (frames until success).
+        calibrates: whether the threshold is to be set on recorded video (learners/stages/judge.py).
 
     Raises:
         ValueError: if hold is less than one frame.
     """
 
     threshold: Tensor
+    reads_features = False
+    discount = 1.0
+    calibrates = True
 
     def __init__(self, hold: int, threshold: float = 0.5):
         super().__init__()
@@ -42,26 +64,73 @@ class Judge(nn.Module):
         self.hold = hold
         self.register_buffer("threshold", torch.tensor(threshold))
 
-    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Judgement:
+    def score(
+        self, frames: Tensor, first: Tensor, instruction: list[str], features: Tensor | None = None
+    ) -> Judgement:
         """Judge clips.
 
         Args:
             frames: uint8 [B, T, V, 3, H, W].
             first: uint8 [B, V, 3, H, W], the first frame of each episode.
             instruction: B texts.
+            features: float32 [B, C, D], the pooled features (simulators/features.py) of the C chunks that the
+                frames make up, the last of which may be cut; only given to a judge that `reads_features`.
         """
         raise NotImplementedError
 
-    def submit(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Any:
+    def loss(self, data: TensorDict, share: float) -> tuple[Tensor, dict[str, Any]]:
+        """Training loss and figures to log; a judge without weights of its own has none.
+
+        Args:
+            data: TensorDict [N] of frames, with label float32 in {0, 1} and progress float32 in 0..1, both
+                NaN where nobody labelled the episode (such frames teach nothing), and text uint8
+                [N, TEXT_BYTES]; frames and first uint8 [N, V, 3, H, W], or, for a judge that
+                `reads_features`, features float32 [N, D] of the frame's chunk and offset int64 [N], its
+                place in that chunk.
+            share: fraction of successes among the labels, by which the classes are balanced.
+        """
+        raise NotImplementedError
+
+    def facts(self) -> dict[str, Any]:
+        """Numbers and texts that results say of the judge, such as what it measures by and how often it
+        could not.
+        """
+        return {}
+
+    def submit(
+        self, frames: Tensor, first: Tensor, instruction: list[str], features: Tensor | None = None
+    ) -> Any:
         """Hand clips over (see `score`) and get a ticket for `fetch`.
 
         A judge in another process works meanwhile; one in this process puts it off until then.
         """
-        return frames, first, instruction
+        return (frames, first, instruction, *([] if features is None else [features]))
 
     def fetch(self, ticket: Any) -> Judgement:
         """The judgement on what `submit` was given."""
         return self.score(*ticket)
+
+    @classmethod
+    def check(cls, options: Mapping[str, Any]) -> None:
+        """See that a judge of these options (section judge) can work here, before hours are spent on others.
+
+        Raises:
+            ConfigError: naming the key and the fix.
+        """
+
+    @classmethod
+    def files(cls, options: Mapping[str, Any]) -> tuple[Path, ...]:
+        """Files whose contents decide judgements, by options that name one: when they change, what was made
+        with the judge is out of date.
+        """
+        return tuple(Path(value) for value in options.values() if isinstance(value, str) and _is_file(value))
+
+    @classmethod
+    def spent(cls, options: Mapping[str, Any]) -> dict[str, float]:
+        """What judges of these options have asked for and paid so far, over all processes; {} if they are
+        free.
+        """
+        return {}
 
     def streak(self, success: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         """Whether `hold` frames in a row were successes by the end of each frame.
@@ -92,6 +161,13 @@ class Judge(nn.Module):
         masked = torch.where(valid, success, 0.0)
         done, _ = self.streak(masked, torch.zeros(len(success), dtype=torch.int64, device=success.device))
         return done.any(1)
+
+
+def _is_file(name: str) -> bool:
+    try:
+        return Path(name).is_file()
+    except OSError:  # too long for a name
+        return False
 
 
 def judgement_status(success: Tensor) -> Tensor:

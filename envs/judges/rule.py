@@ -14,7 +14,9 @@ class RuleJudge(Judge):
         hold: 1 where the suite counts the hold itself, as suites here do.
     """
 
-    def score(self, frames: Tensor, first: Tensor, instruction: list[str]) -> Judgement:
+    def score(
+        self, frames: Tensor, first: Tensor, instruction: list[str], features: Tensor | None = None
+    ) -> Judgement:
         """Refused: see `judgement`.
 
         Raises:

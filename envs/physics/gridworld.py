@@ -98,10 +98,13 @@ class Gridworld(TaskSuite):
         """See TaskSuite; edges are smooth, so that pictures tell parts of pixels."""
         out = np.empty((3, *self.size))
         out[:] = np.array(_GROUND)[:, None, None]
-        for colour, (x, y) in zip(self.colours, self._at, strict=True):
-            share = np.outer(_covered(y, self.size[0]), _covered(x, self.size[1]))
+        for colour, share in zip(self.colours, self._shares(), strict=True):
             out += share * (np.array(COLOURS[colour])[:, None, None] - out)
         return out.round().astype(np.uint8)[None]
+
+    def segment(self) -> NDArray[np.uint8]:
+        """See TaskSuite; all squares are the robot."""
+        return (np.max(self._shares(), 0) >= 0.5).astype(np.uint8)[None]
 
     def observe(self) -> Observation:
         """See TaskSuite; the squares are the robot, and know where they are."""
@@ -125,6 +128,10 @@ class Gridworld(TaskSuite):
             return velocity.flatten()
 
         return act
+
+    def _shares(self) -> list[Array]:
+        """Share [H, W] of each pixel that a square covers, square by square."""
+        return [np.outer(_covered(y, self.size[0]), _covered(x, self.size[1])) for x, y in self._at]
 
     def _inside(self, at: Array) -> Array:
         return at.clip(SIDE / 2, EDGE - SIDE / 2)

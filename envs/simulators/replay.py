@@ -11,6 +11,7 @@ from torch import Tensor
 from envs.episodes.clips import ClipStore
 from envs.precision import mixed_precision
 from envs.simulators.base import Simulator
+from envs.simulators.features import pooled
 from envs.simulators.state_experts.base import StateDecoder
 
 
@@ -18,13 +19,14 @@ class Replay(NamedTuple):
     """Generated episodes beside the rows of the true ones.
 
     frames uint8 [N, T, V, 3, H, W] generated, rows int64 [N, T] of the true frames, valid bool [N, T], states
-    float32 [N, T, S] decoded.
+    float32 [N, T, S] decoded, features float32 [N, C, D] of the generated chunks, pooled.
     """
 
     frames: Tensor
     rows: Tensor
     valid: Tensor
     states: Tensor
+    features: Tensor
 
 
 @torch.no_grad()
@@ -72,7 +74,8 @@ def replay(
                 states = first["state"][:, None].expand(-1, chunk, -1)
             else:
                 states = decoder.follow(state, chunk, features)
-            made.append((frames.cpu(), rows, (ahead <= last), states.cpu()))
+            shown = pooled(features)[:, None].cpu()
+            made.append((frames.cpu(), rows, (ahead <= last), states.cpu(), shown))
         parts.append(Replay(*(torch.cat(values, 1) for values in zip(*made, strict=True))))
     return Replay(*(torch.cat(values) for values in zip(*parts, strict=True)))
 

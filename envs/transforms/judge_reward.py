@@ -8,10 +8,12 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from envs.judges.base import Judge, Judgement
+from envs.simulators.features import pooled
 from envs.specs import FEATURES, FRAMES, IMAGE, JUDGE_STATUS, PROGRESS, SUCCESS, Rewards, Status
 
 
@@ -19,7 +21,8 @@ class JudgeReward(Transform):
     """Success, progress and reward of imagined video; the frames themselves stay behind.
 
     A judgement that is not OK ends the episode and is written to `judge_status`, by which learners drop and
-    count it.
+    count it. At resets the judge is asked how far the task is, unless progress is worth nothing: to some
+    judges every question costs.
 
     Args:
         judge: scores frames.
@@ -32,16 +35,19 @@ class JudgeReward(Transform):
         super().__init__(in_keys=[FRAMES], out_keys=["reward", SUCCESS, PROGRESS, JUDGE_STATUS])
         self.judge, self.rewards, self.later = judge, rewards, later
         self._tickets: list[Any] = []
-        self._opening = torch.zeros(0, 1)
+        self._opening = (torch.zeros(0, 1), torch.zeros(0, dtype=torch.int64))
         self._run = torch.zeros(0, dtype=torch.int64)
         self._progress = torch.zeros(0, 1)
+        self._begun = torch.zeros(0, dtype=torch.int64)  # status of the judgement at the episode's beginning
         self._first = torch.zeros(0, dtype=torch.uint8)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        clips = (next_tensordict[FRAMES], self._first, self.parent.base_env.instructions)
+        clips = [next_tensordict[FRAMES], self._first, self.parent.base_env.instructions]
+        if self.judge.reads_features:
+            clips.append(pooled(next_tensordict[FEATURES])[:, None])
         if self.later:
             if not self._tickets:
-                self._opening = self._progress
+                self._opening = (self._progress, self._begun)
             self._tickets.append(self.judge.submit(*clips))
             nothing = torch.zeros_like(self._progress)
             next_tensordict["reward"], next_tensordict[SUCCESS], next_tensordict[PROGRESS] = (
@@ -67,7 +73,7 @@ class JudgeReward(Transform):
                 " settle each rollout before the next begins"
             )
         # By now the collector has begun the next episodes; these begin where theirs did.
-        self._run, self._progress = torch.zeros_like(self._run), self._opening
+        self._run, (self._progress, self._begun) = torch.zeros_like(self._run), self._opening
         for number, ticket in enumerate(tickets):
             after = batch["next"][:, number]
             self._decide(self.judge.fetch(ticket), after)
@@ -78,13 +84,15 @@ class JudgeReward(Transform):
         successes.
         """
         done, self._run = self.judge.streak(judgement.success, self._run)
-        failed = (judgement.status != Status.OK.value).unsqueeze(-1)
+        # progress from an unknown beginning is as worthless as to an unknown end
+        status = torch.where(self._begun != Status.OK.value, self._begun, judgement.status)
+        failed = (status != Status.OK.value).unsqueeze(-1)
         success = done.any(1, keepdim=True) & ~failed
         progress = torch.where(failed, self._progress, judgement.progress[:, -1:])
         next_tensordict["reward"] = self.rewards(self._progress, progress, success)
         self._progress = progress
         next_tensordict[SUCCESS], next_tensordict[PROGRESS] = success, progress
-        next_tensordict[JUDGE_STATUS] = judgement.status.unsqueeze(-1)
+        next_tensordict[JUDGE_STATUS] = status.unsqueeze(-1)
         next_tensordict["terminated"] = success | failed
         next_tensordict["truncated"] = next_tensordict["truncated"] & ~next_tensordict["terminated"]
         next_tensordict["done"] = next_tensordict["terminated"] | next_tensordict["truncated"]
@@ -92,18 +100,31 @@ class JudgeReward(Transform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         mask = tensordict.get("_reset", None)
         image, world = tensordict_reset[IMAGE], self.parent.base_env
-        progress = self.judge.score(image.unsqueeze(1), world.opening, world.instructions).progress
+        progress, status = self._beginning(image, world)
         if mask is None or self._run.shape[0] != progress.shape[0]:
             self._run = torch.zeros(progress.shape[0], dtype=torch.int64, device=progress.device)
-            self._progress, self._first = progress, world.opening.clone()
+            self._progress, self._begun, self._first = progress, status, world.opening.clone()
         else:
             mask = mask.reshape(-1, 1)
             self._run = torch.where(mask.squeeze(-1), 0, self._run)
             self._progress = torch.where(mask, progress, self._progress)
+            self._begun = torch.where(mask.squeeze(-1), status, self._begun)
             self._first = torch.where(mask[..., None, None, None], world.opening, self._first)
         tensordict_reset[PROGRESS] = self._progress
         tensordict_reset[JUDGE_STATUS] = torch.full_like(self._run, Status.OK.value).unsqueeze(-1)
         return tensordict_reset.exclude(FRAMES, FEATURES, "world")
+
+    def _beginning(self, image: Tensor, world: Any) -> tuple[Tensor, Tensor]:
+        """Progress [B, 1] of episodes that begin with `image` uint8 [B, V, 3, H, W], and its status [B]."""
+        if not self.rewards.progress:
+            nothing = torch.zeros(len(image), 1, device=image.device)
+            return nothing, nothing.squeeze(-1).long()
+        shown = [image.unsqueeze(1), world.opening, world.instructions]
+        if self.judge.reads_features:
+            shown.append(world.features_now()[:, None])
+        judgement = self.judge.score(*shown)
+        known = judgement.status == Status.OK.value
+        return torch.where(known.unsqueeze(-1), judgement.progress, 0.0), judgement.status
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Frames and features leave the specs, the judge's status enters."""

@@ -56,6 +56,9 @@ class RLConfig:
             end.
         freeze_perception: train only what follows the policy's encoder, so that no picture is encoded twice.
         checkpoint_every: iterations between checkpoints.
+        evaluate_every: iterations after which what has been learned so far is tried in physics, for the log
+            alone; 0 for never.
+        evaluate_episodes: of each such trial.
         seed: of start frames, exploration and minibatches.
     """
 
@@ -82,6 +85,8 @@ class RLConfig:
     rewards_later: bool
     freeze_perception: bool
     checkpoint_every: Count
+    evaluate_every: Natural
+    evaluate_episodes: Count
     seed: Natural
 
     def __post_init__(self) -> None:

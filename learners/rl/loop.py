@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -32,6 +32,7 @@ from learners.rl.algorithm import Algorithm, RLConfig
 from learners.rl.feed import AsyncFeed, Feed
 from learners.rl.recorded import TrueExperience
 from learners.rl.update import update
+from learners.rl.watch import Watch
 from learners.training.checkpoint import Checkpoints, adam_moments, buffers_of, truncate_log
 from learners.training.interrupt import deferred_signals, leave
 from learners.training.parallel import Trainee, from_leader, leads
@@ -46,7 +47,7 @@ def train_rl(
     starts: int | Sequence[int],
     name: str = "rl",
     true: TrueExperience | None = None,
-    until: Callable[[int], bool] | None = None,
+    watch: Watch | None = None,
 ) -> dict[str, Any]:
     """Improve `policy` in place.
 
@@ -58,7 +59,8 @@ def train_rl(
         folder: receives checkpoints, metrics.jsonl and learned.jsonl, the jobs that were learned from; a
             checkpoint found there is resumed.
         true: what RLConfig.recorded and RLConfig.anchor speak of.
-        until: asked after every iteration, with its number; true ends the run early.
+        watch: looks at the policy while it learns; its figures stand in metrics.jsonl, beside the seconds of
+            rollouts and updates so far (time/learning), in which it does not count.
 
     Returns:
         Seconds spent, episodes used, alarms, the fleet's ledger, and the metrics of the last iteration.
@@ -167,6 +169,12 @@ def train_rl(
             if feed is not None:
                 feed.check_losses("judges that gave no verdict, a policy that says NaN, physics that crashes")
             figures |= supply | {"time/rollout": collected - began, "time/update": updated - collected}
+            figures["time/learning"] = sum(spent.values())
+            enough = False
+            if watch is not None and watch.due(iteration, config.iterations):
+                weights = trainee(trained_weights, policy)
+                seen, enough = from_leader(partial(watch.look, iteration, weights))
+                figures |= seen
             if feed is not None:
                 figures["time/actors_idle_share"] = max(
                     0.0, 1 - supply["time/actors_busy"] / (feed.fleet.size * (updated - began))
@@ -194,7 +202,7 @@ def train_rl(
                     f"{name}: about {(updated - began) * (config.iterations - first - 1) / 60:.1f} min for"
                     f" {config.iterations - first - 1} more iterations"
                 )
-            over = (until is not None and until(iteration)) or iteration + 1 == config.iterations
+            over = enough or iteration + 1 == config.iterations
             stop = from_leader(asked)
             if (iteration + 1) % config.checkpoint_every == 0 or over or stop:
                 save(iteration + 1)

@@ -13,10 +13,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.episodes.clips import ClipStore
-from envs.judges.base import Judge
+from envs.judges.base import Judge, MissingFeatures
 from envs.judges.labels import progress_to_success, success_labels
-from envs.judges.learned import LearnedJudge
-from envs.precision import mixed_precision
+from envs.specs import Status
 from learners.stages.pictures import augment
 from learners.stages.simulator import owners
 from learners.training.fit import FitConfig, fit
@@ -34,8 +33,9 @@ class JudgeData:
         episodes: to learn from, int64 [N].
         hold: frames in a row that make a success; see labels.success_labels.
         discount: of the progress target, per frame.
-        generated: frames of generated.py, or None; labelled by what the same actions truly led to, they make
-            half of each batch.
+        generated: generated_frames of generated.py, or None; labelled by what the same actions truly led to,
+            they make half of each batch.
+        recorded: recorded_features of generated.py of a judge that reads features; it sees no pictures.
 
     Attributes:
         share: fraction of the labelled frames that show success.
@@ -51,60 +51,66 @@ class JudgeData:
         hold: int,
         discount: float,
         generated: TensorDict | None = None,
+        recorded: TensorDict | None = None,
     ):
-        self.store = store
+        self.store, self.pictures = store, recorded is None
         self.labels, self.progress = frame_targets(store, hold, discount)
         rows = store.rows(episodes)
-        rows = rows[store.arrays["present"][rows] & torch.isfinite(self.labels[rows])]
-        if not len(rows):
+        given = TensorDict({"row": rows}, rows.shape) if recorded is None else recorded
+        known = store.arrays["present"][given["row"]] & torch.isfinite(self.labels[given["row"]])
+        given = given[known]
+        if not len(given):
             raise ValueError(
                 "no episode of the data says whether it succeeded (next.success or next.reward), so a judge"
                 " cannot learn from them; label some, or use a judge that needs no labels"
             )
         when = torch.arange(len(self.labels)) - torch.repeat_interleave(store.start, store.length)
-        self.pools = [_Pool(self.labels, when, rows)]
+        self.pools = [_Pool(self.labels, when, given)]
         if generated is not None:
-            known = generated[torch.isfinite(self.labels[generated["row"]])]
-            if len(known):
-                self.pools.append(_Pool(self.labels, when, known["row"], known["frames"]))
-        self.share = float(self.labels[rows].mean().clamp(0.02, 0.98))
+            names = ("row", "frames") if self.pictures else ("row", "features", "offset")
+            labelled = generated.select(*names)[torch.isfinite(self.labels[generated["row"]])]
+            if len(labelled):
+                self.pools.append(_Pool(self.labels, when, labelled))
+        self.share = float(self.labels[given["row"]].mean().clamp(0.02, 0.98))
 
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
-        """A batch [count] for LearnedJudge.loss, with uint8 frames."""
+        """A batch [count] for Judge.loss, with uint8 frames."""
         each = [count // len(self.pools)] * len(self.pools)
         each[0] += count - sum(each)
         drawn = [pool.draw(size, generator) for pool, size in zip(self.pools, each, strict=True)]
-        rows = torch.cat([rows for rows, _ in drawn])
+        rows = torch.cat([some["row"] for some in drawn])
         owner = owners(self.store, rows)
-        frames = [self.store.frames(rows) if made is None else made for rows, made in drawn]
-        return TensorDict(
-            {
-                "frames": torch.cat(frames),
-                "first": self.store.frames(self.store.start[owner]),
-                "text": self.store.text[owner],
-                "label": self.labels[rows],
-                "progress": self.progress[rows],
-            },
-            [count],
-        )
+        out = {"text": self.store.text[owner], "label": self.labels[rows], "progress": self.progress[rows]}
+        if self.pictures:
+            made = [some.get("frames", None) for some in drawn]
+            frames = [
+                self.store.frames(some["row"]) if own is None else own
+                for some, own in zip(drawn, made, strict=True)
+            ]
+            out |= {"frames": torch.cat(frames), "first": self.store.frames(self.store.start[owner])}
+        else:
+            out |= {name: torch.cat([some[name] for some in drawn]) for name in ("features", "offset")}
+        return TensorDict(out, [count])
 
 
 class _Pool:
-    """Frames to draw from: recorded rows [N], or generated frames and the rows that label them.
+    """Frames to draw from.
 
     Args:
         labels: of all rows.
         when: of all rows, their number within the episode.
+        given: TensorDict [N] with row, that of the recorded frame, which labels it, and what else is known.
     """
 
-    def __init__(self, labels: Tensor, when: Tensor, rows: Tensor, frames: Tensor | None = None):
-        self.rows, self.frames, self.when = rows, frames, when[rows]
+    def __init__(self, labels: Tensor, when: Tensor, given: TensorDict):
+        rows = given["row"]
+        self.given, self.when = given, when[rows]
         self.positive = (labels[rows] > 0.5).nonzero().flatten()
         negative = (labels[rows] <= 0.5).nonzero().flatten()
         self.negative = negative[self.when[negative].argsort(stable=True)]
 
-    def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor | None]:
-        """Rows [count], a third of them positive whatever the data's share is, and their frames if made.
+    def draw(self, count: int, generator: torch.Generator) -> TensorDict:
+        """Frames [count], a third of them positive whatever the data's share is.
 
         Another third fails at the same times as those succeed. Episodes end with success, so success has its
         usual time, and generated frames show by their faults how late it is: judges would tell by that.
@@ -115,8 +121,7 @@ class _Pool:
         if wanted < count:
             beside = self._alongside(parts[0], generator) if wanted else torch.zeros(0, dtype=torch.int64)
             parts += [beside, _pick(self.negative, count - wanted - len(beside), generator)]
-        at = torch.cat(parts)
-        return self.rows[at], None if self.frames is None else self.frames[at]
+        return self.given[torch.cat(parts)]
 
     def _alongside(self, positive: Tensor, generator: torch.Generator) -> Tensor:
         """A negative frame of the same time for each positive one that has any."""
@@ -145,20 +150,29 @@ def frame_targets(store: ClipStore, hold: int, discount: float) -> tuple[Tensor,
 
 
 def train_judge(
-    judge: LearnedJudge,
+    judge: Judge,
     store: ClipStore,
     episodes: Tensor,
     options: FitConfig,
     folder: Path,
     generated: TensorDict | None = None,
+    recorded: TensorDict | None = None,
 ) -> dict[str, float]:
-    """Train `judge` in place; see JudgeData."""
-    data = JudgeData(store, episodes, judge.hold, judge.discount, generated)
+    """Train `judge` in place; see JudgeData.
+
+    Raises:
+        MissingFeatures: if it reads features and none are given.
+    """
+    if judge.reads_features and recorded is None:
+        raise MissingFeatures("this judge learns from a simulator's features; give recorded_features of one")
+    data = JudgeData(store, episodes, judge.hold, judge.discount, generated, recorded)
 
     def batch(step: int, generator: torch.Generator) -> TensorDict:
         return data.sample(options.part, generator)
 
     def loss(batch: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
+        if not data.pictures:
+            return judge.loss(batch, data.share)
         views = batch["frames"].shape[1]  # the same colours for both, as one camera would give them
         both = augment(torch.cat((batch["frames"], batch["first"]), 1), generator, _SHIFT)
         shown = batch.copy()
@@ -170,17 +184,24 @@ def train_judge(
 
 @torch.no_grad()
 def judge_recordings(
-    judge: Judge, store: ClipStore, episodes: Tensor, bf16: bool = False, batch: int = 32
+    judge: Judge, store: ClipStore, episodes: Tensor, features: Tensor | None = None, batch: int = 32
 ) -> Tensor:
-    """Success probabilities of recorded episodes, frame by frame, float32 [N, T]; 0 where they are over."""
+    """Success probabilities of recorded episodes, frame by frame, float32 [N, T]; 0 where they are over, NaN
+    throughout those that the judge could not judge.
+
+    Args:
+        features: of a judge that reads them, see simulators.features.features_of_episodes.
+    """
     rows, valid = store.whole(episodes)
     first = store.frames(store.start[episodes])
     parts = []
     for some in torch.arange(len(episodes)).split(batch):
         texts = [store.instructions[number] for number in episodes[some].tolist()]
-        with mixed_precision(judge.threshold.device, bf16):
-            parts.append(judge.score(store.frames(rows[some]), first[some], texts).success.float())
-    return torch.where(valid, torch.cat(parts), 0.0)
+        seen = () if features is None else (features[some],)
+        judgement = judge.score(store.frames(rows[some]), first[some], texts, *seen)
+        known = (judgement.status == Status.OK.value).unsqueeze(-1)
+        parts.append(torch.where(known, valid[some] * judgement.success.float(), torch.nan))
+    return torch.cat(parts)
 
 
 def calibrate(judge: Judge, success: Tensor, succeeded: Tensor) -> bool:
@@ -194,15 +215,17 @@ def calibrate(judge: Judge, success: Tensor, succeeded: Tensor) -> bool:
 
     Args:
         success: frame probabilities [N, T] of recorded episodes that it did not learn from, 0 where they are
-            over.
+            over; those with NaN, which nobody could judge, are left out.
         succeeded: bool [N], whether they did.
 
     Returns:
-        Whether it was set. It stays as it is where no episode succeeded, or none failed, or scores are not
-        finite or do not rise with success.
+        Whether it was set. It stays as it is where no episode succeeded, or none failed, or scores do not
+        rise with success.
     """
+    known = torch.isfinite(success).all(1)
+    success, succeeded = success[known], succeeded[known]
     hits = float(succeeded.sum())
-    if hits in (0.0, float(len(succeeded))) or not torch.isfinite(success).all():
+    if hits in (0.0, float(len(succeeded))):
         return False
     score = torch.logit(judge.confidence(success.double()).clamp(0.01, 0.99)).numpy()
     targets = (

@@ -36,12 +36,13 @@ class SuccessfulClips:
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
         """Random clips [count], each of a random episode from any of its frames on.
 
-        The last frame repeats beyond the end, and counts: there the task is done, and stays so.
+        The last frame repeats beyond the end, and counts: there the task is done, and stays so. A clip may
+        begin there, so that a frame alone tells whether it is done.
         """
         store = self.store
         chosen = self.episodes[torch.randint(len(self.episodes), (count,), generator=generator)]
         length = store.length[chosen]
-        begin = (torch.rand(count, generator=generator) * (length - 1).clamp(min=1)).long()
+        begin = (torch.rand(count, generator=generator) * length).long()
         ahead = begin[:, None] + self.stride * torch.arange(self.frames)
         rows = store.start[chosen][:, None] + torch.minimum(ahead, length[:, None] - 1)
         return TensorDict(

@@ -49,7 +49,7 @@ def distil(cfg: dict[str, Any]) -> dict[str, dict[str, Any]]:
     Raises:
         ConfigError: if the task has no physics, or the simulator no steps.
     """
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     root = root_of(cfg)
     graph, rows = build_table(cfg, root / "distil")
     graph.run(list(rows.values()))
@@ -103,7 +103,7 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
 @stage(reads=("seed", *TASK, "simulator", "measure.speed_chunks"), place=Place.EVALUATOR)
 def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Speed, and errors of held-out episodes: chunk by chunk from true frames, and rolled out as a whole."""
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     simulator = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
     store, bf16 = open_store(cfg, inputs), cfg["simulator"]["bf16"]

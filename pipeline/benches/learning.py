@@ -13,13 +13,14 @@ from actors.fleets.fleet import LocalFleet
 from actors.policies.vla import ChunkPolicy
 from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
-from actors.rollouts.host import Host
+from actors.rollouts.host import Host, Weights
 from envs.physics.toy_tracking import ToyTrackingEnv
 from envs.rng import seed_process
 from envs.targets import options
 from learners.rl.algorithm import RLConfig
 from learners.rl.grpo import GRPO
 from learners.rl.loop import train_rl
+from learners.rl.watch import Watch
 from pipeline.config import load_config
 
 GOAL, EPISODES, SEEDS = 0.6, 100, (0, 1, 2)
@@ -56,11 +57,11 @@ def learn(seed: int, limit: int, folder: Path, envs: int = 256) -> tuple[float, 
     unseen = ToyTrackingEnv(EPISODES, targets=1_000 + seed)
     rate, done = 0.0, 0
 
-    def reached(iteration: int) -> bool:
+    def reached(iteration: int, _: Weights) -> tuple[dict[str, float], bool]:
         nonlocal rate, done
         done = iteration + 1
         rate = evaluate(unseen, policy, list(range(EPISODES)), label=f"greedy {iteration}").rate
-        return rate >= GOAL
+        return {"greedy_success": rate}, rate >= GOAL
 
     began = time.perf_counter()
     own = {
@@ -83,7 +84,7 @@ def learn(seed: int, limit: int, folder: Path, envs: int = 256) -> tuple[float, 
             folder,
             starts=4096,
             name=f"learning {seed}",
-            until=reached,
+            watch=Watch(1, reached),
         )
     finally:
         fleet.close()
@@ -92,7 +93,7 @@ def learn(seed: int, limit: int, folder: Path, envs: int = 256) -> tuple[float, 
 
 def learning(cfg: Mapping[str, Any]) -> None:
     """GRPO on ToyVLAEnv to 60% greedy success over 100 episodes with targets never seen, three seeds."""
-    prepare_process(0)
+    prepare_process(0, 0)
     seconds = []
     for seed in SEEDS:
         with tempfile.TemporaryDirectory() as folder:

@@ -35,7 +35,7 @@ def serving(cfg: dict[str, Any], seconds: float) -> None:
     """Sessions are opened, stepped and closed (every third one is just left) by four clients; resident memory
     is read every tenth of the `seconds`, and its slope over the second half is said.
     """
-    prepare_process(0)
+    prepare_process(0, 0)
     config = options(ServeConfig, {**cfg["serve"], "port": 0, "grace_s": 1.0}, "serve")
     with tempfile.TemporaryDirectory() as folder:
         recipe = demo_recipe(cfg, Path(folder), 1)

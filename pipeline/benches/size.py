@@ -139,6 +139,7 @@ def _clip(spec: WorldSpec, remembered: int) -> TensorDict:
                 **part(spec.chunk),
                 "states": states[:, : spec.chunk],
                 "valid": torch.ones(1, spec.chunk, dtype=torch.bool, device="meta"),
+                "success": torch.zeros(1, spec.chunk, device="meta"),
             },
             [1],
         ),
@@ -153,6 +154,7 @@ def _clip(spec: WorldSpec, remembered: int) -> TensorDict:
             [1],
         ),
         "begin": torch.zeros(1, dtype=torch.int64, device="meta"),
+        "stride": torch.ones(1, dtype=torch.int64, device="meta"),
     }
     if spec.embodiment.calibrated:
         clip["intrinsic"] = torch.zeros(1, spec.views, 3, 3, device="meta")

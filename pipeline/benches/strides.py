@@ -36,7 +36,7 @@ def strides(cfg: dict[str, Any]) -> dict[int, dict[str, Any]]:
     Raises:
         ConfigError: if the task has no physics.
     """
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     root = root_of(cfg)
     graph, rows = build_table(cfg, root / "strides")
     graph.run(list(rows.values()))
@@ -73,7 +73,7 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     Settings: stride, and common, a multiple of it, at whose frames strides are compared.
     """
     stride, common = inputs.settings["stride"], inputs.settings["common"]
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     simulator, store = build_simulator(cfg, inputs.weights("simulator")), open_store(cfg, inputs)
     held, bf16 = store.split("held_out")[:_EPISODES], cfg["simulator"]["bf16"]
     replay(simulator, store, held[:1], bf16=bf16, stride=stride)  # a warm-up

@@ -62,7 +62,7 @@ def overfit(cfg: Mapping[str, Any], steps: int = 400) -> dict[str, float]:
         raise ConfigError(
             "say which recordings: worldloop bench overfit task.data=[folder of a LeRobot data set]"
         )
-    prepare_process(0)
+    prepare_process(0, 0)
     store = open_clips(cfg, cfg["task"]["data"])
     episodes = torch.arange(len(store))
     found: dict[str, float] = {}
@@ -100,11 +100,11 @@ def pretrained(
             for part, base, count in (("old", 0, 48), ("new", 1000, 8), ("kept", 2000, 12))
         )
         for seed in seeds:
-            prepare_process(seed)
+            prepare_process(seed, 0)
             first = build_simulator(cfg)
             _learn(first, old, learned, seed, folder / f"old-{seed}")
             for label in found:
-                prepare_process(seed + 100)
+                prepare_process(seed + 100, 0)
                 world = build_simulator(cfg)
                 if label == "from learned weights":
                     world.load_state_dict(first.state_dict())

@@ -68,7 +68,7 @@ def collection(cfg: dict[str, Any], episodes: int = 64) -> dict[int, float]:
 
 def world(cfg: dict[str, Any]) -> None:
     """Generated frames per second, and the forward pass's share of a simulator step."""
-    prepare_process(0)
+    prepare_process(0, 0)
     with tempfile.TemporaryDirectory() as folder:
         recipe = demo_recipe(cfg, Path(folder), 1)
         store, simulator = open_clips(cfg, recipe.data), build_simulator(cfg).eval()

@@ -95,7 +95,7 @@ def trust(words: Words) -> None:
     """how far a round's imagined world tells better actions from worse ones: worldloop trust round=1
     [moments=160] [futures=8] [depth=3] experiment=...
     """
-    from pipeline.commands.trust import trust as table
+    from pipeline.commands.worlds.trust import trust as table
 
     own, rest = {"round": 1, "moments": 160, "futures": 8, "depth": 3}, []
     for word in words:
@@ -136,7 +136,7 @@ def study(words: Words) -> None:
     from pipeline.study.run import run_study
 
     device_of(made.cfg)
-    prepare_process(made.cfg["seed"])
+    prepare_process(made.cfg["seed"], made.cfg["threads"])
     with owning(made.root, "study"):
         text = run_study(made)
     print(f"\n{text}\n{made.root}/study.md, study.json, study.html")

@@ -100,22 +100,23 @@ def bench(words: Words) -> None:
     run_bench(words)
 
 
-def gridworld(words: Words) -> None:
-    """how actions should be told to a world, by squares that move as they are told: worldloop gridworld
-    experiment=gridworld [squares=1,3]
+def judge(words: Words) -> None:
+    """verdicts on recorded episodes against their recorded success, and what they cost, by which frames are
+    shown: worldloop judge judge=vlm judge.chat.model=<name> [data=<LeRobot set>] [split=held_out|all]
+    [episodes=N] [frames=all,4,ends] experiment=...
     """
-    own = [word.removeprefix("squares=") for word in words if word.startswith("squares=")]
-    counts = (own[-1] if own else "1,3").split(",")
-    if not all(count.isdigit() and int(count) for count in counts):
-        raise ConfigError(f"squares={own[-1]}: say whole numbers above 0, as in squares=1,3")
-    rest = [word for word in words if not word.startswith("squares=")]
-    cfg, root = prepared([*without_given(["experiment=gridworld"], rest), *rest])
-    from pipeline.commands.gridworld import gridworld as study
-    from pipeline.graph.owner import owning
-    from pipeline.track import tracking
+    from pipeline.commands.worlds.judge import Selection, judge_study
 
-    with owning(root, "gridworld"), tracking(cfg, root) as tracker:
-        print(study(cfg, root, [int(count) for count in counts], tracker))
+    own, rest = {}, []
+    for word in words:
+        key, _, value = word.partition("=")
+        if key in ("data", "split", "episodes", "frames"):
+            own[key] = value
+        else:
+            rest.append(word)
+    selection = Selection.of(own)
+    cfg, root = prepared(rest)
+    print(judge_study(cfg, root, selection))
 
 
 def verify(words: Words) -> None:

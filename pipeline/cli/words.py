@@ -15,6 +15,11 @@ def without_given(base: Sequence[str], words: Sequence[str]) -> list[str]:
     return [word for word in base if word.split("=")[0] not in given]
 
 
+def listed(value: str) -> list[str]:
+    """The names in a word's value, such as [a,b] or a."""
+    return [name.strip() for name in value.strip("[]").split(",") if name.strip()]
+
+
 def root_of(cfg: dict[str, Any]) -> Path:
     """The run's folder."""
     return Path(cfg["runs"]) / cfg["name"]

@@ -1,8 +1,11 @@
-"""Commands that say how far an imagined world can be trusted; their options are sections of the config."""
+"""Commands that say how far an imagined world can be trusted; their options are sections of the config, or
+words of their own.
+"""
 
 from __future__ import annotations
 
-from pipeline.cli.words import Words, prepared
+from envs.targets import ConfigError, nearest
+from pipeline.cli.words import Words, listed, prepared, without_given
 
 
 def policy_value(words: Words) -> None:
@@ -42,3 +45,58 @@ def sweep(words: Words) -> None:
     with owning(root, "sweep"):
         for path in draw(cfg, root):
             print(path)
+
+
+def rewards(words: Words) -> None:
+    """rewards side by side along the same episodes of seen and unseen scenes: worldloop rewards
+    [rewards=[learned,proxy,embedding,golden_goal,rule]] [episodes=64] [variants=[out_of_domain]]
+    experiment=...
+    """
+    from pipeline.config import choices, load_config
+
+    own, rest = {"rewards": "learned,proxy,embedding,golden_goal,rule", "episodes": "64", "variants": ""}, []
+    for word in words:
+        key, _, value = word.partition("=")
+        if key in own:
+            own[key] = value
+        else:
+            rest.append(word)
+    names, known = listed(own["rewards"]), ["rule", *choices("judge")]
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"rewards={own['rewards']}: no reward {name}{nearest(name, known)}")
+    if not own["episodes"].isdigit() or int(own["episodes"]) < 2 or not names:
+        raise ConfigError("say which rewards=[...], and episodes=N of at least 2")
+    cfg, root = prepared(rest)
+    from pipeline.commands.worlds.rewards import Plan, compare_rewards
+    from pipeline.graph.owner import owning
+    from pipeline.track import tracking
+
+    others = [word for word in rest if not word.startswith(("judge=", "judge."))]
+    configs = {name: load_config([*others, f"judge={name}"]) for name in names if name != "rule"}
+    for name, other in configs.items():  # what is said of the run's own judge by judge.<option> stays said
+        configs[name] = cfg if other["judge"]["_target_"] == cfg["judge"]["_target_"] else other
+    if "rule" in names:
+        configs["rule"] = cfg
+    variants = listed(own["variants"]) if own["variants"] else list(cfg["task"].get("variants", {}))
+    with owning(root, "rewards"), tracking(cfg, root) as tracker:
+        print(compare_rewards(cfg, root, Plan(configs, int(own["episodes"]), variants), tracker))
+    print(f"{root}/rewards.html, {root}/rewards.json")
+
+
+def gridworld(words: Words) -> None:
+    """how actions should be told to a world, by squares that move as they are told: worldloop gridworld
+    experiment=gridworld [squares=1,3]
+    """
+    own = [word.removeprefix("squares=") for word in words if word.startswith("squares=")]
+    counts = (own[-1] if own else "1,3").split(",")
+    if not all(count.isdigit() and int(count) for count in counts):
+        raise ConfigError(f"squares={own[-1]}: say whole numbers above 0, as in squares=1,3")
+    rest = [word for word in words if not word.startswith("squares=")]
+    cfg, root = prepared([*without_given(["experiment=gridworld"], rest), *rest])
+    from pipeline.commands.worlds.gridworld import gridworld as study
+    from pipeline.graph.owner import owning
+    from pipeline.track import tracking
+
+    with owning(root, "gridworld"), tracking(cfg, root) as tracker:
+        print(study(cfg, root, [int(count) for count in counts], tracker))

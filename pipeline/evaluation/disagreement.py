@@ -27,11 +27,11 @@ def compared(
     nobody labelled it; recorded and generated, the judge's confidence that the episode succeeded on either
     video; claims, its verdict on the generated one; disagreement in 0..1, how far its confidence on the
     generated video lies from the recorded success, or where that is unknown from its confidence on the
-    recorded video.
+    recorded video. Where the judge gave no judgement they are None, and disagreement 0.
     """
     over = ~made.valid
     recorded, generated = (
-        judge.confidence(scores.success.masked_fill(over, 0.0)).tolist() for scores in views
+        _rounded(judge.confidence(scores.success.masked_fill(over, 0.0)), scores.judged) for scores in views
     )
     device = judge.threshold.device
     claims = judge.episode(views.generated.success.to(device), made.valid.to(device)).tolist()
@@ -46,13 +46,24 @@ def compared(
                 **{key: about[key] for key in ("seed", "source", "instruction", "success")},
                 "task": tasks[n],
                 "scene": scenes[n],
-                "recorded": round(recorded[n], _DIGITS),
-                "generated": round(generated[n], _DIGITS),
-                "claims": bool(claims[n]),
-                "disagreement": round(abs(generated[n] - truth), _DIGITS),
+                "recorded": recorded[n],
+                "generated": generated[n],
+                "claims": None if generated[n] is None else bool(claims[n]),
+                "disagreement": _apart(generated[n], truth),
             }
         )
     return rows
+
+
+def _rounded(confidence: Tensor, judged: Tensor) -> list[float | None]:
+    """Confidences [N] as they are written down, None where they are worth nothing."""
+    pairs = zip(confidence.tolist(), judged.tolist(), strict=True)
+    return [round(value, _DIGITS) if known else None for value, known in pairs]
+
+
+def _apart(one: float | None, other: float | None) -> float:
+    """Distance of two confidences, 0 if one is missing."""
+    return 0.0 if one is None or other is None else round(abs(one - other), _DIGITS)
 
 
 def worst(rows: Sequence[Mapping[str, Any]], count: int) -> list[Mapping[str, Any]]:

@@ -9,15 +9,26 @@ from torch import Tensor
 
 from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge
+from envs.simulators.base import Simulator
+from envs.simulators.features import features_of_episodes
 from envs.simulators.replay import Replay
+from envs.specs import Status
 from pipeline.evaluation.statistics import confusion
 
 
 class Scores(NamedTuple):
-    """Probabilities of success and progress, float32 [N, T] each in 0..1."""
+    """Probabilities of success and progress, float32 [N, T] each in 0..1, and status int64 [N]: where it is
+    not OK the numbers mean nothing.
+    """
 
     success: Tensor
     progress: Tensor
+    status: Tensor
+
+    @property
+    def judged(self) -> Tensor:
+        """Which episodes the judge could judge, bool [N]."""
+        return self.status == Status.OK.value
 
 
 def labelled(store: ClipStore, episodes: Tensor) -> Tensor:
@@ -32,23 +43,36 @@ def episode_success(store: ClipStore, episodes: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def judge_frames(judge: Judge, frames: Tensor, store: ClipStore, episodes: Tensor, batch: int = 16) -> Scores:
-    """What the judge says of frames uint8 [N, T, V, 3, H, W] of these episodes."""
+def judge_frames(
+    judge: Judge,
+    frames: Tensor,
+    store: ClipStore,
+    episodes: Tensor,
+    features: Tensor | None = None,
+    batch: int = 16,
+) -> Scores:
+    """What the judge says of frames uint8 [N, T, V, 3, H, W] of these episodes.
+
+    Args:
+        features: float32 [N, C, D] of their chunks, see Judge.score; used by a judge that reads them.
+    """
     device = judge.threshold.device
     scores = []
     for begin in range(0, len(episodes), batch):
         some = slice(begin, begin + batch)
         first = store.frames(store.start[episodes[some]])
         texts = [store.instructions[n] for n in episodes[some].tolist()]
-        verdict = judge.score(frames[some].to(device), first.to(device), texts)
-        scores.append((verdict.success.cpu(), verdict.progress.cpu()))
+        seen = (features[some].to(device),) if judge.reads_features and features is not None else ()
+        verdict = judge.score(frames[some].to(device), first.to(device), texts, *seen)
+        scores.append([value.cpu() for value in verdict])
     return Scores(*(torch.cat(parts) for parts in zip(*scores, strict=True)))
 
 
 def judge_table(
     judge: Judge, scores: Scores, valid: Tensor, store: ClipStore, episodes: Tensor
 ) -> dict[str, Any]:
-    """Confusion of the judge's episode verdicts with recorded success; {} if no episode is labelled.
+    """Confusion of the judge's episode verdicts with recorded success, and as "dropped" how many labelled
+    episodes it gave none on; {} if no episode is labelled.
 
     Args:
         scores: of frames, recorded or generated, of the N episodes.
@@ -57,9 +81,11 @@ def judge_table(
     known = torch.isin(episodes, labelled(store, episodes))
     if not known.any():
         return {}
+    dropped = int((known & ~scores.judged).sum())
+    known &= scores.judged
     device = judge.threshold.device
     verdicts = judge.episode(scores.success[known].to(device), valid[known].to(device))
-    return confusion(verdicts.cpu(), episode_success(store, episodes[known]))
+    return {**confusion(verdicts.cpu(), episode_success(store, episodes[known])), "dropped": dropped}
 
 
 class Views(NamedTuple):
@@ -71,9 +97,16 @@ class Views(NamedTuple):
     generated: Scores
 
 
-def judge_both(judge: Judge, store: ClipStore, episodes: Tensor, made: Replay) -> Views:
-    """What the judge says of replayed episodes int64 [N] and of their recordings."""
+def judge_both(
+    judge: Judge, simulator: Simulator, store: ClipStore, episodes: Tensor, made: Replay, bf16: bool
+) -> Views:
+    """What the judge says of episodes int64 [N] that the simulator replayed, and of their recordings.
+
+    Args:
+        bf16: whether the simulator computes in bfloat16 where the device does.
+    """
+    known = features_of_episodes(simulator, store, episodes, bf16) if judge.reads_features else None
     return Views(
-        judge_frames(judge, store.frames(made.rows), store, episodes),
-        judge_frames(judge, made.frames, store, episodes),
+        judge_frames(judge, store.frames(made.rows), store, episodes, known),
+        judge_frames(judge, made.frames, store, episodes, made.features),
     )

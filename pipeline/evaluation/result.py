@@ -29,7 +29,8 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         (McNemar), None without physics; imagined_before, imagined_after; judge, rollout, frames_per_second
         (see the measure stage); tasks (the same rates by task, {} if there is one); scenes (the same rates of
         each task in each scene that occurs, [] if there is one); rounds (gaps); episodes used and held out;
-        seconds per stage; training (see `_training`); alarms.
+        seconds per stage; training (see `_training`); what the judge has cost (stages/judge_cost.py), {} if
+        it is free; alarms.
     """
     finished = manifests(inputs)
     imagined, measured = (result_of(inputs.folder(role)) for role in ("imagined", "measured"))
@@ -60,6 +61,7 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         "imagined_episodes_used": [entry["result"]["ledger"]["learned"] for entry in learned],
         "stage_seconds": {name: entry["seconds"] for name, entry in finished.items()},
         "training": _training(finished),
+        "judge_cost": _judge_cost(finished),
         "alarms": [text for entry in learned for text in entry["result"]["alarms"]],
     }
     result["verdict"] = verdict(result)
@@ -203,6 +205,15 @@ def _pair(before: torch.Tensor, after: torch.Tensor) -> dict[str, Any]:
         "physics_after": rate_entry(after),
         "paired": mcnemar(before, after),
     }
+
+
+def _judge_cost(finished: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """What all stages together asked the judge for and paid."""
+    total: dict[str, float] = {}
+    for entry in finished.values():
+        for name, value in entry["result"].get("judge_cost", {}).items():
+            total[name] = total.get(name, 0.0) + value
+    return total
 
 
 def _class_name(section: Mapping[str, Any]) -> str:

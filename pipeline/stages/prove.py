@@ -30,12 +30,14 @@ from pipeline.evaluation.judging import episode_success, judge_both, judge_frame
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import PHYSICS, WORLD, Cfg, load_world, open_store
+from pipeline.stages.judge_cost import priced
 
 EPISODES = "episodes.json"  # of the stage measure
 _SIDE_BY_SIDE = 64  # imagined episodes
 
 
 @stage(reads=(*WORLD, "policy", "measure"), place=Place.EVALUATOR)
+@priced
 def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """How far imagination and truth lie apart for the policy just deployed: same starts, same stochastic
     policy.
@@ -51,7 +53,7 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(mine)), mine)
     seeds = list(range(len(mine)))
     outcome = evaluate(world, policy, seeds, stochastic=True, label="gap", sampling_seed=cfg["seed"])
-    tasks = tasks_of_episodes(cfg, store, mine)
+    tasks, judge = tasks_of_episodes(cfg, store, mine), world.transform[-1].judge
     result = {
         "round": number,
         **_gap(truth, outcome.success, outcome.counted),
@@ -61,10 +63,9 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     held = held[torch.isin(held, store.select(["policy-*"]))]
     if len(held):
         made = replay(world.base_env.simulator, store, held, bf16=cfg["simulator"]["bf16"])
-        judge = build_judge(cfg, inputs.weights("judge"))
-        scores = judge_frames(judge, made.frames, store, held)
+        scores = judge_frames(judge, made.frames, store, held, made.features)
         result["replayed"] = judge_table(judge, scores, made.valid, store, held)
-    return result
+    return {**result, "judged_by": judge.facts()}
 
 
 @stage(reads=(*PHYSICS, "evaluate"), place=Place.EVALUATOR)
@@ -111,6 +112,7 @@ def _true_success(cfg: Cfg, folder: Path, inputs: Inputs, changes: Mapping[str, 
 
 
 @stage(reads=(*WORLD, "policy", "evaluate"), place=Place.EVALUATOR)
+@priced
 def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Deterministic success in the last imagined world, of the policies in the roles before and after, from
     the starts of held-out episodes first.
@@ -150,6 +152,7 @@ def _gap(truth: Tensor, success: Tensor, counted: Tensor) -> dict[str, Any]:
 
 
 @stage(reads=(*WORLD, "measure"), place=Place.EVALUATOR)
+@priced
 def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Rollout error, state error, speed and the judge's tables on held-out episodes of every source; and
     episodes.json, how far imagination and truth disagree in each of them (see disagreement.py).
@@ -159,12 +162,13 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
     judge = build_judge(cfg, inputs.weights("judge"))
     store = open_store(cfg, inputs)
+    bf16 = cfg["simulator"]["bf16"]
     result: dict[str, Any] = {"rollout": {}, "judge": {}}
     rows: list[dict[str, Any]] = []
     for name, episodes in measurement.groups(store, store.split("held_out")).items():
-        made = replay(simulator, store, episodes, decoder, bf16=cfg["simulator"]["bf16"])
+        made = replay(simulator, store, episodes, decoder, bf16=bf16)
         result["rollout"][name] = measurement.rollout_error(store, episodes, made)
-        views = judge_both(judge, store, episodes, made)
+        views = judge_both(judge, simulator, store, episodes, made, bf16)
         tables = {
             video: judge_table(judge, scores, made.valid, store, episodes)
             for video, scores in views._asdict().items()

@@ -39,11 +39,14 @@ from pipeline.stages.given import (
     rl_options,
     successful_episodes,
 )
+from pipeline.stages.judge_cost import priced
+from pipeline.stages.trials import true_success
 
 LEARNING = ("policy", "algorithm", "rl", "imitation", "microbatches")
 
 
 @stage(reads=(*WORLD, *LEARNING, "extra_starts.share"), place=Place.LEARNERS)
+@priced
 def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Reinforcement learning inside the simulator; the role `starts`, if somebody plays it, holds first
     frames that nothing more was recorded of.
@@ -86,7 +89,8 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         share = cfg["extra_starts"]["share"]
         starts = shared_out(begun, len(extra), share) if extra else begun
         true = TrueExperience(anchor, decisions)
-        stats = train_rl(fleet, policy, algorithm, settings, folder, starts, true=true)
+        watch = true_success(cfg, settings, inputs.weights("policy"))
+        stats = train_rl(fleet, policy, algorithm, settings, folder, starts, true=true, watch=watch)
     finally:
         if fleet is not None:
             fleet.close()
@@ -153,7 +157,8 @@ def rl_in_physics(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, An
     pool = episode_seeds(cfg["seed"], Purpose.PRACTICE, 4 * settings.envs * iterations)
     fleet = build_fleet(recipe)
     try:
-        stats = train_rl(fleet, policy, algorithm, settings, folder, pool)
+        watch = true_success(cfg, settings, inputs.weights("policy"))
+        stats = train_rl(fleet, policy, algorithm, settings, folder, pool, watch=watch)
     finally:
         fleet.close()
     save_weights(policy, folder)

@@ -32,6 +32,7 @@ from pipeline.evaluation.result import build_result
 from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.collect import run_recorded
 from pipeline.stages.given import EVERYTHING, WORLD, Cfg, open_store
+from pipeline.stages.judge_cost import priced
 from pipeline.stages.prove import EPISODES
 
 WORST = "worst"  # the label of episodes chosen for their disagreement
@@ -70,8 +71,9 @@ class Studio:
         """
         if not len(episodes):
             return
-        made = replay(self.simulator, store, episodes, bf16=self.cfg["simulator"]["bf16"])
-        views = judge_both(self.judge, store, episodes, made)
+        bf16 = self.cfg["simulator"]["bf16"]
+        made = replay(self.simulator, store, episodes, bf16=bf16)
+        views = judge_both(self.judge, self.simulator, store, episodes, made, bf16)
         rows = compared(self.cfg, self.judge, store, episodes, made, views)
         for n, row in enumerate(rows):
             path = self.folder / "media" / f"{label}-{row['seed']}-{row['episode']}.mp4"
@@ -102,6 +104,7 @@ class Studio:
 
 
 @stage(reads=(*WORLD, "policy", "measure.videos", "measure.worst"))
+@priced
 def videos(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Paired videos: held-out episodes in which imagination and truth disagreed most, and of each task some
     of the policies in the roles before and after, in physics, and the same actions in the simulator.
@@ -123,6 +126,7 @@ def videos(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 
 @stage(reads=(*WORLD, "measure.videos", "measure.worst"))
+@priced
 def replays(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Paired videos without physics: recordings, held-out ones if there are any, and their actions in the
     simulator; first those in which imagination and truth disagreed most.

@@ -14,11 +14,13 @@ from actors.factory import build_judge, build_simulator, build_state_decoder, bu
 from actors.process import prepare_process
 from actors.weights import load
 from envs.episodes.clips import ClipStore
+from envs.judges.base import Judge
 from envs.rng import order_generator
 from envs.simulators.base import Simulator
+from envs.simulators.features import features_of_episodes
 from envs.targets import ConfigError, options
 from learners.stages.distill.stage import train_student
-from learners.stages.generated import generated_frames
+from learners.stages.generated import generated_frames, recorded_features
 from learners.stages.judge import calibrate, judge_recordings, train_judge
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
@@ -39,6 +41,7 @@ from pipeline.stages.given import (
     newest_episodes,
     open_store,
 )
+from pipeline.stages.judge_cost import priced
 
 SIMULATOR = ("seed", "threads", *TASK, "simulator", "microbatches")
 
@@ -109,7 +112,7 @@ def distil(
     section = dict(cfg["distill"][key.rpartition(".")[2]])
     fit = fit_options(cfg, section.pop("fit"), f"{key}.fit")
     how = options(SimulatorFitConfig, section, key)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     teacher = build_simulator(cfg, inputs.weights("simulator"))
     weights = inputs.weights("warm") or inputs.weights("simulator")
     model = build_simulator(acting(cfg), weights)
@@ -141,7 +144,7 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return stats
 
 
-@stage(reads=(*ROBOT, "judge.text_world", "text_world_fit", "microbatches"), place=Place.LEARNERS)
+@stage(reads=(*ROBOT, "threads", "judge.text_world", "text_world_fit", "microbatches"), place=Place.LEARNERS)
 def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The text world of a judge that asks for one, with its tokenizer, going on from the role `warm` if there
     is one.
@@ -150,12 +153,12 @@ def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     phase, section = inputs.settings["phase"], cfg["text_world_fit"]
     store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"])
+    prepare_process(cfg["seed"], cfg["threads"])
     model = build_text_world(cfg, inputs.weights("warm"))
     fit = fit_options(cfg, section[phase], f"text_world_fit.{phase}")
     tokenizer = fit_options(cfg, section["tokenizer"], "text_world_fit.tokenizer")
     stats = train_text_world(
-        *(model, store, learning_episodes(store), section["stride"], fit, folder),
+        *(model, store, store.split("train"), section["stride"], fit, folder),
         tokenizer=tokenizer if phase == "first" else None,
     )
     save_weights(model, folder)
@@ -163,6 +166,7 @@ def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 
 @stage(reads=(*WORLD, "judge_fit.{phase}", "rl.starts", "rl.chunks", "microbatches"), place=Place.LEARNERS)
+@priced
 def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The judge on recorded and on generated frames; its threshold on recorded video that no judge learns
     from. A judge without weights is only calibrated. One with a text world takes over what the role
@@ -174,10 +178,11 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     section = cfg["judge_fit"][phase]
     store = open_store(cfg, inputs)
     prepare_process(cfg["seed"], cfg["threads"])
-    model: Any = build_judge(cfg, inputs.weights("warm"))
+    model, world = build_judge(cfg, inputs.weights("warm")), build_simulator(cfg, inputs.weights("simulator"))
     if golden := inputs.weights("text_world"):
         load(model.text_world, golden).requires_grad_(False)
     stats: dict[str, Any] = {}
+    bf16 = cfg["simulator"]["bf16"]
     if learns(model):
         train = labelled(store, store.split("train"))
         if not len(train):
@@ -187,14 +192,14 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
             )
         shuffled = torch.randperm(len(train), generator=order_generator(cfg["seed"]))
         pick = train[shuffled[: section["imagined"]]]
-        world = build_simulator(cfg, inputs.weights("simulator"))
         generated = _as_imagined(cfg, world, store, pick)
+        recorded = recorded_features(world, store, train, bf16) if model.reads_features else None
         fit = fit_options(cfg, section["fit"], f"judge_fit.{phase}.fit")
-        stats = dict(train_judge(model, store, train, fit, folder, generated))
+        stats = dict(train_judge(model, store, train, fit, folder, generated, recorded))
         stats["generated_frames"] = len(generated)
-    _calibrate(model, store)
+    _calibrate(model, store, world, bf16)
     save_weights(model, folder)
-    return {**stats, "threshold": float(model.threshold)}
+    return {**stats, "threshold": float(model.threshold), **model.facts()}
 
 
 def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor) -> TensorDict:
@@ -208,12 +213,17 @@ def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor)
     return torch.cat([near, generated_frames(world, store, episodes[1::2], bf16)])
 
 
-def _calibrate(model: Any, store: ClipStore) -> None:
-    """Set the judge's threshold on the calibration split, where its scores tell success."""
+def _calibrate(model: Judge, store: ClipStore, world: Simulator, bf16: bool) -> None:
+    """Set the judge's threshold on the calibration split, where its scores tell success; a judge that says
+    (judge.votes.calibrate=false) that its answers need none is not asked.
+    """
+    if not model.calibrates:
+        return
     unseen = labelled(store, store.split("calibration"))
     if not len(unseen):
         return
-    score = judge_recordings(model, store, unseen)
+    features = features_of_episodes(world, store, unseen, bf16) if model.reads_features else None
+    score = judge_recordings(model, store, unseen, features)
     succeeded = episode_success(store, unseen)
     if not calibrate(model, score, succeeded):
         tqdm.write(

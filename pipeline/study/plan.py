@@ -12,7 +12,7 @@ from envs.targets import ConfigError, build, options
 from pipeline.cli.words import root_of, without_given
 from pipeline.config import load_config
 from pipeline.loop import has_physics
-from pipeline.sections import RowSection
+from pipeline.sections.measuring import RowSection
 from pipeline.study.columns import Column, Measured
 from pipeline.study.methods import Made, Method
 

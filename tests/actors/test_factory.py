@@ -121,7 +121,7 @@ def test_arithmetic_is_the_same_on_any_number_of_cores() -> None:
 
 
 def test_gradients_of_indexing_are_the_same_every_time() -> None:
-    prepare_process(0)
+    prepare_process(0, 0)
     table, place = torch.randn(64, 32, requires_grad=True), torch.randint(64, (20000,))
     weight = torch.randn(20000, 32)
     once, *again = [torch.autograd.grad((table[place] * weight).sum(), table)[0] for _ in range(20)]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,11 +17,14 @@ from actors.fleets.cluster import connect
 from actors.fleets.fleet import LocalFleet
 from actors.rollouts.host import Job
 from actors.rollouts.recipe import Recipe, build_host
-from actors.serving.judge_service import JudgeClient, ServiceConfig, start_service
+from actors.serving.judge_service import JudgeClient, JudgeServer, ServiceConfig, start_service
+from envs.judges import JudgeError
 from envs.specs import EPISODE, JUDGE_STATUS, SUCCESS, Status
 from envs.targets import ConfigError
 from learners.rl.algorithm import first_episode
+from pipeline.config import load_config
 from pipeline.graph.artefact import save_weights
+from tests.envs.judges.chat_server import MODEL, refuse, serving
 
 OPTIONS = ServiceConfig(batch=8, wait_ms=20.0, cache=1000, budget=40, deadline=20.0, retries=1, pause=0.1)
 
@@ -46,8 +51,6 @@ def clips(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor, list[str]]
 
 
 def test_service_agrees_remembers_and_gathers(cfg: dict[str, Any], weights: str, service: Any) -> None:
-    from pathlib import Path
-
     inline, client = build_judge(cfg, Path(weights)).eval(), JudgeClient("judge-test", OPTIONS)
     assert client.hold == inline.hold and torch.equal(client.threshold, inline.threshold)
     asked = clips(6, 0)
@@ -59,6 +62,27 @@ def test_service_agrees_remembers_and_gathers(cfg: dict[str, Any], weights: str,
     stats = ray.get(service.stats.remote())
     assert stats["clips"] == 16 and stats["judged"] == 10 and stats["remembered"] == 6
     assert stats["batches"] < 4  # two callers' clips were judged together
+
+
+def test_a_judge_that_reads_features_is_served_them(tmp_path: Path) -> None:
+    cfg = load_config(["experiment=smoke", "judge=embedding"])
+    torch.manual_seed(0)
+    save_weights(build_judge(cfg), tmp_path)
+    path = tmp_path / "weights.safetensors"
+    inline, server = build_judge(cfg, path).eval(), JudgeServer(cfg, str(path), OPTIONS, 1)
+    frames, first, texts = clips(3, 0)
+    size = inline.norm.normalized_shape[0]
+    features = torch.randn(2, 3, 1, size, generator=torch.Generator().manual_seed(1))
+
+    async def ask() -> list[Any]:
+        assert (await server.describe())["reads_features"]
+        given = (frames.numpy(), first.numpy(), texts)
+        return [await server.score(*given, some.numpy()) for some in features]
+
+    one, other = asyncio.run(ask())
+    assert torch.allclose(torch.tensor(one[0]), inline.score(frames, first, texts, features[0]).success)
+    assert not torch.allclose(torch.tensor(one[0]), torch.tensor(other[0]))
+    assert server.counts["judged"] == 6 and not server.counts["remembered"]
 
 
 def test_spent_budget_abstains(service: Any) -> None:
@@ -76,6 +100,38 @@ def test_restarted_service_is_found_again_and_a_lost_one_is_an_error(service: An
     assert said.status.tolist() == [Status.ERROR.value] * 2
     with pytest.raises(ConfigError, match="does not answer"):
         JudgeClient("judge-test", OPTIONS)
+
+
+def test_a_service_hosts_a_vision_language_model_and_passes_on_why_it_stops(
+    service: Any, tmp_path: Path
+) -> None:
+    with serving(lambda asked: "Answer: Yes") as chat:
+        words = [f"judge.chat.url={chat.url}", f"judge.chat.model={MODEL}", "judge.budget.calls=6"]
+        words += [f"judge.asking.cache={tmp_path}/cache", "judge.asking.in_flight=2", "judge.pictures.side=0"]
+        cfg = load_config(["experiment=smoke", "judge=vlm", *words])
+        weights = save_weights(build_judge(cfg), tmp_path)
+        actor = start_service("vlm-test", cfg, str(weights), OPTIONS, {"num_cpus": 0.5}, 1)
+        client = JudgeClient("vlm-test", OPTIONS)
+        said = client.score(*clips(2, 3))
+        assert said.status.tolist() == [Status.OK.value] * 2 and bool((said.success == 1).all())
+        with pytest.raises(JudgeError, match=r"judge\.budget\.calls=6 is spent"):
+            client.score(*clips(2, 4))
+        assert len(chat.seen) == 6  # three votes of five for each chunk
+        ray.kill(actor)
+
+
+def test_errors_of_the_judge_are_asked_about_again(tmp_path: Path) -> None:
+    with serving(lambda asked: "Answer: Yes") as chat:
+        words = [f"judge.chat.url={chat.url}", f"judge.chat.model={MODEL}", "judge.asking.retries=0"]
+        words += [f"judge.asking.cache={tmp_path}/cache", "judge.pictures.side=0", "judge.votes.count=1"]
+        cfg = load_config(["experiment=smoke", "judge=vlm", *words])
+        server = JudgeServer(cfg, str(save_weights(build_judge(cfg), tmp_path)), OPTIONS, 1)
+        frames, first, texts = clips(1, 3)
+        chat.faults.append(refuse(500))
+        for status in (Status.ERROR, Status.OK, Status.OK):
+            said = asyncio.run(server.score(frames.numpy(), first.numpy(), texts))
+            assert said[2].tolist() == [status.value]
+        assert chat.tries == 2 and server.counts["remembered"] == 1
 
 
 def test_rewards_that_come_later_are_those_that_come_at_once(recipe: Recipe) -> None:

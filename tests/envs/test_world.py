@@ -33,6 +33,28 @@ from tests.envs.simulators.test_engines import build_engine
 STARTS = 8
 
 
+class Reader(Judge):
+    """A judge that reads features and notes them."""
+
+    reads_features = True
+
+    def __init__(self) -> None:
+        super().__init__(hold=1)
+        self.read: list[torch.Tensor] = []
+
+    def score(
+        self,
+        frames: torch.Tensor,
+        first: torch.Tensor,
+        instruction: list[str],
+        features: torch.Tensor | None = None,
+    ) -> Judgement:
+        assert features is not None
+        self.read.append(features)
+        nothing = torch.zeros(frames.shape[:2])
+        return Judgement(nothing, nothing, torch.zeros(len(frames), dtype=torch.int64))
+
+
 class Fixed(Judge):
     """A judge whose judgements are given, to test what becomes of them; it notes what it was shown."""
 
@@ -49,14 +71,16 @@ class Fixed(Judge):
         return Judgement(filled, filled, torch.full(frames.shape[:1], self.said.value))
 
 
-def world(name: str, batch: int, judge: Judge | None = None, horizon: int = 12) -> TransformedEnv:
+def world(
+    name: str, batch: int, judge: Judge | None = None, horizon: int = 12, progress: float = 1.0
+) -> TransformedEnv:
     spec = world_spec(EMBODIMENTS[name])
     simulator, decoder = build_engine("unet_small", spec)
     first = first_of(spec, clip(spec, STARTS, simulator.memory_frames))
     starts = InitialStates(first, [f"do task {k}" for k in range(STARTS)])
     mode = ActionMode.ABSOLUTE if spec.embodiment.delta else ActionMode.RELATIVE
     base = WorldEnv(simulator, starts, batch, horizon, mode, shared_noise=False, bf16=False)
-    return TransformedEnv(base, world_transforms(spec, decoder, judge or Fixed(0.1), Rewards(1.0, 1.0)))
+    return TransformedEnv(base, world_transforms(spec, decoder, judge or Fixed(0.1), Rewards(progress, 1.0)))
 
 
 def play(env: TransformedEnv, seeds: list[int], steps: int = 2) -> torch.Tensor:
@@ -147,6 +171,52 @@ def test_the_judge_hears_the_words_and_sees_the_episodes_own_first_frame() -> No
     play(env, [3, 1], 2)
     assert torch.equal(judge.shown[-1], env.base_env.starts.first["frames"][[3, 1]])
     assert judge.asked[-1] == ["do task 3", "do task 1"]
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_judge_that_reads_features_is_given_those_of_the_chunk_and_before_it_of_holding_still(
+    name: str,
+) -> None:
+    judge = Reader()
+    env = world(name, 2, judge)
+    env.base_env.schedule([3, 1])
+    td = env.reset()
+    robot, command = env.base_env.spec.embodiment, td[COMMAND]
+    still = torch.zeros_like(env.action_spec.zero()[CHUNK])
+    if robot.delta:
+        grippers = list(robot.grippers)
+        still[..., grippers] = command[:, None, grippers]
+    td[CHUNK] = still
+    session = env.base_env.session.clone()
+    td = env.step(td)["next"]
+    if not env.base_env.spec.pose_map:  # the pose maps of these starts are made up
+        assert torch.allclose(judge.read[1], judge.read[0], atol=1e-4)  # a chunk that holds still, again
+    td[CHUNK] = still + 0.3
+    env.step(td)
+    assert judge.read[2].shape == (2, 1, *env.base_env.simulator.feature_shape)
+    assert not torch.allclose(judge.read[2], judge.read[1], atol=1e-3)
+    assert torch.equal(session["length"], torch.ones(2, dtype=torch.int64))  # asking changes no session
+
+
+def test_episodes_from_a_beginning_that_nobody_could_judge_are_dropped() -> None:
+    judge = Fixed(0.1, Status.ABSTAIN)
+    env = world("one_arm_deltas", 2, judge)
+    env.base_env.schedule([0, 1])
+    td = env.reset()
+    judge.said = Status.OK
+    td[CHUNK] = torch.zeros_like(env.action_spec.zero()[CHUNK])
+    after = env.step(td)["next"]
+    assert after[JUDGE_STATUS].flatten().tolist() == [Status.ABSTAIN.value] * 2 and bool(after["done"].all())
+
+
+def test_nobody_is_asked_how_far_a_beginning_is_where_progress_is_worth_nothing() -> None:
+    judge = Fixed(0.9, Status.ABSTAIN)
+    env = world("one_arm_deltas", 2, judge, progress=0.0)
+    env.base_env.schedule([0, 1])
+    assert not bool(env.reset()[PROGRESS].any()) and not judge.asked
+    judge.said = Status.OK
+    after = play(env, [0, 1], 1)
+    assert torch.allclose(after["reward"], torch.ones(2, 1)) and len(judge.asked) == 1
 
 
 def test_success_must_hold_across_chunks() -> None:

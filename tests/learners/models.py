@@ -9,7 +9,7 @@ import torch
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
-from envs.judges import LearnedJudge
+from envs.judges import Judge
 from envs.simulators.base import WORLD_OPTIONS, Simulator
 from envs.simulators.dit.engine import DiTSimulator
 from envs.simulators.state_experts.base import StateDecoder
@@ -57,8 +57,8 @@ def decoder_of(name: str, simulator: Simulator) -> StateDecoder:
     return build(section, "simulator.state_expert", simulator=simulator)  # type: ignore[no-any-return]
 
 
-def judge_of(spec: WorldSpec, hold: int = 2) -> LearnedJudge:
-    """An untrained learned judge."""
+def judge_of(spec: WorldSpec, hold: int = 2, name: str = "learned", **context: Any) -> Judge:
+    """An untrained judge; `context` is what the factory would add, such as feature_shape."""
     torch.manual_seed(0)
-    section = {k: v for k, v in section_of("judge", "learned").items() if k != "rewards"}
-    return build(section | {"hold": hold}, "judge", spec=spec)  # type: ignore[no-any-return]
+    section = {k: v for k, v in section_of("judge", name).items() if k != "rewards"}
+    return build(section | {"hold": hold}, "judge", spec=spec, **context)  # type: ignore[no-any-return]

@@ -43,7 +43,7 @@ def test_forcing_full_has_the_published_size_and_shapes() -> None:
     assert found.activations > 20 * 256 * 1024 * 4 * 16 * 2
 
 
-@pytest.mark.parametrize("name", ["forcing_small", "dit_small", "unet_small", "gesim_tiny"])
+@pytest.mark.parametrize("name", ["forcing_small", "dit_small", "unet_small", "tokens_small", "gesim_tiny"])
 def test_what_is_counted_without_numbers_is_what_is_computed_with_them(name: str) -> None:
     spec = world_spec(ROBOTS[BIMANUAL_POSES.robot], chunk=5)
     found = size_of(section_of(name), spec)

@@ -82,7 +82,8 @@ WRONG: dict[type, list[Any]] = {
     dict: [3, None, "none", [1]],
 }
 # other packages' options; where null has a meaning
-FREE, NULLABLE = ("simulator.scratch", "policy.policy"), ("rl.chunks", "task.suite", "finetune.weights")
+FREE = ("simulator.scratch", "policy.policy", "judge.chat.body")
+NULLABLE = ("rl.chunks", "task.suite", "finetune.weights", "judge.chat.key")
 
 
 SECTIONS = {"distiller": "distill"}  # of groups that fill a part of one

@@ -11,7 +11,7 @@ import torch
 
 from envs.physics.gridworld import EDGE, Gridworld
 from envs.targets import ConfigError
-from pipeline.commands.gridworld import gridworld, variant
+from pipeline.commands.worlds.gridworld import gridworld, variant
 from pipeline.config import load_config
 from pipeline.evaluation.squares import find_squares
 from tests.pipeline.test_cli import worldloop

@@ -145,6 +145,17 @@ class RemoteSimulator(Simulator):
             torch.from_numpy(np.stack(states)).to(device),
         )
 
+    def features(self, inputs: TensorDict) -> Tensor:
+        """Refused: a server says nothing of what its network makes of inputs, and each step counts.
+
+        Raises:
+            RemoteError: always.
+        """
+        raise RemoteError(
+            "simulator=remote has no features to learn from; choose a simulator that runs here, or a judge"
+            " that looks at pictures, such as judge=learned"
+        )
+
     def close(self) -> None:
         """End all sessions on the servers."""
         _close_all(self._connections)

@@ -121,7 +121,7 @@ class STBlock(nn.Module):
         return y + self.reader.gate(_TIME, self.time(h, keys, mask, rope).transpose(1, 2), told)
 
     def _before(self, past: int, count: int, more: int, device: torch.device, itself: bool) -> Tensor:
-        """Which of `past` + `more` frames those numbered past, past + 1, ... see, bool [count, past + more]."""
+        """Which of `past` + `more` frames those from number `past` on see, bool [count, past + more]."""
         number = past + torch.arange(count, device=device)[:, None]
         other = torch.arange(past + more, device=device)
         latest = number if itself else number - 1

@@ -1,11 +1,11 @@
-"""In which order the tokens of a frame are decided: all at once in a few steps, or one place after another."""
+"""In which order the tokens of a frame are decided: all at once in a few steps, or place after place."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -48,7 +48,7 @@ class Decoding(Protocol):
         """Whether places see only those before them, and themselves."""
 
     def shown(self, tokens: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """What training gives of frames int64 [B, T, P, F], and where it counts what is said, bool [B, T, P]."""
+        """What training gives of frames int64 [B, T, P, F], and where answers count, bool [B, T, P]."""
 
     def decide(self, ask: Asker, places: int, factors: int, draws: Draws) -> Tensor:
         """Tokens int64 [B, P, F] of a frame."""
@@ -66,7 +66,7 @@ class MaskGIT:
 
     steps: Count
     temperature: NonNegative
-    causal: ClassVar[bool] = False
+    causal = False
 
     def shown(self, tokens: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """See Decoding: of every frame a random set of places is masked, by the same cosine."""
@@ -100,7 +100,7 @@ class Raster:
     """
 
     temperature: NonNegative
-    causal: ClassVar[bool] = True
+    causal = True
 
     def shown(self, tokens: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """See Decoding: every place is shown the tokens of the one before it."""

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from envs.simulators.dit.layers import RMSNorm, rotate
+from envs.simulators.dit.layers import rotate
 from envs.simulators.row_linear import RowLinear
 
 _BASE = 100.0  # of rotary positions: windows are tens of frames long
@@ -35,7 +35,7 @@ class TokenAttention(nn.Module):
         super().__init__()
         self.heads = heads
         self.to_q, self.to_k, self.to_v = (RowLinear(width, width, bias=False) for _ in range(3))
-        self.norm_q, self.norm_k = RMSNorm(width // heads, 1e-5), RMSNorm(width // heads, 1e-5)
+        self.norm_q, self.norm_k = (nn.LayerNorm(width // heads, bias=False) for _ in range(2))
         self.to_out = nn.ModuleList([RowLinear(width, width, bias=False)])
 
     def keys_of(self, x: Tensor, rope: tuple[Tensor, Tensor] | None = None) -> Keys:
@@ -56,13 +56,27 @@ class TokenAttention(nn.Module):
         queries = self.norm_q(self._split(self.to_q(x)))
         queries = queries if rope is None else rotate(queries, rope)
         keys, values = known
-        lead = queries.shape[:-3]
-        q, k, v = (part.to(values.dtype).flatten(0, -4) for part in (queries, keys, values))
-        out = F.scaled_dot_product_attention(q, k, v, attn_mask=mask).unflatten(0, lead)
+        out = _attend(queries.to(values.dtype), keys.to(values.dtype), values, mask)
         return self.to_out[0](out.transpose(-2, -3).flatten(-2))
 
     def _split(self, x: Tensor) -> Tensor:
         return x.unflatten(-1, (self.heads, -1)).transpose(-2, -3)
+
+
+def _attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None) -> Tensor:
+    """Attention of queries [..., L, size] to keys and values [..., N, size]; sizes before that may broadcast.
+
+    On a CPU by two products: over so few keys they take a half to a quarter of the time of torch's fused
+    kernel, most of all backwards in bfloat16 (8.8 against 35 ms for 40 queries of 88 keys in 192 heads).
+    """
+    if q.is_cuda:
+        lead = q.shape[:-2]
+        k, v = (part.expand(*lead, -1, -1).flatten(0, -4) for part in (k, v))
+        return F.scaled_dot_product_attention(q.flatten(0, -4), k, v, attn_mask=mask).unflatten(0, lead[:-1])
+    scores = (q * q.shape[-1] ** -0.5) @ k.mT
+    if mask is not None:
+        scores = scores.masked_fill(~mask, float("-inf"))
+    return scores.softmax(-1) @ v
 
 
 class _Gelu(nn.Module):

@@ -131,7 +131,7 @@ class SpatioTemporalTransformer(nn.Module):
         return self.norm_seen(x)
 
     def ask(self, shown: Tensor, told: Tensor, beside: Tensor | None, memory: Memory) -> Tensor:
-        """Logits [B, P, F, codes] of the frame after those of a memory, of which `shown` [B, P, F] is given."""
+        """Logits [B, P, F, codes] of the frame after those of a memory; `shown` [B, P, F] is given of it."""
         y = self._input(shown[:, None], beside) + self.asked
         for block, cache in self._each(memory):
             y = block.ask_next(y, told, cache, memory.frames)

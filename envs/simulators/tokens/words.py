@@ -36,7 +36,7 @@ class WordEncoder(Protocol):
         """
 
     def encode(self, texts: Sequence[str], device: torch.device) -> Tensor:
-        """float32 [N, tokens, size] of texts, the same for a text in any batch; zeros where one has no more."""
+        """float32 [N, tokens, size] of texts, the same for one in any batch; zeros where it has no more."""
 
 
 class HashedWords:

@@ -24,8 +24,8 @@ from envs.files import write_text
 from envs.initial_states import InitialStates
 from envs.targets import ConfigError
 from pipeline.commands.worlds.subject import WEIGHTS, Subject, mark, weights_at
-from pipeline.evaluation.agreement import Cell, agreement
 from pipeline.evaluation.by_task import tasks_of_episodes
+from pipeline.evaluation.value.agreement import Cell, agreement
 from pipeline.evaluation.value.candidates import Candidate, action_spread, candidates
 from pipeline.evaluation.value.page import build_page, table_text
 from pipeline.evaluation.value.trials import Imagination, Kept, Physics

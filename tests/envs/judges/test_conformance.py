@@ -17,10 +17,13 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.embodiment import Embodiment
-from envs.judges import Judge, Judgement, RuleJudge
+from envs.judges import Judge, Judgement, MissingFeatures, RuleJudge
+from envs.simulators.features import pooled_size
 from envs.specs import Status, WorldSpec, text_to_bytes
-from envs.targets import build
+from envs.targets import build, target
 from tests.embodiments import EMBODIMENTS, INSTRUCTIONS, world_spec
+from tests.envs.judges.chat_server import MODEL, hashing, serving
+from tests.envs.judges.tiny_vlm import save_tiny_vlm
 from tests.sections import CONFIGS, offered, section
 
 EXAMPLES = CONFIGS.parent / "examples/configs"
@@ -35,11 +38,63 @@ def goal() -> Iterator[dict[str, Any]]:
         yield {"picture": path}
 
 
+# Of pictures whose sides are multiples of 8, and sure that the first frame it imagines is the goal: what it
+# says of other frames then shows in the judgement.
+TINY_TEXT_WORLD = {
+    "window": 3,
+    "codec": {"bits": 8, "stride": 8, "width": 16},
+    "net": {"layers": 1, "width": 16, "heads": 1, "ratio": 1},
+    "conditioning": {"tokens": 2},
+    "decoding": {"steps": 1},
+    "ending": {"threshold": 0.0, "max_frames": 2},
+}
+
+
+@contextmanager
+def server() -> Iterator[dict[str, Any]]:
+    """A chat server whose model looks at every pixel and letter, and a cache for its answers."""
+    with TemporaryDirectory() as folder, serving(hashing) as chat:
+        yield {
+            "chat": {"url": chat.url, "model": MODEL},
+            "votes": {"count": 9, "calibrate": True},
+            "pictures": {"side": 0},
+            "asking": {"cache": folder},
+        }
+
+
+@contextmanager
+def weights() -> Iterator[dict[str, Any]]:
+    """A tiny vision-language model on disk, and a cache for its answers."""
+    pytest.importorskip("transformers", reason="pip install -c constraints.txt 'worldloop[vlm]'")
+    with TemporaryDirectory() as folder:
+        path, prompt = save_tiny_vlm(Path(folder) / "model"), Path(folder) / "prompt.txt"
+        prompt.write_text("$instruction?")
+        yield {
+            "chat": {"path": str(path), "device": "cpu", "max_tokens": 1},
+            "prompt": str(prompt),
+            "votes": {"count": 15, "calibrate": True},
+            "pictures": {"side": 0},
+            "asking": {"cache": folder},
+        }
+
+
 # What a judge needs that is not in its config, a file or a server: while the context lasts it is there, at
 # the options that the context gives. A judge that is not named here is built as its config says.
-SURROUNDINGS: dict[str, Callable[[], AbstractContextManager[dict[str, Any]]]] = {"goal_picture": goal}
+SURROUNDINGS: dict[str, Callable[[], AbstractContextManager[dict[str, Any]]]] = {
+    "goal_picture": goal,
+    "goal_image": goal,
+    "golden_goal": partial(nullcontext, {"text_world": TINY_TEXT_WORLD}),
+    "vlm": server,
+    "vlm_local": weights,
+}
 # What a judge does not look at, and says so; all others look at everything.
-IGNORES: dict[str, tuple[str, ...]] = {"goal_picture": ("instruction", "other views")}
+IGNORES: dict[str, tuple[str, ...]] = {
+    "goal_picture": ("instruction", "other views"),
+    "goal_image": ("instruction", "other views"),
+    "proxy": ("first frame", "instruction"),
+    "embedding": ("first frame", "frames"),
+}
+FEATURES = (6, 10)  # of a simulator whose features judges read: tokens and their width
 JUDGES = {name: CONFIGS for name in offered("judge")} | {
     path.stem: EXAMPLES for path in (EXAMPLES / "judge").glob("*.yaml")
 }
@@ -71,18 +126,26 @@ def spec(request: pytest.FixtureRequest) -> WorldSpec:
 def judge(options: dict[str, Any], spec: WorldSpec) -> Judge:
     """The judge with random weights."""
     torch.manual_seed(0)
-    return build(options, "judge", spec=spec).eval()  # type: ignore[no-any-return]
+    context = {"feature_shape": FEATURES} if target(options, "judge").reads_features else {}
+    return build(options, "judge", spec=spec, **context).eval()  # type: ignore[no-any-return]
 
 
-def clips(spec: WorldSpec, batch: int, frames: int) -> tuple[Tensor, Tensor, list[str]]:
+Clips = tuple[Tensor, Tensor, list[str], tuple[Tensor, ...]]
+
+
+def clips(judge: Judge, spec: WorldSpec, batch: int, frames: int) -> Clips:
+    """What `score` takes; the last are features, none of a judge that reads none."""
     g = torch.Generator().manual_seed(0)
     shape = (batch, frames, spec.views, 3, *spec.size)
     video = torch.randint(0, 256, shape, dtype=torch.uint8, generator=g)
-    return video, video[:, 0], [INSTRUCTIONS[k % len(INSTRUCTIONS)] for k in range(batch)]
+    features = torch.randn(batch, -(-frames // spec.chunk), pooled_size(FEATURES), generator=g)
+    texts = [INSTRUCTIONS[k % len(INSTRUCTIONS)] for k in range(batch)]
+    return video, video[:, 0], texts, (features,) if judge.reads_features else ()
 
 
 def test_judgements_are_probabilities_in_every_frame(judge: Judge, spec: WorldSpec) -> None:
-    judgement = judge.score(*clips(spec, 3, 5))
+    frames, first, texts, seen = clips(judge, spec, 3, 5)
+    judgement = judge.score(frames, first, texts, *seen)
     assert judgement.success.shape == judgement.progress.shape == (3, 5) and judgement.status.shape == (3,)
     assert judgement.success.dtype == judgement.progress.dtype == torch.float32
     assert judgement.status.dtype == torch.int64 and bool((judgement.status == Status.OK.value).all())
@@ -99,15 +162,16 @@ def rows(judgement: Judgement, at: slice) -> Judgement:
 
 
 def test_a_judgement_does_not_depend_on_the_rest_of_the_batch(judge: Judge, spec: WorldSpec) -> None:
-    frames, first, texts = clips(spec, 3, 4)
-    together = judge.score(frames, first, texts)
-    turned = judge.score(frames.flip(0), first.flip(0), texts[::-1])
+    frames, first, texts, seen = clips(judge, spec, 3, 4)
+    together = judge.score(frames, first, texts, *seen)
+    turned = judge.score(frames.flip(0), first.flip(0), texts[::-1], *(part.flip(0) for part in seen))
     assert same(Judgement(*(value.flip(0) for value in turned)), together)
     frames, first = frames.clone(), first.clone()
     frames[[0, 2]], first[[0, 2]] = 255 - frames[[0, 2]], 99
     others = ["stop", texts[1], "put the small green cube that lies beside the drawer onto the plate"]
-    assert same(rows(judge.score(frames, first, others), slice(1, 2)), rows(together, slice(1, 2)))
-    alone = judge.score(frames[1:2], first[1:2], texts[1:2])
+    changed = [part * torch.tensor([2.0, 1.0, 2.0])[:, None, None] for part in seen]
+    assert same(rows(judge.score(frames, first, others, *changed), slice(1, 2)), rows(together, slice(1, 2)))
+    alone = judge.score(frames[1:2], first[1:2], texts[1:2], *(part[1:2] for part in seen))
     # Other batch sizes may choose other kernels, which sum in another order.
     assert torch.allclose(alone.success, together.success[1:2], atol=1e-5)
     assert torch.allclose(alone.progress, together.progress[1:2], atol=1e-5)
@@ -115,45 +179,65 @@ def test_a_judgement_does_not_depend_on_the_rest_of_the_batch(judge: Judge, spec
 
 def test_every_weight_is_learned_or_at_least_used(judge: Judge, spec: WorldSpec) -> None:
     """What is trained gets a gradient from the loss; what is frozen changes the judgement when it changes."""
-    frames, first, texts = clips(spec, 6, 1)
+    frames, first, texts, seen = clips(judge, spec, 6, 1)
+    first = first.flip(0)
     trained = [(key, value) for key, value in judge.named_parameters() if value.requires_grad]
     frozen = [(key, value) for key, value in judge.named_parameters() if not value.requires_grad]
     if trained:
-        data = TensorDict({"frames": frames[:, 0], "first": first.flip(0), "text": text_to_bytes(texts)}, [6])
+        data = TensorDict({"frames": frames[:, 0], "first": first, "text": text_to_bytes(texts)}, [6])
         data["label"], data["progress"] = torch.tensor([0.0, 1.0] * 3), torch.linspace(0, 1, 6)
+        for part in seen:
+            data["features"], data["offset"] = part[:, 0], torch.arange(6) % spec.chunk
         judge.loss(data, 0.5)[0].backward()
         assert not [key for key, value in trained if value.grad is None or not bool(value.grad.any())]
-    before = judge.score(frames, first, texts)
-    for key, value in frozen:
+    before = judge.score(frames, first, texts, *seen)
+    turn = [*EMBODIMENTS].index(spec.embodiment.robot)  # all robots have the same; they share the work
+    for key, value in frozen[turn :: len(EMBODIMENTS)]:
         kept = value.detach().clone()
         value.copy_(kept + torch.randn(kept.shape, generator=torch.Generator().manual_seed(0)))
-        assert not same(judge.score(frames, first, texts), before), f"{key} is used for nothing"
+        judge.load_state_dict(judge.state_dict())  # as weights come, so that what hangs on them is made anew
+        assert not same(judge.score(frames, first, texts, *seen), before), f"{key} is used for nothing"
         value.copy_(kept)
 
 
 def test_what_is_submitted_is_fetched(judge: Judge, spec: WorldSpec) -> None:
-    given = clips(spec, 2, 3)
+    frames, first, texts, seen = clips(judge, spec, 2, 3)
+    given = (frames, first, texts, *seen)
     assert torch.equal(judge.fetch(judge.submit(*given)).success, judge.score(*given).success)
 
 
 def test_first_frame_instruction_and_every_view_matter(name: str, judge: Judge, spec: WorldSpec) -> None:
-    frames, first, texts = clips(spec, 2, 3)
-    scores, ignored = judge.score(frames, first, texts), IGNORES.get(name, ())
-    assert not same(judge.score(frames, 255 - first, texts), scores)
-    assert same(judge.score(frames, first, texts[::-1]), scores) == ("instruction" in ignored)
+    frames, first, texts, seen = clips(judge, spec, 2, 3)
+    scores, ignored = judge.score(frames, first, texts, *seen), IGNORES.get(name, ())
+    assert same(judge.score(frames, 255 - first, texts, *seen), scores) == ("first frame" in ignored)
+    assert same(judge.score(frames, first, texts[::-1], *seen), scores) == ("instruction" in ignored)
+    for part in seen:
+        assert not same(judge.score(frames, first, texts, 2 * part), scores)
     for view in range(spec.views):
         other = frames.clone()
         other[:, :, view] = 255 - other[:, :, view]
-        unseen = "other views" in ignored and view != spec.embodiment.main_view
-        assert same(judge.score(other, first, texts), scores) == unseen
+        beside = "other views" in ignored and view != spec.embodiment.main_view
+        assert same(judge.score(other, first, texts, *seen), scores) == (beside or "frames" in ignored)
+
+
+def test_a_judge_that_reads_features_says_when_it_has_none(judge: Judge, spec: WorldSpec) -> None:
+    frames, first, texts, seen = clips(judge, spec, 2, spec.chunk + 1)
+    if not judge.reads_features:
+        return
+    for given in ((), (seen[0][:, :1],)):
+        with pytest.raises(MissingFeatures, match="reads the simulator's features"):
+            judge.score(frames, first, texts, *given)
 
 
 def test_a_judge_of_nan_says_error(judge: Judge, spec: WorldSpec) -> None:
     numbers = [*judge.parameters(), *(value for value in judge.buffers() if value is not judge.threshold)]
+    if not numbers:
+        pytest.skip("this judge has no numbers of its own; what errors of a model come to is in test_vlm.py")
     for value in numbers:
         if value.is_floating_point():
             value.detach().fill_(torch.nan)
-    assert bool((judge.score(*clips(spec, 2, 3)).status == Status.ERROR.value).all())
+    frames, first, texts, seen = clips(judge, spec, 2, 3)
+    assert bool((judge.score(frames, first, texts, *seen).status == Status.ERROR.value).all())
 
 
 def test_the_rule_has_no_weights_and_judges_each_episode_by_itself() -> None:

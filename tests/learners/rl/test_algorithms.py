@@ -16,12 +16,13 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from actors.fleets.fleet import FleetError, LocalFleet
 from actors.policies.contract import action_key, distribution, freeze_perception, trained_part
 from actors.policies.safe import SafePolicyWrapper
-from actors.rollouts.host import Host, Job
+from actors.rollouts.host import Host, Job, Weights
 from envs.physics.toy_tracking import ToyTrackingEnv
 from envs.specs import EPISODE, IMAGE, INSTRUCTION_UTF8, LOG_PROB, SUCCESS, ActionMode, WorldSpec
 from envs.targets import build, options
 from learners.rl.algorithm import Algorithm, RLConfig
 from learners.rl.loop import train_rl
+from learners.rl.watch import Watch
 from tests.embodiments import ARM_DELTAS, observations, world_spec
 from tests.sections import offered, section
 
@@ -45,6 +46,7 @@ RL = {
         "rewards_later": False,
     },
     **{"starts": "first", "chunks": None, "freeze_perception": False, "checkpoint_every": 5, "seed": 0},
+    **{"evaluate_every": 0, "evaluate_episodes": 1},
 }
 POLICIES = [name for name in offered("policy") if name != "openpi"]  # that one needs a server
 SMALL = {"chunk_gaussian": {"width": 32}, "chunk_tokens": {"width": 32, "head": {"bins": 8}}}
@@ -204,6 +206,27 @@ def test_with_frozen_perception_no_picture_is_carried_or_encoded_again(name: str
     assert not encoded
     changed = {key for key, value in policy.named_parameters() if not torch.equal(value, before[key])}
     assert changed and not any(key.startswith("module.0.") for key in changed)
+
+
+def test_looking_at_a_policy_changes_nothing_that_it_learns(tmp_path: Path) -> None:
+    looked: list[int] = []
+
+    def look(iteration: int, weights: Weights) -> tuple[dict[str, float], bool]:
+        looked.append(iteration)
+        torch.rand(3)
+        return {"true_success": float(iteration)}, iteration == 3
+
+    rows = {}
+    for name, watch in (("blind", None), ("watched", Watch(2, look))):
+        env = toy(8)
+        policy, replica = policy_of("chunk_gaussian", env.spec), policy_of("chunk_gaussian", env.spec)
+        algorithm = algorithm_of("ppo", policy, env.spec)
+        fleet, plan = LocalFleet(Host(env, replica)), settings(iterations=5)
+        train_rl(fleet, policy, algorithm, plan, tmp_path / name, starts=4, watch=watch)
+        rows[name] = rows_of(tmp_path / name)
+    assert looked == [1, 3] and len(rows["watched"]) == 4  # enough after the second look
+    assert [row.pop("rl/true_success", None) for row in rows["watched"]] == [None, 1.0, None, 3.0]
+    assert rows["watched"] == rows["blind"][:4]
 
 
 def test_end_to_end_pictures_travel_and_the_encoder_learns(tmp_path: Path) -> None:

@@ -13,21 +13,30 @@ from tensordict import TensorDict
 from envs.embodiment import Embodiment
 from envs.episodes import LeRobotWriter
 from envs.episodes.clips import ClipStore
-from envs.judges import RuleJudge
+from envs.judges import MissingFeatures, RuleJudge
+from envs.simulators.features import features_of_episodes
+from learners.stages.generated import generated_frames, recorded_features
 from learners.stages.judge import JudgeData, calibrate, frame_targets, judge_recordings, train_judge
 from learners.stages.pictures import augment
+from learners.stages.simulator import units
 from learners.training.fit import FitConfig
 from tests.embodiments import ARM_DELTAS, EMBODIMENTS, world_spec
-from tests.learners.models import judge_of
+from tests.learners.models import judge_of, simulator_of
 from tests.moving_square import SIZE, moving_square
 
 Stores = Callable[[Embodiment], ClipStore]
 
 
-@pytest.mark.parametrize("robot", EMBODIMENTS.values(), ids=EMBODIMENTS)
-def test_a_judge_learns_who_succeeded(robot: Embodiment, tiny_store: Stores, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("robot", "name"),
+    [*((robot, "learned") for robot in EMBODIMENTS.values()), (ARM_DELTAS, "proxy")],
+    ids=[*EMBODIMENTS, "proxy"],
+)
+def test_a_judge_learns_who_succeeded(
+    robot: Embodiment, name: str, tiny_store: Stores, tmp_path: Path
+) -> None:
     store = tiny_store(robot)
-    judge = judge_of(store.spec)
+    judge = judge_of(store.spec, name=name)
     options = FitConfig(steps=60, batch=32, lr=3e-3, warmup=5, ema=0.9, bf16=False)
     train_judge(judge, store, store.split("train"), options, tmp_path)
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").open()]
@@ -37,6 +46,40 @@ def test_a_judge_learns_who_succeeded(robot: Embodiment, tiny_store: Stores, tmp
     right = judge.episode(success, store.whole(unseen)[1])
     truth = torch.tensor([store.episodes[n]["success"] for n in unseen.tolist()])
     assert float((right == truth).float().mean()) >= 0.8
+
+
+def test_a_judge_learns_who_succeeded_from_a_simulators_features(tiny_store: Stores, tmp_path: Path) -> None:
+    store = tiny_store(ARM_DELTAS)
+    simulator, train = simulator_of("unet_small", store.spec), store.split("train")
+    simulator.normalise(*units(store, train))
+    simulator.fit_camera_statistics(store.frames(store.start))
+    judge = judge_of(store.spec, name="embedding", feature_shape=simulator.feature_shape)
+    with pytest.raises(MissingFeatures, match="recorded_features"):
+        train_judge(judge, store, train, FitConfig(steps=1, batch=2, lr=1e-3), tmp_path)
+    options = FitConfig(steps=150, batch=32, lr=1e-2, warmup=5, ema=0.9, bf16=False)
+    recorded = recorded_features(simulator, store, train, bf16=False)
+    generated = generated_frames(simulator, store, train[:4], bf16=False)
+    train_judge(judge, store, train, options, tmp_path, generated, recorded)
+    unseen = torch.cat([store.split("calibration"), store.split("held_out")])
+    seen = features_of_episodes(simulator, store, unseen, bf16=False)
+    right = judge.episode(judge_recordings(judge, store, unseen, seen), store.whole(unseen)[1])
+    truth = torch.tensor([store.episodes[n]["success"] for n in unseen.tolist()])
+    assert float((right == truth).float().mean()) >= 0.8
+
+
+def test_every_recorded_frame_has_the_features_of_its_chunk(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    simulator, some = simulator_of("unet_small", store.spec), torch.tensor([3, 4])
+    table = recorded_features(simulator, store, some, bf16=False)
+    whole = features_of_episodes(simulator, store, some, bf16=False)
+    begins = -(-(store.length[some] - 1) // store.spec.chunk)
+    assert len(table) == int((store.length[some] - 1).sum() + begins.sum())
+    for row in table[: int((store.length[some] - 1).sum())]:
+        owner = int(torch.searchsorted(store.start, row["row"], right=True)) - 1
+        frame = int(row["row"] - store.start[owner]) - 1
+        assert int(row["offset"]) == frame % store.spec.chunk
+        wanted = whole[some.tolist().index(owner), frame // store.spec.chunk]
+        assert torch.allclose(row["features"], wanted, atol=1e-5)
 
 
 def test_batches_are_balanced_and_labelled_by_time_and_success(tiny_store: Stores) -> None:
@@ -53,7 +96,7 @@ def test_failures_are_as_late_as_successes(tiny_store: Stores) -> None:
     store = tiny_store(ARM_DELTAS)
     data = JudgeData(store, torch.arange(20), hold=2, discount=0.5)
     pool = data.pools[0]
-    rows, _ = pool.draw(300, torch.Generator().manual_seed(0))
+    rows = pool.draw(300, torch.Generator().manual_seed(0))["row"]
     won, beside = data.labels[rows[:100]], data.labels[rows[100:200]]
     assert bool((won == 1).all()) and not bool(beside.any())
     owner = torch.searchsorted(store.start, rows, right=True) - 1
@@ -139,6 +182,15 @@ def test_scores_that_do_not_tell_set_no_threshold(best: list[float], succeeded: 
     judge = RuleJudge(hold=2)
     assert not calibrate(judge, runs(best), torch.tensor(succeeded))
     assert float(judge.threshold) == 0.5
+
+
+def test_episodes_that_nobody_could_judge_set_no_threshold() -> None:
+    judge, alone = RuleJudge(hold=2), RuleJudge(hold=2)
+    best, succeeded = [0.1, 0.2, 0.8, 0.9], [False, False, True, True]
+    assert calibrate(alone, runs(best), torch.tensor(succeeded))
+    more = runs([*best, float("nan"), float("nan")])
+    assert calibrate(judge, more, torch.tensor([*succeeded, True, False]))
+    assert torch.equal(judge.threshold, alone.threshold)
 
 
 def test_pictures_are_disturbed_alike_in_all_views_and_by_the_generator_alone() -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.stats import pearsonr, spearmanr
 
-from pipeline.evaluation.agreement import Cell, agreement, bias, correlation, macro, micro, mmrv, order
+from pipeline.evaluation.value.agreement import Cell, agreement, bias, correlation, macro, micro, mmrv, order
 
 TRUE = np.array([0.9, 0.5, 0.1])
 

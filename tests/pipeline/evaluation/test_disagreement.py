@@ -13,6 +13,7 @@ from envs.episodes.clips import ClipStore
 from envs.episodes.video import read_video
 from envs.judges.base import Judge, Judgement
 from envs.physics.suite import scene_of
+from envs.simulators.base import Simulator
 from envs.simulators.replay import Replay
 from pipeline.evaluation.by_task import by_scene, scenes_of_seeds
 from pipeline.evaluation.disagreement import compared, curves, worst
@@ -22,6 +23,7 @@ from pipeline.evaluation.statistics import rate_entry
 from tests.envs.physics.sections import Counting
 
 FRAMES = 6
+NOBODY: Simulator = None  # type: ignore[assignment]  # no judge here reads its features
 
 
 class Brightness(Judge):
@@ -61,14 +63,14 @@ def replayed(generated: list[list[int]], valid: int = FRAMES - 1) -> Replay:
     )
     rows = torch.arange(count)[:, None] * FRAMES + torch.arange(1, FRAMES)
     exists = (torch.arange(FRAMES - 1) < valid).expand(count, -1)
-    return Replay(frames, rows, exists, torch.zeros(count, FRAMES - 1, 1))
+    return Replay(frames, rows, exists, torch.zeros(count, FRAMES - 1, 1), torch.zeros(count, 2, 3))
 
 
 def test_the_surer_and_the_more_wrong_the_worse() -> None:
     store: ClipStore = Store()  # type: ignore[assignment]
     judge, episodes = Brightness(), torch.arange(3)
     made = replayed([[0, 0, 0, 51, 51], [0, 204, 204, 204, 0], [255, 255, 0, 0, 0]])
-    views = judge_both(judge, store, episodes, made)
+    views = judge_both(judge, NOBODY, store, episodes, made, bf16=False)
     rows = compared({"task": {"name": "any"}}, judge, store, episodes, made, views)
     assert [row["generated"] for row in rows] == [0.2, 0.8, 1.0]
     assert [row["recorded"] for row in rows] == [1.0, 0.0, 1.0]
@@ -82,7 +84,7 @@ def test_the_surer_and_the_more_wrong_the_worse() -> None:
 def test_frames_that_do_not_exist_count_for_nothing() -> None:
     store: ClipStore = Store()  # type: ignore[assignment]
     judge, made = Brightness(), replayed([[0, 0, 255, 255, 255]], valid=3)
-    views = judge_both(judge, store, torch.tensor([0]), made)
+    views = judge_both(judge, NOBODY, store, torch.tensor([0]), made, bf16=False)
     (row,) = compared({"task": {"name": "any"}}, judge, store, torch.tensor([0]), made, views)
     assert row["generated"] == 0.0 and not row["claims"] and len(curves(views, made, 0)["recorded"]) == 3
 

@@ -36,7 +36,7 @@ def recorded(store: ClipStore, episodes: torch.Tensor, shift: int = 0) -> Replay
     """The true video as if a world had made it, with every picture `shift` pixels too far right."""
     rows, valid = store.whole(episodes)
     frames = store.frames(rows).roll(shift, -1)
-    return Replay(frames, rows, valid, store.arrays["states"][rows])
+    return Replay(frames, rows, valid, store.arrays["states"][rows], torch.zeros(len(rows), 1, 1))
 
 
 def test_calibrated_data_without_privileged_columns_are_measured(tmp_path: Path) -> None:

@@ -25,11 +25,12 @@ SOAK = ["experiment=soak", "track=disabled", "launch.workers=1", "cameras=main"]
 
 
 def test_fidelity_with_masks_from_physics(tmp_path: Path) -> None:
-    cfg = load_config(SOAK)
+    soak = [*SOAK, "simulator=forcing_small"]  # whose blocks can be chosen at inference
+    cfg = load_config(soak)
     data = scripted_set(cfg, tmp_path / "set", 3)
-    words = [*SOAK, *untrained_world(cfg, tmp_path), f"imagined.data=[{data}]"]
+    words = [*soak, *untrained_world(cfg, tmp_path), f"imagined.data=[{data}]"]
     words += ["fidelity.long={frames: 30, episodes: 1, noise_level: 1.0}"]
-    tried = load_config([*words, "fidelity.grid={simulator.motion: [1.0, 2.0]}"])
+    tried = load_config([*words, "fidelity.grid={simulator.context: [1, 4], simulator.horizon: [4]}"])
     said = fidelity(tried, tmp_path / "run")
     result = json.loads((tmp_path / "run/fidelity.json").read_text())
     assert result["masks"] == {"source": "physics", "episodes": 3}
@@ -40,14 +41,14 @@ def test_fidelity_with_masks_from_physics(tmp_path: Path) -> None:
     assert len(result["frechet"]) == 2 and "no learned weights" in result["frechet"][0]["extractor"]
     assert result["long"]["frames"] == 32 and len(result["long"]["by_frame"]["mse"]) == 32
     assert [row["settings"] for row in result["grid"]["rows"]] == [
-        {"simulator.motion": 1.0},
-        {"simulator.motion": 2.0},
+        {"simulator.context": 1, "simulator.horizon": 4},
+        {"simulator.context": 4, "simulator.horizon": 4},
     ]
-    assert result["grid"]["figure"] == "arm_mse" and "Least arm MSE: simulator.motion=" in said
+    assert result["grid"]["figure"] == "arm_mse" and "Least arm MSE: simulator.context=" in said
     page = (tmp_path / "run/fidelity.html").read_text()
     assert "Frechet distances" in page and not re.findall(r'(?:src|href)=(?!"#)', page)
     with pytest.raises(ConfigError, match="another architecture"):
-        fidelity(load_config([*words, "fidelity.grid={simulator.width: [48]}"]), tmp_path / "run")
+        fidelity(load_config([*words, "fidelity.grid={simulator.net.layers: [2]}"]), tmp_path / "run")
     with pytest.raises(ConfigError, match=r"fidelity\.frames_extractor\._target_=.*single frames"):
         clips = "fidelity.frames_extractor._target_=pipeline.evaluation.fidelity.extractors.PyramidClips"
         fidelity(load_config([*words, clips]), tmp_path / "run")

@@ -62,6 +62,11 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
     simulator = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
     judge = build_judge(cfg, inputs.weights("judge"))
+    if judge.reads_features:
+        raise ConfigError(
+            f"judge={cfg['judge']['_target_']} reads the simulator's features, and true frames, on which"
+            " imagination is compared, have none; ask a run whose judge looks at pictures"
+        )
     world = build_world(
         *(cfg, simulator, decoder, judge, points, len(which) * futures),
         horizon=depth * int(cfg["task"]["chunk"]),

@@ -1,0 +1,164 @@
+"""worldloop judge: what a judge says of recorded episodes, beside whether they succeeded, and what that cost.
+
+With several choices of frames it is WPE's study of how much a judge must see: all frames, every n-th, the
+first and the last alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from actors.factory import build_judge, open_clips
+from envs.episodes.clips import ClipStore
+from envs.judges.base import Judge
+from envs.specs import Status
+from envs.targets import ConfigError, target
+from pipeline.evaluation.judging import Scores, judge_frames, judge_table, labelled
+from pipeline.loop import build_loop, has_physics, last_round
+from pipeline.stages.given import datasets, learns
+
+_BATCH = 16  # episodes judged at once
+_SPLITS = ("train", "held_out", "calibration")
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What is judged.
+
+    Args:
+        data: a LeRobot data set; "" for what the run has recorded (task.data, of a task without physics).
+        split: train, held_out, calibration, or all.
+        episodes: at most, the first ones; 0 for all.
+        frames: "all", a number n for every n-th counted back from the last, or "ends" for first and last.
+    """
+
+    data: str
+    split: str
+    episodes: int
+    frames: tuple[str, ...]
+
+    @classmethod
+    def of(cls, words: Mapping[str, str]) -> Selection:
+        """From the words of the command line.
+
+        Raises:
+            ConfigError: naming the word that cannot work.
+        """
+        data, episodes = words.get("data", ""), words.get("episodes", "0")
+        split = words.get("split", "all" if data else "held_out")
+        frames = tuple(words.get("frames", "all").strip("[]").split(","))
+        if split not in (*_SPLITS, "all"):
+            raise ConfigError(f"split={split} should be one of {[*_SPLITS, 'all']}")
+        if not episodes.isdigit():
+            raise ConfigError(f"episodes={episodes} should be a whole number; 0 for all")
+        for name in frames:
+            if name not in ("all", "ends") and not (name.isdigit() and int(name)):
+                raise ConfigError(f"frames={name} should be all, ends, or a number n for every n-th frame")
+        return cls(data, split, int(episodes), frames)
+
+
+def judge_study(cfg: Mapping[str, Any], root: Path, selection: Selection) -> str:
+    """A table with a line for each choice of frames.
+
+    Args:
+        cfg: the resolved config.
+        root: the run's folder, whose last judge is asked if it learns.
+
+    Raises:
+        ConfigError: if there is nothing to judge, or no judge.
+        JudgeError: if it cannot go on; what was answered is kept.
+    """
+    store = open_clips(cfg, _folders(cfg, root, selection))
+    chosen = torch.arange(len(store)) if selection.split == "all" else store.split(selection.split)
+    episodes = labelled(store, chosen)
+    if not len(episodes):
+        raise ConfigError(
+            f"no episode of split={selection.split} says whether it succeeded; say split=all, or other data"
+        )
+    episodes = episodes[: selection.episodes or None]
+    judge, kind = _judge(cfg, root), target(cfg["judge"], "judge")
+    name = str(cfg["judge"]["_target_"]).rpartition(".")[2]
+    lines = [f"{name} on {len(episodes)} recorded episodes ({selection.split})", _line(_HEAD)]
+    for frames in selection.frames:
+        before = kind.spent(cfg["judge"])  # type: ignore[attr-defined]
+        row = _row(judge, store, episodes, frames)
+        after = kind.spent(cfg["judge"])  # type: ignore[attr-defined]
+        spent = {key: after[key] - before[key] for key in after}
+        cost = ", ".join(f"{key.replace('_', ' ')} {value:g}" for key, value in spent.items() if value)
+        lines.append(f"{_line([frames, *row])}  {cost or ('free' if not spent else 'all remembered')}")
+    return "\n".join(lines)
+
+
+_HEAD = ("frames", "shown", "TP", "FP", "FN", "TN", "accuracy", "abstained", "errors")
+
+
+def _line(cells: Any) -> str:
+    return "  ".join(f"{cell!s:>9}" for cell in cells)
+
+
+def _folders(cfg: Mapping[str, Any], root: Path, selection: Selection) -> list[Path]:
+    """The data sets that are judged."""
+    if selection.data:
+        return [Path(selection.data)]
+    if not has_physics(cfg):
+        return [Path(folder) for folder in cfg["task"]["data"]]
+    graph = build_loop(cfg, root)
+    recorded = [name for name in graph.nodes if name == "collect" or name.startswith("deploy-")]
+    found = [graph.folder(name) for name in recorded if (graph.folder(name) / "manifest.json").exists()]
+    if not found:
+        raise ConfigError(
+            "this run has recorded nothing yet: first `worldloop stage collect` with the same options, or say"
+            " data=<folder of a LeRobot data set>"
+        )
+    return datasets(found)
+
+
+def _judge(cfg: Mapping[str, Any], root: Path) -> Judge:
+    """The judge as the run's last round left it; one without weights may do without a run."""
+    graph, name = build_loop(cfg, root), f"judge-{last_round(cfg)}"
+    if (graph.folder(name) / "manifest.json").exists():
+        return build_judge(cfg, graph.folder(name) / "weights.safetensors").eval()
+    judge = build_judge(cfg)
+    if learns(judge):
+        raise ConfigError(
+            f"this judge has learned nothing yet: first `worldloop stage {name}` with the same options"
+        )
+    return judge.eval()
+
+
+def _row(judge: Judge, store: ClipStore, episodes: Tensor, frames: str) -> list[Any]:
+    """Cells of the table behind the name of the choice of frames."""
+    rows, valid = thinned(store, episodes, frames)
+    parts, held = [], judge.hold
+    # So many of the frames that are left stand for `hold` of all.
+    judge.hold = 1 if frames == "ends" else max(1, round(held / (1 if frames == "all" else int(frames))))
+    try:
+        for some in tqdm(torch.arange(len(episodes)).split(_BATCH), desc=f"judge {frames}", leave=False):
+            parts.append(judge_frames(judge, store.frames(rows[some]), store, episodes[some]))
+        scores = Scores(*(torch.cat(values) for values in zip(*parts, strict=True)))
+        table = judge_table(judge, scores, valid, store, episodes)
+    finally:
+        judge.hold = held
+    lost = [int((scores.status == status.value).sum()) for status in (Status.ABSTAIN, Status.ERROR)]
+    share = f"{100 * table['accuracy']:.1f}%"
+    shown = f"{1 + float(valid.sum(1).float().mean()):.1f}"
+    return [shown, *(table[name] for name in ("tp", "fp", "fn", "tn")), share, *lost]
+
+
+def thinned(store: ClipStore, episodes: Tensor, frames: str) -> tuple[Tensor, Tensor]:
+    """Some rows of each episode but its first, int64 [N, T], the last repeated up to the longest, and which
+    are no repeats, bool [N, T]; see Selection.frames.
+    """
+    length = store.length[episodes] - 1
+    every = {"all": 1, "ends": int(length.max())}.get(frames) or int(frames)
+    count = -(-length // every)
+    behind = (count[:, None] - 1 - torch.arange(int(count.max()))).clamp(min=0) * every
+    valid = torch.arange(int(count.max())) < count[:, None]
+    return store.start[episodes][:, None] + length[:, None] - behind, valid

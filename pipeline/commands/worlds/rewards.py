@@ -1,0 +1,167 @@
+"""worldloop rewards: rewards side by side along the same episodes, of seen scenes and of unseen ones.
+
+RoboScape-R compares its reward with a rule, a head on the simulator's features and a network on pictures by
+their curves along an episode of an unseen scene. Here each judge is fitted to the data of a run's first
+round, as that run's own judge is, and asked about episodes that none of them has learned from.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from actors.factory import build_judge, build_simulator, open_clips
+from envs.episodes.clips import ClipStore
+from envs.files import write_text
+from envs.judges.base import Judge
+from envs.judges.rule import RuleJudge
+from envs.simulators.base import Simulator
+from envs.simulators.replay import replay
+from envs.targets import ConfigError
+from pipeline.evaluation.judging import Scores, judge_both, labelled
+from pipeline.evaluation.rewards.figures import BY_PHYSICS, Truth, by_rule, chosen, curve, figures, truth_of
+from pipeline.evaluation.rewards.page import build_page, table_text
+from pipeline.graph.graph import Graph
+from pipeline.loop import build_loop
+from pipeline.stages.given import datasets, open_store
+from pipeline.stages.variant import variant_episodes
+from pipeline.track import Tracker
+
+RULE = "rule"  # the reward that asks physics; it has no weights and no config
+SEEN = "seen"
+JUDGE = "judge-1"  # later rounds' data hang on what the first judge rewarded
+Cfg = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is compared on what.
+
+    Args:
+        configs: of each reward, by name: the run's with another section judge; that of the rule is any.
+        episodes: of each domain, at most.
+        variants: of the task, beside the scenes that are learned from.
+        drawn: successes, and as many failures, whose curves are drawn in each domain.
+    """
+
+    configs: Mapping[str, Cfg]
+    episodes: int
+    variants: Sequence[str]
+    drawn: int = 3
+
+
+def compare_rewards(cfg: Cfg, root: Path, plan: Plan, tracker: Tracker | None = None) -> str:
+    """Fit the judges that are not fitted yet, ask all of them; writes rewards.json and rewards.html.
+
+    Args:
+        cfg: the run's config.
+        root: its folder.
+
+    Returns:
+        The table as Markdown.
+
+    Raises:
+        ConfigError: for variants that the task does not have, and data of which nobody knows success.
+    """
+    unknown = sorted(set(plan.variants) - set(cfg["task"].get("variants", {})))
+    if unknown:
+        raise ConfigError(f"variants={unknown}: task.variants are {sorted(cfg['task'].get('variants', {}))}")
+    base = build_loop(cfg, root)
+    base.run(base.nodes[JUDGE].inputs["simulator"], tracker)
+    judges = dict(_judges(cfg, root, plan, tracker))
+    simulator = build_simulator(base.cfg, base.inputs(JUDGE).weights("simulator")).eval()
+    domains = {
+        name: _domain(cfg, judges, simulator, store, episodes, plan.drawn)
+        for name, store, episodes in _domains(cfg, base, plan, tracker)
+    }
+    about = {"name": cfg["name"], "simulator": cfg["simulator"]["_target_"].rpartition(".")[2]}
+    result = {**about, "domains": domains}
+    write_text(root / "rewards.json", json.dumps(result, indent=1))
+    write_text(root / "rewards.html", build_page(result))
+    return table_text(result)
+
+
+def _judges(cfg: Cfg, root: Path, plan: Plan, tracker: Tracker | None) -> Iterator[tuple[str, Judge]]:
+    # What progress and success are worth is known to whoever acted in physics: with other worth the data
+    # would be out of date.
+    worth = cfg["judge"]["rewards"]
+    for name, other in plan.configs.items():
+        if name == RULE:
+            yield name, RuleJudge(hold=1)
+            continue
+        mine = {**other, "judge": {**other["judge"], "rewards": worth}}
+        graph = build_loop(mine, root)
+        graph.run(JUDGE, tracker)
+        yield name, build_judge(graph.cfg, graph.folder(JUDGE) / "weights.safetensors").eval()
+
+
+def _domains(
+    cfg: Cfg, base: Graph, plan: Plan, tracker: Tracker | None
+) -> Iterator[tuple[str, ClipStore, Tensor]]:
+    """Name, store and episodes of what was held out of the run's data, and of each variant."""
+    store = open_store(cfg, base.inputs(JUDGE))
+    held = labelled(store, store.split("held_out"))
+    if not len(held):
+        raise ConfigError("no held-out episode of the data says whether it succeeded (next.success)")
+    spread = torch.linspace(0, len(held) - 1, min(plan.episodes, len(held))).round().long()
+    yield SEEN, store, held[spread]
+    for name in plan.variants:
+        node = base.add(f"variant-{name}", variant_episodes, variant=name, episodes=plan.episodes)
+        base.run(node, tracker)
+        other = open_clips(cfg, datasets([base.folder(node)]))
+        yield name, other, torch.arange(len(other))
+
+
+def _domain(
+    cfg: Cfg,
+    judges: Mapping[str, Judge],
+    simulator: Simulator,
+    store: ClipStore,
+    episodes: Tensor,
+    drawn: int,
+) -> dict[str, Any]:
+    """The entry of rewards.json for some episodes."""
+    truth, bf16 = truth_of(store, episodes), cfg["simulator"]["bf16"]
+    made = replay(simulator, store, episodes, bf16=bf16)
+    rows, curves = {}, {}
+    for name, judge in judges.items():
+        if name == RULE:
+            if truth.source != BY_PHYSICS:
+                raise ConfigError("rewards=[rule] asks physics, and these recordings have none; leave it out")
+            videos = {"recorded": by_rule(truth)}
+        else:
+            views = judge_both(judge, simulator, store, episodes, made, bf16)
+            videos = {video: _cut(scores, truth) for video, scores in views._asdict().items()}
+        found = {video: figures(judge, scores, truth, cfg["seed"]) for video, scores in videos.items()}
+        rows[name] = {"facts": judge.facts(), "figures": found}
+        curves[name] = videos["recorded"].progress
+    if RULE not in judges:
+        curves = {"true": truth.progress, **curves}
+    return {
+        "episodes": len(episodes),
+        "successes": int(truth.success.sum()),
+        "truth": truth.source,
+        "rewards": rows,
+        "drawn": [
+            {
+                "outcome": outcome,
+                "seed": store.episodes[int(episodes[n])]["seed"],
+                "instruction": store.instructions[int(episodes[n])],
+                "curves": {name: curve(values, truth, n) for name, values in curves.items()},
+            }
+            for outcome, numbers in chosen(truth, drawn).items()
+            for n in numbers
+        ],
+    }
+
+
+def _cut(scores: Scores, truth: Truth) -> Scores:
+    """Scores of the frames that the longest episode has; whole chunks were generated."""
+    count = truth.valid.shape[1]
+    return Scores(scores.success[:, :count], scores.progress[:, :count], scores.status)

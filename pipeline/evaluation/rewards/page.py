@@ -1,0 +1,69 @@
+"""Rewards side by side as a table of text and as one page with their curves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from markupsafe import Markup
+
+from pipeline.evaluation.charts import Curve, line_chart
+from pipeline.evaluation.report import templates
+from pipeline.evaluation.rewards.figures import cell
+
+# Figures of a reward: key, and heading.
+FIGURES = (
+    ("within", "Spearman within episodes"),
+    ("pooled", "Spearman over all frames"),
+    ("auc", "AUC of success"),
+)
+
+
+def build_page(result: Mapping[str, Any]) -> str:
+    """One self-contained HTML page of rewards.json."""
+    domains = [
+        {"name": name, "about": about_of(domain), "lines": list(lines_of(domain)), "charts": _charts(domain)}
+        for name, domain in result["domains"].items()
+    ]
+    return (
+        templates()
+        .get_template("rewards.html.j2")
+        .render(result=result, headings=[heading for _, heading in FIGURES], domains=domains)
+    )
+
+
+def table_text(result: Mapping[str, Any]) -> str:
+    """Markdown: a table for each domain."""
+    out = []
+    for name, domain in result["domains"].items():
+        headings = ["reward", "video", *(heading for _, heading in FIGURES)]
+        rows = [headings, ["---"] * len(headings), *lines_of(domain)]
+        table = "\n".join(f"| {' | '.join(row)} |" for row in rows)
+        out.append(f"{name}: {about_of(domain)}\n\n{table}")
+    return "\n\n".join(out)
+
+
+def about_of(domain: Mapping[str, Any]) -> str:
+    """What a domain's figures are of, in a sentence."""
+    return (
+        f"{domain['episodes']} episodes, {domain['successes']} of them successes, against {domain['truth']}"
+        " and true success [95% by resampling episodes]"
+    )
+
+
+def lines_of(domain: Mapping[str, Any]) -> Iterator[list[str]]:
+    """Name, video and figures of every reward, recorded video before generated."""
+    for name, row in domain["rewards"].items():
+        said = "".join(f"; {key} {value}" for key, value in row["facts"].items())
+        for video, found in row["figures"].items():
+            yield [name + said, video, *(cell(found, key) for key, _ in FIGURES)]
+
+
+def _charts(domain: Mapping[str, Any]) -> list[Markup]:
+    """The rewards' progress along each drawn episode, as it was recorded."""
+    out = []
+    for drawn in domain["drawn"]:
+        curves = [Curve(name, list(range(1, len(y) + 1)), y) for name, y in drawn["curves"].items()]
+        title = f"{drawn['outcome']}: {drawn['instruction']}, seed {drawn['seed']}"
+        out.append(line_chart(curves, title, "frame", "progress"))
+    return out

@@ -1,0 +1,416 @@
+"""judge=vlm against a real server that also misbehaves: what is asked, what comes of it, what it costs."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from email.utils import formatdate
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from envs.judges import JudgeError, Judgement
+from envs.judges.vlm import VLMJudge
+from envs.judges.vlm.answers import parse
+from envs.judges.vlm.ledger import _ledger
+from envs.specs import Status
+from envs.targets import ConfigError, build
+from tests.embodiments import ARM_DELTAS, world_spec
+from tests.envs.judges.chat_server import (
+    MODEL,
+    ChatServer,
+    completion,
+    half,
+    hashing,
+    refuse,
+    say,
+    seeing,
+    serving,
+    sleep,
+)
+from tests.moving_square import SIZE, picture
+from tests.sections import merged, section
+
+SPEC = world_spec(ARM_DELTAS.at(SIZE), SIZE)  # two cameras, chunks of four frames
+FIRST = torch.from_numpy(picture(np.zeros(2), 2))
+DONE, FAR = 0.95, 0.2  # places of the square
+Make = Callable[..., VLMJudge]
+
+
+@pytest.fixture
+def server() -> Iterator[ChatServer]:
+    """A server whose model sees the square."""
+    with serving() as chat:
+        yield chat
+
+
+@pytest.fixture
+def options(server: ChatServer, tmp_path: Path) -> dict[str, Any]:
+    """The section judge for that server, in a hurry."""
+    quick = {"cache": str(tmp_path / "cache"), "deadline_s": 20.0, "retries": 2, "pause_s": 0.01}
+    found = section("judge/vlm", chat={"url": server.url, "model": MODEL}, asking=quick, pictures={"side": 0})
+    found.pop("rewards")
+    return found
+
+
+@pytest.fixture
+def make(options: dict[str, Any]) -> Make:
+    """Makes a judge with other options."""
+
+    def judge(**changes: Any) -> VLMJudge:
+        return build(merged(options, changes), "judge", spec=SPEC)  # type: ignore[no-any-return]
+
+    return judge
+
+
+def new_command() -> None:
+    """What a process knows is gone; what lies on disk stays."""
+    _ledger.cache_clear()
+
+
+def clip(*places: float) -> Tensor:
+    """Frames uint8 [1, T, 2, 3, 32, 32] with the square at these places of the diagonal."""
+    return torch.from_numpy(np.stack([picture(np.array([at, at]), 2) for at in places]))[None]
+
+
+def score(judge: VLMJudge, *clips: Tensor) -> Judgement:
+    frames = torch.cat(clips)
+    return judge.score(frames, FIRST.expand(len(frames), -1, -1, -1, -1), ["move the square"] * len(frames))
+
+
+def test_one_chunk_is_one_question_asked_until_the_majority_is_sure(make: Make, server: ChatServer) -> None:
+    said = score(make(pictures={"every": 2}), clip(0.1, 0.3, 0.6, DONE))
+    assert said.success.tolist() == said.progress.tolist() == [[1.0] * 4]
+    assert said.status.tolist() == [Status.OK.value]
+    assert sorted(asked.seed for asked in server.seen) == [0, 1, 2]  # of five votes
+    shown = server.seen[0].pictures
+    assert [picture.shape for picture in shown] == [(32, 68, 3)] * 3  # both cameras of first, second and last
+    for got, frame in zip(shown, (0.0, 0.3, DONE), strict=True):
+        wanted = picture(np.array([frame, frame]), 2)[0].transpose(1, 2, 0)
+        assert np.abs(got[:, :32].astype(int) - wanted).mean() < 4  # JPEG
+    text = server.seen[0].text
+    assert "move the square" in text and "The 2 that follow" in text and "corner, behind" in text
+    assert "Authorization" not in server.seen[0].headers
+
+
+def test_small_pictures_are_enlarged_and_one_camera_needs_no_explanation(
+    make: Make, server: ChatServer
+) -> None:
+    score(make(cameras=["behind"], pictures={"side": 96}), clip(FAR))
+    assert {picture.shape for picture in server.seen[0].pictures} == {(96, 96, 3)}
+    assert "side by side" not in server.seen[0].text
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("Answer: Yes", True),
+        ("It fell.\nanswer: no", False),
+        ("Well.\n\n**Answer: Yes.**\n \n", True),
+        ("**Answer:** No", False),
+        ("Yes", None),
+        ("Answer: Yes, I think", None),
+        ("Answer: Yes\nthough one may doubt it", None),
+        ("Answer: No\nAnswer: Yes", None),
+        ("The answer: yes", None),
+        ("Answer: Maybe", None),
+        ("Answer: Yes or No", None),
+        ("", None),
+    ],
+)
+def test_answers_are_read_strictly(text: str, said: bool | None) -> None:
+    assert parse(text) is said
+
+
+@pytest.mark.parametrize(
+    ("answers", "status", "share", "calls"),
+    [
+        ("YYY", Status.OK, 1.0, 3),
+        ("NYNYN", Status.OK, 0.4, 5),
+        ("?YNYY", Status.OK, 0.75, 5),
+        ("???", Status.ABSTAIN, 0.0, 3),  # no answer can have three of five any more
+        ("?YNYN", Status.ABSTAIN, 0.0, 5),
+    ],
+)
+def test_votes(
+    make: Make, server: ChatServer, answers: str, status: Status, share: float, calls: int
+) -> None:
+    words = {"Y": "Answer: Yes", "N": "Answer: No", "?": "I cannot tell."}
+    server.answer = lambda asked: words[answers[asked.seed]]
+    said = score(make(), clip(FAR))
+    assert said.status.tolist() == [status.value] and len(server.seen) == calls
+    assert said.success.item() == pytest.approx(share)
+
+
+def test_calibration_asks_every_vote_of_every_chunk(make: Make, server: ChatServer) -> None:
+    said = score(make(votes={"calibrate": True}), clip(*[DONE] * 4, 0.9, 0.9, 0.9, 0.9))
+    assert said.status.tolist() == [0] and len(server.seen) == 10
+
+
+def test_whole_episodes_are_judged_chunk_by_chunk_until_they_succeed(make: Make, server: ChatServer) -> None:
+    far = [0.1, 0.2, 0.1, 0.2]
+    won = clip(*far, 0.5, 0.6, 0.7, DONE, 0.5, 0.4, 0.3, 0.3)
+    said = score(make(), won)
+    assert said.success.tolist() == [[0.0] * 4 + [1.0] * 8] and len(server.seen) == 6
+    lost = score(make(hold=5), won)  # one chunk of four does not make five in a row
+    assert lost.success.tolist() == [[0.0] * 4 + [1.0] * 4 + [0.0] * 4] and len(server.seen) == 9
+    padded = torch.cat([won[:, :8], won[:, 7:8].expand(-1, 6, -1, -1, -1, -1)], 1)
+    assert score(make(), padded).success.tolist() == [[0.0] * 4 + [1.0] * 10] and len(server.seen) == 9
+    whole = make(pictures={"span": "clip", "every": 3})
+    assert score(whole, won).success.tolist() == [[0.0] * 12] and len(server.seen[-1].pictures) == 5
+
+
+def test_an_unusable_chunk_spoils_the_episode_as_in_imagination(make: Make, server: ChatServer) -> None:
+    server.answer = lambda asked: "no idea" if asked.pictures[-1][0, 0, 0] > 150 else seeing(asked)
+    black, odd = clip(0.1, 0.2, 0.3, 0.4), clip(0.1, 0.2, 0.1, 0.0)  # the square covers the first pixel
+    said = score(
+        make(), torch.cat([odd, clip(*[DONE - k / 100 for k in range(4)])], 1), torch.cat([black] * 2, 1)
+    )
+    assert said.status.tolist() == [Status.ABSTAIN.value, Status.OK.value]
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        refuse(500),
+        refuse(503),
+        refuse(408),
+        half,
+        say("<html>gateway</html>"),
+        say('{"choices": []}'),
+        say('{"choices": [{"message": null}]}'),
+        say('["not", "an", "object"]'),
+    ],
+    ids=["500", "503", "408", "cut", "html", "no choices", "no message", "list"],
+)
+def test_a_question_that_came_to_nothing_is_asked_again(make: Make, server: ChatServer, fault: Any) -> None:
+    server.faults.extend([fault, fault])
+    judge = make(votes={"count": 1})
+    said = score(judge, clip(DONE))
+    assert said.status.tolist() == [0] and said.success.item() == 1.0 and server.tries == 3
+    assert judge.asker.ledger.counts["unanswered"] == 2
+    server.faults.extend([fault] * 3)
+    lost = score(judge, clip(FAR))
+    assert lost.status.tolist() == [Status.ERROR.value] and lost.success.item() == 0.0
+    assert score(judge, clip(FAR)).status.tolist() == [Status.OK.value]  # errors are not remembered
+
+
+def test_what_the_server_will_never_take_is_not_asked_again(make: Make, server: ChatServer) -> None:
+    server.faults.append(refuse(400, "too many pictures"))
+    assert score(make(votes={"count": 1}), clip(DONE)).status.tolist() == [Status.ERROR.value]
+    assert server.tries == 1
+
+
+def test_a_refusal_without_words_is_an_unusable_answer(make: Make, server: ChatServer) -> None:
+    server.faults.append(
+        say(json.dumps(completion("", (5, 1)) | {"choices": [{"message": {"content": None}}]}))
+    )
+    judge = make(votes={"count": 1})
+    assert score(judge, clip(DONE)).status.tolist() == [Status.ABSTAIN.value]
+    assert judge.asker.ledger.counts["unusable"] == 1
+
+
+@pytest.mark.parametrize("say_when", ["seconds", "date"])
+def test_retry_after_is_waited_for_by_all(make: Make, server: ChatServer, say_when: str) -> None:
+    when = "1" if say_when == "seconds" else formatdate(time.time() + 2, usegmt=True)
+    server.faults.append(refuse(429, **{"Retry-After": when}))
+    began = time.monotonic()
+    said = score(make(votes={"count": 1}), clip(DONE), clip(FAR))
+    assert said.status.tolist() == [0, 0] and time.monotonic() - began > 0.9
+
+
+def test_a_server_that_wants_too_long_a_rest_is_not_waited_for(make: Make, server: ChatServer) -> None:
+    server.faults.append(refuse(429, **{"Retry-After": "86400"}))
+    judge = make(votes={"count": 1}, asking={"stop_after": 1})
+    with pytest.raises(JudgeError, match=r"86400 s, longer than judge\.asking\.longest_pause_s=120"):
+        score(judge, clip(DONE))
+
+
+def test_slow_answers_end_at_the_deadline_even_if_they_trickle(make: Make, server: ChatServer) -> None:
+    judge = make(votes={"count": 1}, asking={"deadline_s": 0.5, "retries": 1})
+    score(judge, clip(0.3))  # the greeting takes no part
+    server.faults.extend([sleep(60.0)] * 2)
+    began = time.monotonic()
+    assert score(judge, clip(DONE)).status.tolist() == [Status.ERROR.value]
+    assert 0.9 < time.monotonic() - began < 20
+
+
+def test_votes_that_are_missing_do_not_count_as_no(make: Make, server: ChatServer) -> None:
+    server.faults.extend([refuse(500)] * 3)
+    judge = make(asking={"retries": 0, "in_flight": 1})
+    assert score(judge, clip(DONE)).status.tolist() == [Status.ERROR.value]  # two of five could still come
+
+
+def test_a_dead_server_stops_the_run(make: Make, server: ChatServer) -> None:
+    judge = make(votes={"count": 1}, asking={"retries": 0, "stop_after": 3, "in_flight": 1})
+    score(judge, clip(0.3))
+    server.faults.extend([refuse(500, "out of memory")] * 20)
+    with pytest.raises(JudgeError, match=r"3 questions in a row .*stop_after=3.* 500: out of memory"):
+        score(judge, *(clip(k / 20) for k in range(8)))
+    assert server.tries == 4
+
+
+@pytest.mark.parametrize(
+    ("chat", "said"),
+    [
+        ({"url": "http://127.0.0.1:9/v1"}, r"judge\.chat\.url=http://127\.0\.0\.1:9/v1: nobody answers"),
+        ({"url": "nonsense"}, r"judge\.chat\.url must be the address"),
+        ({"url": "http://me:secret@127.0.0.1/v1"}, r"without a key in it$"),
+        ({"model": ""}, r"judge\.chat\.model is empty"),
+        ({"model": "tiny-vml"}, r"judge\.chat\.model=tiny-vml is not served by .*did you mean tiny-vlm"),
+        (
+            {"key": "NO_SUCH_KEY"},
+            r"judge\.chat\.key=NO_SUCH_KEY should be the name of an environment variable",
+        ),
+        ({"key": "sk-aBc123"}, r"judge\.chat\.key should be the name"),
+    ],
+)
+def test_what_is_missing_is_told_by_its_key(make: Make, chat: dict[str, Any], said: str) -> None:
+    with pytest.raises((JudgeError, ConfigError), match=said) as told:
+        score(make(chat=chat), clip(DONE))
+    assert "\n" not in str(told.value) and "aBc123" not in str(told.value) and "secret" not in str(told.value)
+
+
+def test_a_wrong_address_and_an_unwelcome_key_stop_the_run_at_once(
+    options: dict[str, Any], make: Make, server: ChatServer
+) -> None:
+    server.faults.append(refuse(404, "no such path"))
+    with pytest.raises(JudgeError, match=r"404: no such path.*judge\.chat\.url"):
+        score(make(), clip(DONE))
+    server.key = "right"
+    with pytest.raises(JudgeError, match=r"401: wrong key: None; judge\.chat\.key=null"):
+        score(make(), clip(DONE))
+
+
+@pytest.mark.parametrize(
+    ("prompt", "said"),
+    [
+        ("nowhere", r"judge\.prompt=nowhere is no text file, and no prompt of that name; there are .*done"),
+        ("Is it done?", r"must say \$instruction, .* found \[\]"),
+        ("$instruction costs 5$", r"found \['\$', '\$instruction'\]"),
+        ("$instruction by $whom", r"found \['\$instruction', '\$whom'\]"),
+    ],
+)
+def test_prompts_are_checked(make: Make, tmp_path: Path, prompt: str, said: str) -> None:
+    path = tmp_path / "prompt.txt"
+    path.write_text(prompt)
+    with pytest.raises(ConfigError, match=said):
+        make(prompt=prompt if prompt == "nowhere" else str(path))
+
+
+def test_questions_are_asked_side_by_side_within_bounds(make: Make, server: ChatServer) -> None:
+    server.think = 0.1
+    score(make(asking={"in_flight": 3}), *(clip(k / 10) for k in range(4)))
+    assert len(server.seen) == 12 and server.most == 3
+
+
+def test_answers_are_remembered_by_content(make: Make, server: ChatServer, tmp_path: Path) -> None:
+    server.answer = hashing
+    chunk = clip(0.1, 0.2, 0.3, 0.4)
+    said = score(make(), chunk, chunk)  # the second is not asked even while the first is under way
+    assert len(server.seen) == (once := len({asked.seed for asked in server.seen}))
+    assert torch.equal(score(make(), chunk).success, said.success[:1]) and len(server.seen) == once
+    path = tmp_path / "prompt.txt"
+    path.write_text("$instruction?")
+    changed = chunk.clone()
+    changed[0, -1, 0, 0, 0, 0] += 1
+    for other, shown in (
+        (make(prompt=str(path)), chunk),
+        (make(chat={"model": "another"}), chunk),
+        (make(chat={"temperature": 0.1}), chunk),
+        (make(), changed),
+    ):
+        before = server.tries
+        score(other, shown)
+        assert server.tries > before
+
+
+def test_a_damaged_answer_is_asked_for_again(make: Make, server: ChatServer, tmp_path: Path) -> None:
+    score(make(), clip(DONE))
+    for path in (tmp_path / "cache" / "answers").rglob("*.json"):
+        path.write_text('{"text": "Answer')
+    assert score(make(), clip(DONE)).status.tolist() == [0] and len(server.seen) == 6
+
+
+@pytest.mark.parametrize("limit", [{"calls": 7}, {"tokens": 700}])
+def test_a_spent_budget_stops_the_run_which_then_goes_on_at_no_cost(
+    make: Make, options: dict[str, Any], server: ChatServer, limit: dict[str, int]
+) -> None:
+    new_command()
+    key = next(iter(limit))
+    episodes = [clip(DONE, k / 10) for k in range(4)]  # of three votes each
+    budget = {**limit, "input_price": 10.0, "output_price": 100.0}
+    with pytest.raises(
+        JudgeError, match=rf"judge\.budget\.{key}={limit[key]} is spent .* same command goes on"
+    ):
+        score(make(budget=budget, asking={"in_flight": 1}), *episodes)
+    assert len(server.seen) == 7
+    with pytest.raises(JudgeError, match="is spent"):  # another judge of the same command
+        score(make(budget=budget), episodes[3])
+    new_command()
+    said = score(make(budget=budget, asking={"in_flight": 1}), *episodes)
+    assert said.status.tolist() == [0] * 4 and len(server.seen) == 12
+    spent = VLMJudge.spent(merged(options, {"budget": budget}))
+    assert spent["calls"] == 12 and spent["prompt_tokens"] == 1200 and spent["completion_tokens"] == 120
+    assert spent["cost"] == pytest.approx(1200 * 10e-6 + 120 * 100e-6)
+
+
+def test_tokens_that_nobody_counts_cannot_be_budgeted(make: Make, server: ChatServer) -> None:
+    server.usage = None
+    with pytest.raises(JudgeError, match=r"judge\.budget\.tokens=50 cannot be kept"):
+        score(make(budget={"tokens": 50}), clip(DONE))
+
+
+def test_the_key_is_sent_and_found_nowhere_else(
+    make: Make,
+    server: ChatServer,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    secret = "sk-very-5ecret"
+    monkeypatch.setenv("VLM_KEY", secret)
+    server.key = secret
+    server.answer = lambda asked: f"You sent {asked.headers['Authorization']}.\nAnswer: Yes"
+    judge = make(chat={"key": "VLM_KEY"}, asking={"retries": 0, "stop_after": 1})
+    told = ""
+    with caplog.at_level(logging.DEBUG):
+        assert score(judge, clip(DONE)).success.item() == 1.0
+        for status in (401, 500):
+            server.faults.extend([refuse(status, f"wrong key: Bearer {secret}")] * 5)
+            with pytest.raises(JudgeError, match=r"wrong key: Bearer \[key\]") as error:
+                score(
+                    make(chat={"key": "VLM_KEY"}, asking={"retries": 0, "stop_after": 1}), clip(status / 1000)
+                )
+            server.faults.clear()
+            told += "".join(traceback.format_exception(error.value)) + repr(error.value)
+    held = (
+        f"{judge!r}{judge.asker.__dict__}{vars(judge.asker.chat)}{judge.state_dict()}{judge.asker.chat.name}"
+    )
+    kept = "".join(path.read_text() for path in (tmp_path / "cache").rglob("*.json"))
+    assert "[key]" in kept
+    assert not [text for text in (told, held, kept, caplog.text) if secret in text]
+
+
+def test_what_it_asks_is_under_way_before_anybody_fetches(make: Make, server: ChatServer) -> None:
+    judge = make()
+    ticket = judge.submit(clip(DONE), FIRST[None], ["move the square"])
+    until = time.monotonic() + 20
+    while len(server.seen) < 3 and time.monotonic() < until:
+        time.sleep(0.01)
+    assert len(server.seen) == 3 and judge.fetch(ticket).success.item() == 1.0
+
+
+def test_it_has_no_weights_and_its_threshold_is_the_majority(make: Make) -> None:
+    judge = make()
+    assert not list(judge.parameters()) and list(judge.state_dict()) == ["threshold"]
+    assert not judge.calibrates and make(votes={"calibrate": True}).calibrates
+    for share, done in ((0.6, True), (0.4, False)):
+        assert judge.episode(torch.tensor([[share]]), torch.tensor([[True]])).tolist() == [done]
