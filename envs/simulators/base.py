@@ -91,7 +91,7 @@ class Simulator(nn.Module):
         Raises:
             ValueError: of an engine that does not denoise in steps.
         """
-        raise ValueError(f"{cls.__name__} does not denoise in steps; choose simulator=dit or gesim")
+        raise ValueError(f"{cls.__name__} does not denoise in steps; choose simulator=dit, forcing or gesim")
 
     @classmethod
     def student_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
@@ -102,7 +102,7 @@ class Simulator(nn.Module):
         """
         raise ValueError(
             f"distill.steps={steps}, but {cls.__name__} does not denoise in steps, so there is nothing to"
-            " distil; set distill.steps=0, or choose simulator=dit or gesim"
+            " distil; set distill.steps=0, or choose simulator=dit, forcing or gesim"
         )
 
     @property

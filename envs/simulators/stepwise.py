@@ -19,6 +19,18 @@ from envs.specs import WorldSpec
 Given = TypeVar("Given")
 
 
+def lost_jumps(sampler: Sampler) -> str:
+    """What a loss that knows nothing of jumps takes from weights that are sampled so; "" for nothing."""
+    if not sampler.jumps:
+        return ""
+    steps = sampler.evaluations
+    return (
+        f"these weights sample in {steps} distilled steps, and flow matching takes that out of them: what"
+        " they learn here is right in many steps, and blurred in few. Distil again"
+        f" (distill.steps={steps}), or sample undistilled"
+    )
+
+
 @runtime_checkable
 class Stepwise(Protocol[Given]):
     """A simulator that can be a teacher, a student, and the critic between them.

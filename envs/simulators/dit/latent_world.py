@@ -19,6 +19,7 @@ from envs.simulators.dit.network import MultiViewDiT
 from envs.simulators.foreground import foreground_weight
 from envs.simulators.inputs import own_frames
 from envs.simulators.samplers import Distilled, Sampler
+from envs.simulators.stepwise import lost_jumps
 from envs.simulators.tokenizers.autoencoder import STRIDE, Codec
 from envs.specs import WorldSpec
 
@@ -148,14 +149,8 @@ class LatentWorld(Simulator):
 
     @property
     def lost_in_training(self) -> str:
-        """See Simulator: flow matching knows nothing of jumps."""
-        if not self.sampler.jumps:
-            return ""
-        return (
-            f"these weights sample in {self.sampler.evaluations} distilled steps, and flow matching takes"
-            " that out of them: what they learn here is right in many steps, and blurred in few. Distil again"
-            f" (distill.steps={self.sampler.evaluations}), or sample undistilled"
-        )
+        """See Simulator."""
+        return lost_jumps(self.sampler)
 
     # -- in steps
     @property

@@ -8,7 +8,6 @@ their h actions, which are denoised at once; then the window moves by h.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import torch
@@ -17,13 +16,14 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.conditioning import Pace, render_ray_map
-from envs.ranges import Count, NonNegative, Share
+from envs.ranges import Count
 from envs.simulators import memory
-from envs.simulators.base import Simulator, noise_generator, to_bytes
+from envs.simulators.base import to_bytes
 from envs.simulators.dit.latent_world import unit
+from envs.simulators.forcing.blocks import Blockwise, Denoising, wide
 from envs.simulators.forcing.network import ForcingDiT, Known, Trunk
 from envs.simulators.forcing.prediction import Prediction
-from envs.simulators.forcing.schedule import DDIM, Sigmoid
+from envs.simulators.forcing.schedule import Sigmoid
 from envs.simulators.foreground import foreground_weight
 from envs.simulators.tokenizers.autoencoder import STRIDE, Autoencoder
 from envs.specs import WorldSpec
@@ -32,28 +32,7 @@ from envs.targets import OptionsOf, build, options
 _ENCODED = 512  # pictures encoded at a time
 
 
-@dataclass(frozen=True)
-class Denoising:
-    """How it is trained and sampled.
-
-    Args:
-        steps: DDIM steps per block.
-        stabilisation: time on the schedule, 0..1, that context frames are said to stand at. They are shown as
-            they are: a network that took its own frames for clean would trust their errors.
-        as_sampled: chance that a clip of training has the levels of sampling (context as above, all newer
-            frames at one level) instead of independent ones.
-        foreground: extra loss weight of what differs from the picture's median colour.
-        schedule: options of Sigmoid.
-    """
-
-    steps: Count
-    stabilisation: Share
-    as_sampled: Share
-    foreground: NonNegative
-    schedule: Annotated[Mapping[str, Any], OptionsOf(Sigmoid)]
-
-
-class ForcingSimulator(Simulator):
+class ForcingSimulator(Blockwise):
     """Blockwise-autoregressive diffusion transformer; see the module's docstring.
 
     Args:
@@ -151,40 +130,6 @@ class ForcingSimulator(Simulator):
             features.append(seen)
         return latents[:, before:], torch.cat(features, 1).flatten(1)
 
-    def _block(self, context: Tensor, noise: Tensor, beside: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """Frames [B, n, V, C, h, w] after those of the context [B, c, V, C, h, w], and their features.
-
-        Nothing in frames of the past depends on newer ones: they are read once, and not at every step.
-
-        Args:
-            noise: like the frames.
-            beside: channels [B, c + n, V, C', h, w] and action vectors [B, c + n, size].
-        """
-        past, kept = context.shape[1], list[Tensor]()
-        stable = float(self.schedule.level(torch.tensor(self.denoising.stabilisation)))
-        old = torch.full(context.shape[:2], stable, device=context.device)
-        _, _, known = self._run(context, old, (beside[0][:, :past], beside[1][:, :past]))
-        ahead = (beside[0][:, past:], beside[1][:, past:])
-
-        def velocity(z: Tensor, level: float) -> Tensor:
-            levels = torch.full(z.shape[:2], level, device=z.device)
-            base = self._base(torch.cat([context, z], 1), torch.cat([old, levels], 1))
-            base = None if base is None else base[:, past:]
-            output, features, _ = self._run(z, levels, ahead, base, known)
-            kept[:] = [features]
-            return (z - self.prediction.clean(output, z, _wide(levels), base)) / level
-
-        made = DDIM(self.schedule.levels(self.denoising.steps))(velocity, noise)
-        return made, kept[0]
-
-    def _noise(self, seed: Tensor, chunk_index: Tensor, like: Tensor) -> Tensor:
-        """Noise [B, K, V, C, h, w], row by row from its own generator, the same in any batch."""
-        shape = (self.spec.chunk, *like.shape[2:])
-        pairs = zip(seed.tolist(), chunk_index.tolist(), strict=True)
-        return torch.stack([torch.randn(shape, generator=noise_generator(*pair)) for pair in pairs]).to(
-            like.device
-        )
-
     # -- training
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of every frame that has one before it; memory and all chunks of the clip are one window."""
@@ -194,10 +139,10 @@ class ForcingSimulator(Simulator):
         clean = self._encode(truth)
         level = self._levels(clean.shape[:2], first["index"].shape[1], generator).to(clean.device)
         noise = torch.randn(clean.shape, generator=generator).to(clean.device)
-        z = (1 - _wide(level)) * clean + _wide(level) * noise
+        z = (1 - wide(level)) * clean + wide(level) * noise
         base = self._base(z, level)
         output, _, _ = self._run(z, level, self._beside(frames, slice(None), clip), base)
-        error = self.prediction.error(output, (clean, noise), _wide(level), base)
+        error = self.prediction.error(output, (clean, noise), wide(level), base)
         repeats = first["index"].diff(dim=1, prepend=first["index"][:, :1]) == 0  # the first frame as well
         weight = self._weight(truth, torch.cat([~repeats, clip["future", "valid"].bool()], 1))
         return (error.square() * weight).sum() / (weight.sum() * clean.shape[3]).clamp(min=1), {}
@@ -258,9 +203,6 @@ class ForcingSimulator(Simulator):
             channels.append(rays.transpose(1, 2))
         return torch.cat(channels, 3), vectors
 
-    def _base(self, z: Tensor, level: Tensor) -> Tensor | None:
-        return self.prediction.base(z, _wide(level))
-
     def _run(
         self,
         z: Tensor,
@@ -270,12 +212,7 @@ class ForcingSimulator(Simulator):
         known: list[Known] | None = None,
     ) -> tuple[Tensor, Tensor, list[Known]]:
         """One pass of the network over frames z [B, T, V, C, h, w] at levels [B, T]; see ForcingDiT."""
-        shown = z / ((1 - _wide(level)).square() + _wide(level).square()).sqrt()  # of unit variance
+        shown = z / ((1 - wide(level)).square() + wide(level).square()).sqrt()  # of unit variance
         base = self._base(z, level) if base is None else base
         parts = [shown, beside[0]] if base is None else [shown, base, beside[0]]
         return self.net(torch.cat(parts, 3), level, beside[1], known)
-
-
-def _wide(level: Tensor) -> Tensor:
-    """Levels [B, T] as [B, T, 1, 1, 1, 1]."""
-    return level[..., None, None, None, None]

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -57,6 +58,12 @@ class DDIM:
     """
 
     levels: Sequence[float]
+    jumps: ClassVar[bool] = False
+
+    @property
+    def evaluations(self) -> int:
+        """See Sampler."""
+        return len(self.levels) - 1
 
     def __call__(self, velocity: Velocity, noise: Tensor) -> Tensor:
         """Data like `noise`; `velocity` is called with z and its level."""

@@ -63,7 +63,7 @@ def check_pair(teacher: Simulator, student: Simulator) -> None:
         if not isinstance(world, Stepwise):
             raise ValueError(
                 f"the {role}, {type(world).__name__}, does not denoise in steps; set distill.steps=0, or"
-                " choose simulator=dit or gesim"
+                " choose simulator=dit, forcing or gesim"
             )
     assert isinstance(teacher, Stepwise) and isinstance(student, Stepwise)
     pairs = {
@@ -82,12 +82,12 @@ def check_pair(teacher: Simulator, student: Simulator) -> None:
         )
     if not student.sampler.jumps:
         raise ValueError(
-            "a student samples in distilled steps; set simulator.denoising.sampler=distilled (dit) or"
-            " simulator.sampling.kind=distilled (gesim)"
+            "a student samples in distilled steps; set simulator.denoising.sampler=distilled (dit, forcing)"
+            " or simulator.sampling.kind=distilled (gesim)"
         )
     many, few = teacher.sampler.evaluations, student.sampler.evaluations
     if few > many:
         raise ValueError(
             f"distill.steps={few} are more than the teacher's {many}; lower distill.steps, or raise"
-            " simulator.denoising.steps (dit) or simulator.sampling.steps (gesim)"
+            " simulator.denoising.steps (dit, forcing) or simulator.sampling.steps (gesim)"
         )
