@@ -100,7 +100,7 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
     return graph, rows
 
 
-@stage(reads=("seed", *TASK, "simulator", "measure.speed_chunks"), place=Place.EVALUATOR)
+@stage(reads=("seed", "threads", *TASK, "simulator", "measure.speed_chunks"), place=Place.EVALUATOR)
 def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Speed, and errors of held-out episodes: chunk by chunk from true frames, and rolled out as a whole."""
     prepare_process(cfg["seed"], cfg["threads"])

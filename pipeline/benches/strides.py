@@ -66,7 +66,7 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[int, st
     return graph, {n: graph.add(f"stride-{n}", measure, roles, stride=n, common=numbers[-1]) for n in numbers}
 
 
-@stage(reads=("seed", *TASK, "simulator"), place=Place.EVALUATOR)
+@stage(reads=("seed", "threads", *TASK, "simulator"), place=Place.EVALUATOR)
 def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Rollouts of held-out episodes.
 
