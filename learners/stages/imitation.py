@@ -60,6 +60,7 @@ class Cloning:
         self.rows = rows[store.arrays["present"][rows]]
         self.targets = chunks_ahead(store, self.rows, mode)
         self.states = store.arrays["states"][self.rows]
+        self.commands = store.arrays["commands"][self.rows]
         self.state_noise = _STATE_NOISE * self.states.std(0)
         self._features: Tensor | None = None
 
@@ -145,7 +146,7 @@ def train_imitation(
     """
     policy = cloning.policy
     if fresh and hasattr(policy, "normalise"):
-        policy.normalise(cloning.targets, cloning.states)
+        policy.normalise(cloning.targets, cloning.states, cloning.commands)
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         return cloning.loss(data, generator), {}
