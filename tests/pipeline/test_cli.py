@@ -89,6 +89,11 @@ def test_every_command_explains_itself_at_once_and_starts_nothing() -> None:
     for name in ("run", "chaos", "convert"):
         out = worldloop(name, "--help")
         assert out.returncode == 0 and out.stdout.startswith(f"worldloop {name} "), out
+    assert "[key=value ...]" in worldloop("run", "--help").stdout
+    for words in (("convert", "--help"), ("help", "convert")):  # whose words are none of configs/
+        usage, _, rest = worldloop(*words).stdout.partition("\n")
+        assert usage == "worldloop convert SRC DST [frames=N] [size=[H,W]]" and "configs/" not in rest
+    assert max(map(len, worldloop("--help").stdout.splitlines())) <= 100
     assert all(command.__doc__ for command in COMMANDS.values())
     assert worldloop("--version").stdout.startswith("worldloop 0.")
 
