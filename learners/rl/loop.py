@@ -1,7 +1,7 @@
 """The reinforcement-learning loop: collect whole episodes, let an algorithm turn them into updates, watch for
 trouble.
 
-Rollouts come from a fleet (actors/fleets/fleet.py): this process or any number of Ray actors, in any world of this
+Rollouts come from a fleet (actors/fleets): this process or any number of Ray actors, in any world of this
 project; update.py learns from them. Every iteration starts fresh episodes and draws its randomness from
 (seed, iteration), so a run resumed from its checkpoint repeats what it would have done, and so do any number
 of actors. Of several workers that learn together (parallel.py), the first one has the fleet and shows the
