@@ -24,10 +24,7 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
     Raises:
         ConfigError: for unknown keys or choices and values that cannot work, naming the nearest fix.
     """
-    try:
-        cfg = composed(overrides)
-    except Exception as error:  # for simulator=null and the like Hydra raises a bare ValueError
-        raise ConfigError(_unknown_key(overrides) or _unreadable(overrides, error)) from error
+    cfg = read_config(overrides)
     from pipeline.checks import faults  # needs torch, which an unknown key should not wait for
 
     if wrong := faults(cfg):
@@ -35,19 +32,34 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
     return cfg
 
 
+def read_config(overrides: Sequence[str]) -> dict[str, Any]:
+    """The resolved config, whose values nobody has looked at.
+
+    Raises:
+        ConfigError: for unknown keys or choices, naming the nearest fix.
+    """
+    try:
+        return composed(overrides)
+    except Exception as error:  # for simulator=null and the like Hydra raises a bare ValueError
+        raise ConfigError(_unknown_key(overrides) or _unreadable(overrides, error)) from error
+
+
 def groups() -> list[str]:
     """Names of the folders of choices."""
     return sorted(p.name for p in CONFIGS.iterdir() if p.is_dir() and not p.name.startswith("_"))
 
 
-def choices(group: str) -> list[str]:
-    """What can be chosen for a group, such as policy."""
-    return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
+def choices(group: str, overrides: Sequence[str] = ()) -> list[str]:
+    """What can be chosen for a group, such as policy: in configs/, and in folders that
+    hydra.searchpath=[file://FOLDER] among the overrides names.
+    """
+    folders = [CONFIGS, *_searched(overrides)]
+    return sorted({path.stem for folder in folders for path in (folder / group).glob("*.yaml")})
 
 
 def offered(group: str, choice: str, overrides: Sequence[str]) -> bool:
-    """Whether a group has a choice: in configs/, or in a folder that hydra.searchpath names."""
-    if choice in choices(group):
+    """Whether a group has a choice: in configs/, or in a folder or package that hydra.searchpath names."""
+    if choice in choices(group, overrides):
         return True
     elsewhere = [word for word in overrides if word.startswith("hydra.searchpath=")]
     try:
@@ -62,6 +74,13 @@ def composed(overrides: Sequence[str]) -> dict[str, Any]:
         plain = OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
     assert isinstance(plain, dict)
     return {str(key): value for key, value in plain.items()}
+
+
+def _searched(overrides: Sequence[str]) -> list[Path]:
+    """Folders with choices of somebody's own."""
+    values = [word.partition("=")[2] for word in overrides if word.startswith("hydra.searchpath=")]
+    names = [part.strip(" '\"") for value in values for part in value.strip("[]").split(",")]
+    return [Path(name.removeprefix("file://")) for name in names if name.startswith("file://")]
 
 
 def _unknown_key(overrides: Sequence[str]) -> str:

@@ -183,17 +183,19 @@ def tasks(words: Words) -> None:
     """list what can be tried in physics: suites, robots, tasks, scenes; of one all, and its pictures into a
     folder: worldloop tasks task=metaworld [pictures=FOLDER]
     """
-    from pipeline.commands.tasks import table
+    from pipeline.commands.tasks import chosen_tasks, table
 
-    own = {key: value for key, _, value in (word.partition("=") for word in words)}
-    if set(own) - {"task", "pictures"} or ("pictures" in own and not own.get("task")):
-        raise ConfigError("say worldloop tasks, or worldloop tasks task=metaworld [pictures=FOLDER]")
-    print(table(own.get("task", "")))
-    if own.get("pictures"):
+    wanted = [word.partition("=")[2] for word in words if word.startswith("pictures=")]
+    found = chosen_tasks([word for word in words if not word.startswith("pictures=")])
+    if wanted and len(found) > 1:
+        raise ConfigError("say of which task: worldloop tasks task=metaworld pictures=FOLDER")
+    print(table(found))
+    if wanted:
         from pipeline.commands.task_pictures import draw  # loads torch
 
-        for path in draw(own["task"], Path(own["pictures"])):
-            print(path)
+        for choice, task in found.items():
+            for path in draw(choice, task, Path(wanted[-1])):
+                print(path)
 
 
 def config(words: Words) -> None:
