@@ -51,6 +51,8 @@ class GoldenGoalJudge(GoalJudge):
         cache: goals remembered.
     """
 
+    needs_labels = True
+
     def __init__(
         self,
         spec: WorldSpec,

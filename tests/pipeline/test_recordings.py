@@ -19,7 +19,7 @@ from envs.targets import ConfigError
 from pipeline.commands.finetune import build_finetune
 from pipeline.config import load_config
 from pipeline.graph.graph import Graph
-from pipeline.loop import build_loop
+from pipeline.loop import build_loop, check_labels
 from tests.envs.episodes.lerobot_sets import SETS, write_set
 
 
@@ -138,3 +138,14 @@ def test_a_set_without_labels_teaches_no_judge(tmp_path: Path) -> None:
     cfg = config(tmp_path, "so101", *smoke("simulator_fit.first"))
     with pytest.raises(ConfigError, match=r"no training episode of the data says; record next\.success"):
         build_loop(cfg, tmp_path / "smoke").run(until="judge-1")
+
+
+def test_missing_labels_are_told_before_anything_runs(tmp_path: Path) -> None:
+    cfg, other = config(tmp_path, "so101"), config(tmp_path / "other", "labelled")
+    graph = build_loop(cfg, tmp_path / "smoke")
+    with pytest.raises(ConfigError, match=r"record next\.success, or choose a judge that needs none"):
+        check_labels(cfg, graph)
+    check_labels(cfg, graph, "simulator-1")  # which asks for none
+    check_labels(other, build_loop(other, tmp_path / "other/smoke"))
+    order = list(graph.nodes)
+    assert order.index("imitation") < order.index("simulator-1")  # missing demonstrations are told early, too
