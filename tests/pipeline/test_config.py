@@ -41,6 +41,12 @@ from pipeline.loop import build_loop
         (["policy.head.std=wide"], r"policy\.head\.std='wide' should be a valid number"),
         (["judge._target_=judges.Mine"], r"judge\._target_=judges\.Mine does not import"),
         (["algorithm=grpo", "rl.envs=40"], r"algorithm\.group"),
+        (
+            ["algorithm=grpo", "judge.rewards.progress=0"],
+            r"rl\.chunks=2 cuts episodes short.*rl\.chunks=null",
+        ),
+        (["rl.rewards_later=true"], r"rl\.rewards_later=true, but algorithm=ppo"),
+        (["rl.schedule=async", "rl.queue=2"], r"rl\.queue=2 must hold at least the rl\.shards=4"),
         (["imitation.fit.batch=7", "microbatches=2"], r"imitation\.fit: batch=7 must be a multiple of micro"),
         (["collect.noise_level=[0.6,0.1]"], r"collect\.noise_level"),
         (["simulator=null"], r"simulator=null cannot be read"),
