@@ -46,6 +46,7 @@ def play(words: Words) -> None:
     from actors.serving.sessions import ServeConfig
     from envs.targets import options
     from pipeline.commands.play import build_game, learned_world
+    from pipeline.config import load_config
 
     chosen = [word.removeprefix("actions=") for word in words if word.startswith("actions=")]
     words = [word for word in words if not word.startswith("actions=")]
@@ -53,8 +54,9 @@ def play(words: Words) -> None:
     world = learned_world(cfg, root)
     if not world and (root / "stages").is_dir():
         print(f"{root} holds no world of these options and this code yet (`worldloop stages` says why)")
-    if not world and cfg["task"]["suite"]:  # nothing asks for small pictures
-        cfg, root = prepared([*words, *without_given([_LARGE], words)])
+    larger = [*words, *without_given([_LARGE], words)]
+    if not world and load_config(larger)["task"]["suite"] != cfg["task"]["suite"]:
+        cfg, root = prepared(larger)  # nothing asks for small pictures, and the suite can do otherwise
     config = options(ServeConfig, cfg["serve"], "serve")
     with listening(config) as server:
         sides = " and ".join([*["physics"] * bool(cfg["task"]["suite"]), *["imagination"] * bool(world)])

@@ -150,6 +150,7 @@ def test_drawn_overrides_are_understood_or_refused(seed: int) -> None:
         ("cameras=[hed]", r"^cameras=\['hed'\] must be some of"),
         ("policy.cameras=[hed]", r"policy\.cameras=\['hed'\] must be some of .*head"),
         ("judge.cameras=most", r"judge\.cameras='most' must be all, main or"),
+        ("task.suite.size=[32,48]", r"task\.size=\[64, 64\], but the suite renders \[\[32, 48\]\]"),
     ],
 )
 def test_what_the_robot_has_not_is_told_before_any_work(word: str, said: str) -> None:
