@@ -14,6 +14,7 @@ from pipeline.evaluation.by_task import by_scene, by_task, scenes_of_seeds, task
 from pipeline.evaluation.statistics import mcnemar, rate, rate_entry
 from pipeline.graph.stage import Inputs
 
+_BLIND = 0.3  # imagined minus true success from which on imagination says nothing of the truth
 _ENTRY = ("successes", "episodes", "low", "high")
 
 
@@ -122,6 +123,13 @@ def _why(result: Mapping[str, Any], points: float, imagined: float) -> str:
             f"imagined success rose by {imagined:.0f} points and true success did not follow: the policy"
             f" exploits the simulator (gap in the last round {100 * gap:+.0f} points); deploy more episodes"
             " per round"
+        )
+    if gap > _BLIND:
+        true, said = (100 * rate(result["rounds"][-1][key]) for key in ("true", "imagined"))
+        return (
+            f"the imagined world is no guide: in the last round it says {said:.0f}% of a policy that succeeds"
+            f" in {true:.0f}%, so RL has little to learn from; see by `worldloop trust` and the judge's table"
+            " whether simulator or judge mistakes failures for successes, and train it longer"
         )
     alarms = [text for text in result["alarms"] if text.startswith("rl-")]
     if imagined > -2 and alarms:

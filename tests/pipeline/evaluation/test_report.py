@@ -99,6 +99,9 @@ def test_the_verdict_can_say_no_and_why() -> None:
     assert "chance" in near and "exploits" not in near
     flat = verdict(result(physics_after=entry(39), imagined_after=entry(40), **small))
     assert "iterations" in flat
+    blind = [{"round": 1, "true": entry(0), "imagined": entry(100), "gap": 1.0}]
+    useless = verdict(result(physics_after=entry(40), imagined_after=entry(40), rounds=blind, **small))
+    assert "it says 100% of a policy that succeeds in 0%" in useless and "iterations" not in useless
     alarms = ["tokenizer: collapsed", "rl-2: no reward variance"]
     alarmed = verdict(result(physics_after=entry(39), imagined_after=entry(40), alarms=alarms, **small))
     assert "even imagined success; rl-2: no reward variance" in alarmed
