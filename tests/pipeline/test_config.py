@@ -25,6 +25,8 @@ from pipeline.loop import build_loop
         (["rl.learningrate=1"], r"rl\.learningrate is not a key"),
         (["rl.minibach=1"], r"did you mean rl\.minibatch"),
         (["simulater=dit"], "simulator"),
+        (["simulator.sampling.kind=edm"], r"no key of the simulator that is chosen, but of simulator=gesim"),
+        (["seed=1,2"], r"seed=1,2 names several values.*seed=\[1,2\], or run each"),
         (["simulator=gan"], "gan"),
         (["task.horizon=41"], r"task\.horizon"),
         (["task.mode=sideways"], r"task\.mode"),
