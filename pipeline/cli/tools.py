@@ -93,9 +93,9 @@ def inspect(words: Words) -> None:
 
 
 def bench(words: Words) -> None:
-    """measure performance: worldloop bench
-    conditioning|collection|experts|world|actors|learning|serving|gesim|size|distil|strides|overfit|pretrained;
-    of serving also for how long: worldloop bench serving seconds=7200
+    """measure performance: worldloop bench NAME; names are conditioning, collection, experts, world, actors,
+    learning, serving, gesim, size, distil, strides, overfit and pretrained; of serving also for how long:
+    worldloop bench serving seconds=7200
     """
     from pipeline.benches.bench import run_bench
 

@@ -109,14 +109,15 @@ def inspect(
     sizes, and no size is asked for, all take the main camera's.
     """
     target.mkdir(parents=True, exist_ok=True)
-    made = []
+    made, said = [], set[str]()
     cut = cut if cut.size else replace(cut, size=_common_size(source))
     for number, episode in enumerate(islice(read_any(source, cut), episodes)):
         shown = np.flatnonzero(episode.present)
         shown = shown[np.linspace(0, len(shown) - 1, min(rows, len(shown))).round().astype(int)]
         part, bare = episode.take(shown), why_bare(episode)
-        if bare:
-            tqdm.write(f"{source.name}, episode {number}: {bare}")
+        if bare and bare not in said:
+            tqdm.write(f"{source.name}, from episode {number} on: {bare}")
+            said.add(bare)
         maps = np.full_like(part.frames, CANVAS) if bare else _pose_maps(part, style)
         sheet = np.concatenate(
             [
