@@ -131,6 +131,12 @@ def _why(result: Mapping[str, Any], points: float, imagined: float) -> str:
             f" in {true:.0f}%, so RL has little to learn from; see by `worldloop trust` and the judge's table"
             " whether simulator or judge mistakes failures for successes, and train it longer"
         )
+    tried = ("physics_before", "physics_after", "imagined_before", "imagined_after")
+    if not any(result[key]["successes"] for key in tried):
+        return (
+            "no policy succeeded even once, in truth or in imagination, so RL had nothing to go on; give"
+            " imitation more demonstrations (imitation.demos) or steps (imitation.fit.steps)"
+        )
     alarms = [text for text in result["alarms"] if text.startswith("rl-")]
     if imagined > -2 and alarms:
         return f"RL did not improve even imagined success; {alarms[0]}"

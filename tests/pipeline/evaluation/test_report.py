@@ -102,6 +102,8 @@ def test_the_verdict_can_say_no_and_why() -> None:
     blind = [{"round": 1, "true": entry(0), "imagined": entry(100), "gap": 1.0}]
     useless = verdict(result(physics_after=entry(40), imagined_after=entry(40), rounds=blind, **small))
     assert "it says 100% of a policy that succeeds in 0%" in useless and "iterations" not in useless
+    none = dict.fromkeys(("physics_before", "physics_after", "imagined_before", "imagined_after"), entry(0))
+    assert "more demonstrations" in verdict(result(**none, **small))
     alarms = ["tokenizer: collapsed", "rl-2: no reward variance"]
     alarmed = verdict(result(physics_after=entry(39), imagined_after=entry(40), alarms=alarms, **small))
     assert "even imagined success; rl-2: no reward variance" in alarmed
