@@ -109,7 +109,8 @@ def inspect(
     sizes, and no size is asked for, all take the main camera's.
     """
     target.mkdir(parents=True, exist_ok=True)
-    made, said = [], set[str]()
+    made: list[Path] = []
+    said: set[str] = set()
     cut = cut if cut.size else replace(cut, size=_common_size(source))
     for number, episode in enumerate(islice(read_any(source, cut), episodes)):
         shown = np.flatnonzero(episode.present)
