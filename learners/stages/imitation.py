@@ -25,6 +25,7 @@ from envs.specs import (
     ActionMode,
     to_chunk,
 )
+from envs.targets import ConfigError
 from learners.stages.observed import observe
 from learners.stages.pictures import augment
 from learners.stages.simulator import last_rows
@@ -68,10 +69,10 @@ class Cloning:
         """Compute the policy's visual features of every frame once, for a policy whose perception is frozen.
 
         Raises:
-            ValueError: if the policy writes no ("policy", "visual_features").
+            ConfigError: if the policy writes no ("policy", "visual_features").
         """
         if VISUAL_FEATURES not in self.policy.out_keys:
-            raise ValueError(
+            raise ConfigError(
                 f"{type(self.policy).__name__} writes no {VISUAL_FEATURES}; set rl.freeze_perception=false"
             )
         encoder = feature_part(self.policy)

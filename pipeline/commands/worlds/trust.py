@@ -83,8 +83,8 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
     return _table(rows, compared, futures)
 
 
-def _table(rows: list[dict[str, list[float]]], moments: int, futures: int) -> str:
-    """Markdown."""
+def _table(rows: list[dict[str, list[float | None]]], moments: int, futures: int) -> str:
+    """Markdown; "-" where all futures of each moment are alike."""
     lines = [
         f"Correlations among {futures} futures of each of {moments} moments [95% interval]",
         "",
@@ -92,6 +92,6 @@ def _table(rows: list[dict[str, list[float]]], moments: int, futures: int) -> st
         "| --- | --- | --- | --- |",
     ]
     for number, row in enumerate(rows, 1):
-        cells = [f"{value:.2f} [{low:.2f}, {high:.2f}]" for value, low, high in row.values()]
+        cells = ["-" if None in row[name] else "{:.2f} [{:.2f}, {:.2f}]".format(*row[name]) for name in row]
         lines.append(f"| {number} | {' | '.join(cells)} |")
     return "\n".join(lines)
