@@ -92,6 +92,11 @@ def _table(rows: list[dict[str, list[float | None]]], moments: int, futures: int
         "| --- | --- | --- | --- |",
     ]
     for number, row in enumerate(rows, 1):
-        cells = ["-" if None in row[name] else "{:.2f} [{:.2f}, {:.2f}]".format(*row[name]) for name in row]
+        cells = [_interval(values) for values in row.values()]
         lines.append(f"| {number} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _interval(values: list[float | None]) -> str:
+    numbers = [value for value in values if value is not None]
+    return "{:.2f} [{:.2f}, {:.2f}]".format(*numbers) if len(numbers) == len(values) else "-"
