@@ -37,14 +37,16 @@ _MODULE = "pipeline.evaluation.ewmbench.samples"
 _SHORTEST = 4  # frames of an episode: the first is given, and accelerations need three
 NO_MODEL = (
     "No semantics (BLEU, steps, logic): no vision-language model is configured; say judge=vlm or"
-    " judge=vlm_local,"
-    " as docs/own_judge.md tells."
+    " judge=vlm_local, as docs/own_judge.md tells."
 )
 PARITY = (
-    "Strict parity: figures repeat quirks of the public code (one arm alone, pictures' width and height"
-    " both 1,"
-    " nothing for a perfect match of dynamics). It averages over all samples: compare it with the row of"
+    "Strict parity: figures repeat quirks of the public code (one arm alone, pictures' width and height both"
+    " 1, nothing for a perfect match of dynamics). It averages over all samples: compare it with the row of"
     " means."
+)
+ALIKE = (
+    "All samples of each episode came out alike: this simulator draws nothing, so the best of them is any, and"
+    " there is no diversity."
 )
 
 
@@ -106,7 +108,6 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
     except EmbodimentError as error:
         notes.append(f"No trajectories (SA, TA, DYN): {error}.")
     chosen = bench_set(cfg, store, held, ruler)
-    simulator = subject.simulator()
     instruments = Instruments(
         extractors.patches,
         extractors.frames,
@@ -116,20 +117,10 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
         reader,
         section["strict_parity"],
     )
-    looked = {
-        "data": [
-            [str(folder), len(part.frames)] for folder, part in zip(subject.data, store.parts, strict=True)
-        ],
-        "size": list(store.spec.size),
-        "extractors": [extractors.patches.name, extractors.frames.name, list(instruments.views)],
-        "detector": None if ruler is None else ruler.identity,
-        "reader": None if reader is None else reader.identity,
-        "strict_parity": section["strict_parity"],
-        "code": code_of(_MODULE, {name: section[name] for name in ("patches", "frames")}),
-    }
+    looked = _identity(section, subject, store, instruments, ruler)
     world = {**looked, "world": subject.identity("simulator"), "engine": code_of(_MODULE, cfg["simulator"])}
     samples = Samples(
-        simulator,
+        subject.simulator(),
         store,
         instruments,
         Records(root / "ewmbench/samples", world),
@@ -145,6 +136,7 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
         extractors.texts,
         () if reader is None else reader.errors,
     )
+    tasks = tasks_of_episodes(cfg, store, chosen.episodes)
     rows = [
         {
             "episode": number,
@@ -152,19 +144,13 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
             "instruction": store.instructions[number],
             **scoring.episode(made[number], true[number], store.instructions[number]),
         }
-        for number, task in zip(
-            chosen.episodes.tolist(), tasks_of_episodes(cfg, store, chosen.episodes), strict=True
-        )
+        for number, task in zip(chosen.episodes.tolist(), tasks, strict=True)
     ]
     notes += [NO_MODEL] * (reader is None) + [PARITY] * section["strict_parity"]
     if reader is not None and (lost := sum(not one.whole for one in _records(true, made))):
         notes.append(f"Of {lost} videos the model answered not everything; what is missing counts nowhere.")
     if section["samples"] > 1 and alike([made[row["episode"]] for row in rows]):
-        notes.append(
-            "All samples of each episode came out alike: this simulator draws nothing, so the best of them"
-            " is any,"
-            " and there is no diversity."
-        )
+        notes.append(ALIKE)
     result = {
         **subject.about(),
         "task": cfg["task"]["name"],
@@ -199,15 +185,33 @@ def reader_of(cfg: Mapping[str, Any]) -> Reader | None:
 
 
 def bench_set(cfg: Mapping[str, Any], store: ClipStore, held: Tensor, ruler: GripperRuler | None) -> BenchSet:
-    """The set out of held-out episodes int64 [N]: by trajectories in space, else in pictures, else evenly
-    spread.
-    """
+    """The set out of held-out episodes int64 [N], by paths in space, else in pictures, else by none."""
     section = cfg["ewmbench"]
     try:
         paths = in_space(store, known_ends(cfg, store), held)
     except EmbodimentError:
         paths = None if ruler is None else in_pictures(store, ruler, held)
     return choose(held, tasks_of_episodes(cfg, store, held), section["episodes"], section["voxel"], paths)
+
+
+def _identity(
+    section: Mapping[str, Any],
+    subject: Subject,
+    store: ClipStore,
+    instruments: Instruments,
+    ruler: GripperRuler | None,
+) -> dict[str, Any]:
+    """What measurements of recorded videos depend on."""
+    sizes = {str(folder): len(part.frames) for folder, part in zip(subject.data, store.parts, strict=True)}
+    return {
+        "data": sizes,
+        "size": list(store.spec.size),
+        "extractors": [instruments.patches.name, instruments.frames.name, list(instruments.views)],
+        "detector": None if ruler is None else ruler.identity,
+        "reader": None if instruments.reader is None else instruments.reader.identity,
+        "strict_parity": instruments.strict_parity,
+        "code": code_of(_MODULE, {name: section[name] for name in ("patches", "frames")}),
+    }
 
 
 def measured(

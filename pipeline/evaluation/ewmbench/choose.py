@@ -1,6 +1,4 @@
-"""Which held-out episodes make up the benchmark's set: of each task those whose trajectories overlap
-least.
-"""
+"""Which held-out episodes make up the benchmark's set: those of each task that overlap least."""
 
 from __future__ import annotations
 

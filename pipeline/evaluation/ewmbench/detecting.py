@@ -204,9 +204,8 @@ def detector_error(detector: GripperDetector, sights: Sights, episodes: Tensor) 
 
     Returns:
         For each camera, by name: px (median and 90th percentile of the distance to the projected end
-            effector),
-        missed (share of end effectors in the picture that it calls nowhere) and imagined (share of those
-        outside that it finds; None where none is outside), frames.
+        effector; None where none was found), missed (share of end effectors in the picture that it calls
+        nowhere), imagined (share of those outside that it finds; None where none is outside) and frames.
     """
     store = sights.store
     rows, owner = store.rows(episodes), torch.repeat_interleave(episodes, store.length[episodes])
@@ -221,8 +220,9 @@ def detector_error(detector: GripperDetector, sights: Sights, episodes: Tensor) 
     for n, view in enumerate(sights.views):
         there = torch.isfinite(wanted[:, n]).all(-1)
         seen = torch.isfinite(found[:, n]).all(-1)
+        off = (found[:, n] - wanted[:, n]).norm(dim=-1)
         out[store.spec.embodiment.views[view]] = {
-            "px": quantiles((found[:, n] - wanted[:, n]).norm(dim=-1)[there & seen]),
+            "px": quantiles(off[there & seen]) if (there & seen).any() else None,
             "missed": float((~seen)[there].float().mean()) if there.any() else None,
             "imagined": float(seen[~there].float().mean()) if (~there).any() else None,
             "frames": len(rows),

@@ -162,10 +162,12 @@ class ClipTexts(TextExtractor):
         self._network, config = pretrained(path, ("clip",), "CLIP")
         from transformers import AutoTokenizer
 
+        if not any((Path(path) / name).is_file() for name in ("tokenizer.json", "vocab.json")):
+            raise ConfigError(f"path={path} holds no tokenizer (tokenizer.json), by which texts are read")
         try:
             self._tokenizer: Any = AutoTokenizer.from_pretrained(path, local_files_only=True)
         except (OSError, ValueError) as error:
-            raise ConfigError(f"path={path} holds no tokenizer of CLIP: {error}") from error
+            raise ConfigError(f"path={path}: its tokenizer cannot be loaded: {error}") from error
         self._longest = int(config.text_config.max_position_embeddings)
         self.name = f"CLIP texts ({fingerprint(path)})"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -99,9 +99,11 @@ def _detector(found: Mapping[str, Any] | None) -> dict[str, str]:
 
 def error_text(row: Mapping[str, Any]) -> str:
     """A camera's row of detecting.detector_error in words."""
-    parts: Sequence[str] = [f"{row['px']['median']:.2f} px off (median; 90% within {row['px']['p90']:.2f})"]
+    parts = ["finds none"]
+    if row["px"] is not None:
+        parts = [f"{row['px']['median']:.2f} px off (median; 90% within {row['px']['p90']:.2f})"]
     if row["missed"] is not None:
-        parts = [*parts, f"misses {100 * row['missed']:.1f}%"]
+        parts.append(f"misses {100 * row['missed']:.1f}%")
     if row["imagined"] is not None:
-        parts = [*parts, f"imagines {100 * row['imagined']:.1f}% of those out of sight"]
+        parts.append(f"imagines {100 * row['imagined']:.1f}% of those out of sight")
     return f"{', '.join(parts)} on {row['frames']} held-out frames"

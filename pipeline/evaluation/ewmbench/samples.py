@@ -99,10 +99,8 @@ class Samples:
 
     def film(self, number: int, draw: int) -> Path:
         """The file of the video for people of a sample."""
-        return (
-            self.films
-            / self.made.path(f"{number}-{draw}", self._about(number, draw)).with_suffix(".mp4").name
-        )
+        path = self.made.path(f"{number}-{draw}", self._about(number, draw))
+        return self.films / path.with_suffix(".mp4").name
 
     def _about(self, number: int, draw: int | None = None) -> dict[str, Any]:
         row = self.store.episodes[number]

@@ -8,7 +8,9 @@ Without one there are no such figures.
 from __future__ import annotations
 
 import asyncio
+import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -199,18 +201,27 @@ def read_errors(name: str) -> tuple[LogicalError, ...]:
 def bleu(caption: str, instruction: str, strict_parity: bool) -> float:
     """BLEU (Papineni et al. 2002) of a caption against the instruction, 0..1.
 
-    Up to 4-grams, fewer where the instruction is shorter, small letters, no punctuation, and one added to
-    counts of pairs and longer grams (Lin and Och 2004): instructions are a few words, and one 4-gram that is
-    missing would be 0. With strict_parity as in the public code: 4-grams, none added, words as they are
-    between blanks.
+    Up to 4-grams, or as many words as the instruction has; small letters, no punctuation; one is added to the
+    counts of pairs and longer grams (Lin and Och 2004), for instructions are a few words, and one gram that is
+    missing would be 0. With strict_parity as in the public code: 4-grams of words as they stand between blanks,
+    and nothing is added.
     """
     if strict_parity:
         return float(bleu_score([caption], [[instruction]], n_gram=_GRAMS))
     said, wanted = words_of(caption), words_of(instruction)
-    if not said or not wanted:
+    if not set(said) & set(wanted):
         return 0.0
-    grams = min(_GRAMS, len(wanted))
-    return float(bleu_score([" ".join(said)], [[" ".join(wanted)]], n_gram=grams, smooth=True))
+    longest, total = min(_GRAMS, len(wanted)), 0.0
+    for length in range(1, longest + 1):
+        found, due = (_grams(words, length) for words in (said, wanted))
+        hits, more = sum((found & due).values()), int(length > 1)
+        total += math.log((hits + more) / (sum(found.values()) + more))
+    return math.exp(total / longest + min(0.0, 1 - len(wanted) / len(said)))
+
+
+def _grams(words: Sequence[str], length: int) -> Counter[tuple[str, ...]]:
+    """How often each run of so many words occurs."""
+    return Counter(tuple(words[n : n + length]) for n in range(len(words) - length + 1))
 
 
 def step_similarity(made: Sequence[str], true: Sequence[str], texts: TextExtractor) -> float:

@@ -1,9 +1,8 @@
-"""How far a generated trajectory is from the true one: space (SA), order (TA) and dynamics (DYN), EWMBench
-6.2.
+"""How far a generated trajectory is from the true one in space (SA), order (TA) and dynamics (DYN).
 
-Distances are in shares of the picture's width. Scores are those of the paper, 1 / (distance + eps) and DYN,
-cut off at the public code's caps and divided by them: 0..1, and 1 for what is closer than a detector can
-tell.
+Distances are in shares of the picture's width. Scores are those of EWMBench's paper, 1 / (distance + eps) and
+DYN, cut off at the public code's caps and divided by them: 0..1, and 1 for what is closer than a detector
+can tell.
 """
 
 from __future__ import annotations
@@ -110,13 +109,12 @@ def dynamics(one: Floats, other: Floats, strict_parity: bool) -> float:
 def scores(made: Floats, true: Floats, size: tuple[int, int], strict_parity: bool) -> Scores | None:
     """Scores of a generated against the true trajectory; they may be of different lengths.
 
-    Every arm counts: distances are means over the arms, DYN over those that truly move. With strict_parity
-        all
-    is as in the public code: pictures' width and height both count 1, only the arm with the longest true
-        travel
-    counts (counted among the arms that have a true track, which is a fault where one has none), and what
-    matches perfectly in its dynamics gets 0; dynamic time warping is exact, where the public code
-    approximates it.
+    Every arm counts: distances are means over the arms, DYN over those that truly move.
+
+    With strict_parity all is as in the public code. Pictures' width and height both count 1. Only the arm
+    with the longest true travel counts; it is counted among the arms that have a true track, a fault where
+    one has none. What matches perfectly in its dynamics gets 0. Dynamic time warping alone is exact, where
+    the public code approximates it.
 
     Args:
         made, true: [T, arms, 2] and [U, arms, 2] in pixels, NaN where nothing was found.

@@ -47,7 +47,9 @@ def test_two_arms_in_physics_with_a_model_that_reads(tmp_path: Path) -> None:
     assert result["set"]["of"] == 4 and "end effectors in space (commanded poses)" in result["set"]["by"]
     whole = result["overall"]
     assert None not in (whole["recorded"][name] for name in ("scene", "bleu", "steps", "logic"))
-    assert whole["generated"]["logic"] == pytest.approx(0.6) and whole["generated"]["steps"] == 1.0
+    assert whole["generated"]["logic"] == pytest.approx(0.6) and whole["generated"]["steps"] == pytest.approx(
+        1
+    )
     assert whole["generated"]["diversity"] > 0 and 0 <= whole["generated"]["missing"] <= 1
     for row in result["rows"]:  # the best is the least of those that have a trajectory
         known = [sample["hsd"] for sample in row["samples"] if sample["hsd"] is not None]
