@@ -96,7 +96,8 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
     # what cannot work is told before anything is measured
     extractors, subject = Extractors.of(section), Subject.of(cfg, root)
     cfg = subject.cfg
-    reader, notes = reader_of(cfg), []
+    reader = reader_of(cfg)
+    notes: list[str] = []
     store = subject.store()
     held = subject.held_out(store)
     held = held[store.length[held] >= _SHORTEST]

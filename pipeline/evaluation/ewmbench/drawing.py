@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -45,7 +47,7 @@ def film_tracks(
     )
 
 
-def _rows(video: Tensor, drawn: list[tuple[NDArray[np.float32], float]]) -> list[NDArray[np.uint8]]:
+def _rows(video: Tensor, drawn: Sequence[tuple[NDArray[Any], float]]) -> list[NDArray[np.uint8]]:
     """Pictures uint8 [h, w, 3] of a video's views side by side, enlarged, with trajectories up to each
     frame.
     """
@@ -64,7 +66,7 @@ def _rows(video: Tensor, drawn: list[tuple[NDArray[np.float32], float]]) -> list
     return out
 
 
-def _line(picture: NDArray[np.uint8], points: NDArray[np.float32], arm: int, share: float) -> None:
+def _line(picture: NDArray[np.uint8], points: NDArray[Any], arm: int, share: float) -> None:
     """Draw a trajectory [t, 2], with a ring at its last point; gaps stay open."""
     colour = tuple(int(value * share) for value in _COLOURS[arm % len(_COLOURS)])
     seen = np.isfinite(points).all(-1)

@@ -202,9 +202,9 @@ def bleu(caption: str, instruction: str, strict_parity: bool) -> float:
     """BLEU (Papineni et al. 2002) of a caption against the instruction, 0..1.
 
     Up to 4-grams, or as many words as the instruction has; small letters, no punctuation; one is added to the
-    counts of pairs and longer grams (Lin and Och 2004), for instructions are a few words, and one gram that is
-    missing would be 0. With strict_parity as in the public code: 4-grams of words as they stand between blanks,
-    and nothing is added.
+    counts of pairs and longer grams (Lin and Och 2004), for instructions are a few words, and one gram that
+    is missing would be 0. With strict_parity as in the public code: 4-grams of words as they stand between
+    blanks, and nothing is added.
     """
     if strict_parity:
         return float(bleu_score([caption], [[instruction]], n_gram=_GRAMS))

@@ -14,6 +14,7 @@ from scipy.stats import wasserstein_distance
 
 from envs.rng import constant_generator
 from envs.targets import ConfigError
+from pipeline.evaluation.ewmbench.choose import Paths, choose
 from pipeline.evaluation.ewmbench.coverage import least_overlap, mean_overlap, overlaps, voxels
 from pipeline.evaluation.ewmbench.features import PyramidPatches, WordGrams
 from pipeline.evaluation.ewmbench.records import Record, Records
@@ -172,6 +173,17 @@ def test_the_set_is_chosen_for_least_overlap() -> None:
     # The lonely one first; then of those that overlap with it equally the first; then what overlaps least.
     assert least_overlap(iou, 3) == [3, 0, 2] and least_overlap(iou, 9) == [3, 0, 2, 1]
     assert least_overlap(iou, 0) == [] and mean_overlap(iou, [0, 2]) == 0.5 and mean_overlap(iou, [3]) == 0.0
+
+
+def test_each_task_has_its_part_of_the_set() -> None:
+    episodes, tasks = torch.arange(10, 16), ["a", "b"] * 3
+    spread = choose(episodes, tasks, 2, 1.0, None)
+    assert spread.episodes.tolist() == [10, 14, 11, 15] and spread.overlap is None
+    ends = (2.0, 9.0, 3.0, 9.0, -4.0, -9.0)  # of straight paths from the middle
+    paths = [torch.tensor([[[0.5, 0.0]], [[end + 0.5, 0.0]]]) for end in ends]
+    chosen = choose(episodes, tasks, 2, 1.0, Paths(paths, "by hand"))
+    assert chosen.episodes.tolist() == [14, 12, 15, 11] and chosen.of == 6 and chosen.by == "by hand"
+    assert chosen.overlap == pytest.approx((1 / 8 + 1 / 19) / 2) and chosen.overlap < chosen.overlap_of_all  # type: ignore[operator]
 
 
 # -- scenes

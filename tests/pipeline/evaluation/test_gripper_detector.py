@@ -14,6 +14,7 @@ from envs.episodes.clips import ClipStore
 from envs.geometry.cameras import project
 from envs.rng import constant_generator
 from envs.targets import ConfigError
+from pipeline.evaluation.ewmbench.choose import in_pictures
 from pipeline.evaluation.ewmbench.detecting import (
     WEIGHTS,
     Sights,
@@ -25,6 +26,7 @@ from pipeline.evaluation.ewmbench.detecting import (
 )
 from pipeline.evaluation.ewmbench.end_effectors import known_end_effectors, true_end_effectors
 from pipeline.evaluation.ewmbench.features import ClipFrames, ClipTexts, DinoPatches
+from pipeline.evaluation.ewmbench.ruler import GripperRuler
 from pipeline.evaluation.objects.rays import nearest_on_ray, rays, triangulate
 from tests.arms import two_arms
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES, world_spec
@@ -77,6 +79,10 @@ def test_a_detector_learns_what_projection_says(store: ClipStore, tmp_path: Path
     assert torch.equal(*found) and (tmp_path / WEIGHTS).is_file()
     empty = frames[:1, ..., :1, :1].expand_as(frames[:1])  # the square is gone, and with it the left arm
     assert torch.isnan(detector.detect(empty, torch.arange(1))[0, 0, 0]).all()
+    ruler = GripperRuler(detector, sights.views, None, tmp_path / WEIGHTS)
+    flat = in_pictures(store, ruler, held)  # where space is unknown
+    assert [tuple(path.shape) for path in flat.paths] == [(13, 2, 2)] * len(held)
+    assert "picture plane" in flat.by and float(flat.paths[0].nan_to_num(0).max()) <= 1
     with pytest.raises(ConfigError, match="another architecture or robot"):
         train_detector(sights, {**SECTION, "width": 16}, tmp_path, torch.device("cpu"))
 
