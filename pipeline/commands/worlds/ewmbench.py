@@ -45,8 +45,8 @@ PARITY = (
     " means."
 )
 ALIKE = (
-    "All samples of each episode came out alike: this simulator draws nothing, so the best of them is any, and"
-    " there is no diversity."
+    "All samples of each episode came out alike: this simulator draws nothing, so the best of them is any,"
+    " and there is no diversity."
 )
 
 

@@ -13,6 +13,7 @@ from envs.embodiment import Embodiment, EmbodimentError
 from envs.episodes.clips import ClipStore
 from envs.geometry.cameras import project
 from envs.rng import constant_generator
+from envs.simulators.replay import replay
 from envs.targets import ConfigError
 from pipeline.evaluation.ewmbench.choose import in_pictures
 from pipeline.evaluation.ewmbench.detecting import (
@@ -27,10 +28,16 @@ from pipeline.evaluation.ewmbench.detecting import (
 from pipeline.evaluation.ewmbench.end_effectors import known_end_effectors, true_end_effectors
 from pipeline.evaluation.ewmbench.features import ClipFrames, ClipTexts, DinoPatches
 from pipeline.evaluation.ewmbench.ruler import GripperRuler
+from pipeline.evaluation.fidelity.end_effector import (
+    EndEffectorRuler,
+    end_effector_summary,
+    end_effector_text,
+)
 from pipeline.evaluation.objects.rays import nearest_on_ray, rays, triangulate
 from tests.arms import two_arms
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES, world_spec
 from tests.moving_square import SIZE
+from tests.pipeline.evaluation.test_fidelity import Drawing
 
 SECTION = {
     "width": 8,
@@ -83,6 +90,16 @@ def test_a_detector_learns_what_projection_says(store: ClipStore, tmp_path: Path
     flat = in_pictures(store, ruler, held)  # where space is unknown
     assert [tuple(path.shape) for path in flat.paths] == [(13, 2, 2)] * len(held)
     assert "picture plane" in flat.by and float(flat.paths[0].nan_to_num(0).max()) <= 1
+    # In space: of one camera alone, across its line of sight. A pixel is 2.7 cm there.
+    space = EndEffectorRuler(ruler, sights.ends, ("top",))
+    made = replay(Drawing(store.spec, "right"), store, held, bf16=False)
+    summary = end_effector_summary(space, [space.measure(store, held, made, store.frames(made.rows))])
+    assert summary["generated_cm"]["median"] < 6 and summary["recorded_cm"]["median"] < 6
+    assert abs(summary["lost"] - summary["recorded_lost"]) < 0.1
+    assert "across the line of sight of top" in end_effector_text(summary)
+    grey = replay(Drawing(store.spec, "grey"), store, held, bf16=False)
+    lost = space.measure(store, held, grey, store.frames(made.rows))
+    assert torch.isnan(lost["made"][..., 0]).float().mean() > 0.9  # no square, no left arm
     with pytest.raises(ConfigError, match="another architecture or robot"):
         train_detector(sights, {**SECTION, "width": 16}, tmp_path, torch.device("cpu"))
 
