@@ -27,7 +27,7 @@ from pipeline.evaluation.ewmbench.measure import Instruments
 from pipeline.evaluation.ewmbench.page import build_page, summary_text
 from pipeline.evaluation.ewmbench.records import Record, Records
 from pipeline.evaluation.ewmbench.result import Scoring, alike, by_task, overall
-from pipeline.evaluation.ewmbench.ruler import GripperRuler, gripper_ruler, known_ends
+from pipeline.evaluation.ewmbench.ruler import GripperRuler, gripper_ruler, known_ends, looked_through
 from pipeline.evaluation.ewmbench.samples import Samples
 from pipeline.evaluation.ewmbench.semantics import Reader
 from pipeline.evaluation.fidelity.extractors import Extractor
@@ -112,7 +112,7 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
     instruments = Instruments(
         extractors.patches,
         extractors.frames,
-        store.spec.embodiment.views_of(section["cameras"]),
+        looked_through(cfg, store),
         None if ruler is None else ruler.detector,
         () if ruler is None else ruler.views,
         reader,

@@ -44,7 +44,8 @@ def overlaps(cells: Sequence[NDArray[np.int64]]) -> Tensor:
     counts = [len(some) for some in cells]
     _, number = np.unique(np.concatenate(list(cells)), axis=0, return_inverse=True)
     member = torch.zeros(len(cells), int(number.max(initial=-1)) + 1, dtype=torch.float64)
-    member[torch.repeat_interleave(torch.arange(len(cells)), torch.tensor(counts)), number.reshape(-1)] = 1
+    owner = torch.repeat_interleave(torch.arange(len(cells)), torch.tensor(counts))
+    member[owner, torch.from_numpy(number.reshape(-1))] = 1
     both = member @ member.T
     either = member.sum(1)[:, None] + member.sum(1)[None] - both
     return both / either.clamp(min=1)

@@ -78,6 +78,18 @@ def known_ends(cfg: Mapping[str, Any], store: ClipStore) -> EndEffectors:
     return known_end_effectors(store, pose_style(cfg).tool_offset)
 
 
+def looked_through(cfg: Mapping[str, Any], store: ClipStore) -> tuple[int, ...]:
+    """Positions of the cameras of ewmbench.cameras.
+
+    Raises:
+        ConfigError: if the robot has not all of them.
+    """
+    try:
+        return store.spec.embodiment.views_of(cfg["ewmbench"]["cameras"])
+    except ValueError as error:
+        raise ConfigError(f"ewmbench.{error}") from error
+
+
 def gripper_ruler(cfg: Mapping[str, Any], store: ClipStore, data: Sequence[Path], root: Path) -> GripperRuler:
     """The detector of section ewmbench.detector: its weights if they are given, else the one that the run's
     folder holds for these data, trained first if it is not there.
@@ -93,7 +105,7 @@ def gripper_ruler(cfg: Mapping[str, Any], store: ClipStore, data: Sequence[Path]
     """
     section = cfg["ewmbench"]["detector"]
     robot = store.spec.embodiment
-    views = robot.views_of(cfg["ewmbench"]["cameras"])
+    views = looked_through(cfg, store)
     sights: Sights | None = None
     try:
         sights = Sights.of(store, known_ends(cfg, store), views)

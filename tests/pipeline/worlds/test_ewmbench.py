@@ -79,5 +79,7 @@ def test_one_arm_that_nobody_calibrated(tmp_path: Path, tiny_data: Callable[[Emb
     for name in ("sa", "ta", "dyn", "bleu", "steps", "logic"):  # unknown is not nothing
         assert whole["generated"][name] is None and whole["recorded"].get(name) is None
     assert whole["generated"]["scene"] is not None and whole["generated"]["diversity"] == pytest.approx(0)
+    with pytest.raises(ConfigError, match=r"ewmbench\.cameras=\['side'\] must be some of"):
+        ewmbench(load_config([*words, "ewmbench.cameras=[side]"]), tmp_path / "run")
     with pytest.raises(ConfigError, match=r"ewmbench\.detector\.weights=.*nowhere is not there"):
         ewmbench(load_config([*words, f"ewmbench.detector.weights={tmp_path}/nowhere"]), tmp_path / "run")
