@@ -17,7 +17,9 @@ from tests.embodiments import ARM_DELTAS
 from tests.envs.judges.chat_server import MODEL, Asked, serving
 from tests.worlds import scripted_set, untrained_world
 
-SOAK = ["experiment=soak", "track=disabled", "launch.workers=1", "cameras=main"]
+SMOKE = ["experiment=smoke", "track=disabled", "launch.workers=1", "cameras=main", "task.size=[32,32]"]
+SMOKE += ["ewmbench.episodes=2", "ewmbench.videos=1", "ewmbench.detector.fit={steps: 4, batch: 8, lr: 1e-3}"]
+FORCING = ["simulator=forcing_small", "task.suite.cameras=[head,hand_left]"]  # which draws noise
 
 
 def told(asked: Asked) -> str:
@@ -28,11 +30,11 @@ def told(asked: Asked) -> str:
 
 
 def test_two_arms_in_physics_with_a_model_that_reads(tmp_path: Path) -> None:
-    cfg = load_config([*SOAK, "simulator=forcing_small"])  # which draws noise
+    cfg = load_config([*SMOKE, *FORCING])
     data = scripted_set(cfg, tmp_path / "set", 4)
     world = untrained_world(cfg, tmp_path)
     with serving(told) as server:
-        words = [*SOAK, "simulator=forcing_small", *world, f"imagined.data=[{data}]", "judge=vlm"]
+        words = [*SMOKE, *FORCING, *world, f"imagined.data=[{data}]", "judge=vlm"]
         words += [f"judge.chat.url={server.url}", f"judge.chat.model={MODEL}", "judge.pictures.side=0"]
         words += [f"judge.asking.cache={tmp_path}/cache"]
         said = ewmbench(load_config(words), tmp_path / "run")
@@ -66,9 +68,8 @@ def test_two_arms_in_physics_with_a_model_that_reads(tmp_path: Path) -> None:
 
 
 def test_one_arm_that_nobody_calibrated(tmp_path: Path, tiny_data: Callable[[Embodiment], Path]) -> None:
-    words = ["experiment=soak", "track=disabled", "task=lerobot", f"task.data=[{tiny_data(ARM_DELTAS)}]"]
-    words += ["task.size=[32,32]", "task.chunk=4", "task.horizon=8", "ewmbench.videos=0"]
-    words += ["task.suite=null", *untrained_world(load_config(words), tmp_path)]
+    words = [*SMOKE, "task=lerobot", f"task.data=[{tiny_data(ARM_DELTAS)}]", "task.chunk=4", "task.horizon=8"]
+    words += untrained_world(load_config(words), tmp_path)
     said = ewmbench(load_config(words), tmp_path / "run")
     assert "No trajectories (SA, TA, DYN): the cameras of one_arm_deltas are not all calibrated" in said
     assert "No semantics" in said and "All samples of each episode came out alike" in said
