@@ -50,10 +50,15 @@ SIMULATOR = ("seed", "threads", *TASK, "simulator", "microbatches")
 def tokenizer(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The video autoencoder of a simulator that works on latents."""
     store = open_store(cfg, inputs)
+    return train_codec(cfg, folder, store, learning_episodes(store))
+
+
+def train_codec(cfg: Cfg, folder: Path, store: ClipStore, episodes: Tensor) -> dict[str, Any]:
+    """A simulator whose autoencoder was trained on some episodes; nothing else of it was."""
     prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg)
     fit = fit_options(cfg, cfg["tokenizer_fit"], "tokenizer_fit")
-    stats = train_tokenizer(model, store, learning_episodes(store), fit, folder)
+    stats = train_tokenizer(model, store, episodes, fit, folder)
     save_weights(model, folder)
     return stats
 
