@@ -27,10 +27,10 @@ from pipeline.evaluation.ewmbench.measure import Instruments
 from pipeline.evaluation.ewmbench.page import build_page, summary_text
 from pipeline.evaluation.ewmbench.records import Record, Records
 from pipeline.evaluation.ewmbench.result import Scoring, alike, by_task, overall
-from pipeline.evaluation.ewmbench.ruler import GripperRuler, gripper_ruler, known_ends, looked_through
 from pipeline.evaluation.ewmbench.samples import Samples
 from pipeline.evaluation.ewmbench.semantics import Reader
 from pipeline.evaluation.fidelity.extractors import Extractor
+from pipeline.evaluation.grippers.ruler import GripperRuler, gripper_ruler, known_ends, looked_through
 from pipeline.graph.code_version import code_of
 
 _MODULE = "pipeline.evaluation.ewmbench.samples"

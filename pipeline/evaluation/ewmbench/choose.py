@@ -10,8 +10,8 @@ from torch import Tensor
 
 from envs.episodes.clips import ClipStore
 from pipeline.evaluation.ewmbench.coverage import least_overlap, mean_overlap, overlaps, voxels
-from pipeline.evaluation.ewmbench.end_effectors import EndEffectors
-from pipeline.evaluation.ewmbench.ruler import GripperRuler
+from pipeline.evaluation.grippers.end_effectors import EndEffectors
+from pipeline.evaluation.grippers.ruler import GripperRuler
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pipeline.evaluation.ewmbench.detector import GripperDetector
 from pipeline.evaluation.ewmbench.features import PatchExtractor
 from pipeline.evaluation.ewmbench.records import Record
 from pipeline.evaluation.ewmbench.scene import Scene, scene_consistency, video_embedding
 from pipeline.evaluation.ewmbench.semantics import Reader
 from pipeline.evaluation.fidelity.extractors import Extractor
+from pipeline.evaluation.grippers.detector import GripperDetector
 
 
 @dataclass(frozen=True)

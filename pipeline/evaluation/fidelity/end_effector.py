@@ -19,8 +19,8 @@ from actors.world_config import pose_style
 from envs.embodiment import EmbodimentError
 from envs.episodes.clips import ClipStore
 from envs.simulators.replay import Replay
-from pipeline.evaluation.ewmbench.end_effectors import EndEffectors, true_end_effectors
-from pipeline.evaluation.ewmbench.ruler import GripperRuler, gripper_ruler
+from pipeline.evaluation.grippers.end_effectors import EndEffectors, true_end_effectors
+from pipeline.evaluation.grippers.ruler import GripperRuler, gripper_ruler
 from pipeline.evaluation.objects.rays import nearest_on_ray, rays, triangulate
 from pipeline.evaluation.quantiles import quantiles
 

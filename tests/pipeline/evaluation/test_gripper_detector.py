@@ -16,7 +16,13 @@ from envs.rng import constant_generator
 from envs.simulators.replay import replay
 from envs.targets import ConfigError
 from pipeline.evaluation.ewmbench.choose import in_pictures
-from pipeline.evaluation.ewmbench.detecting import (
+from pipeline.evaluation.ewmbench.features import ClipFrames, ClipTexts, DinoPatches
+from pipeline.evaluation.fidelity.end_effector import (
+    EndEffectorRuler,
+    end_effector_summary,
+    end_effector_text,
+)
+from pipeline.evaluation.grippers.detecting import (
     WEIGHTS,
     Sights,
     detector_error,
@@ -25,14 +31,8 @@ from pipeline.evaluation.ewmbench.detecting import (
     train_detector,
     unseen,
 )
-from pipeline.evaluation.ewmbench.end_effectors import known_end_effectors, true_end_effectors
-from pipeline.evaluation.ewmbench.features import ClipFrames, ClipTexts, DinoPatches
-from pipeline.evaluation.ewmbench.ruler import GripperRuler
-from pipeline.evaluation.fidelity.end_effector import (
-    EndEffectorRuler,
-    end_effector_summary,
-    end_effector_text,
-)
+from pipeline.evaluation.grippers.end_effectors import known_end_effectors, true_end_effectors
+from pipeline.evaluation.grippers.ruler import GripperRuler
 from pipeline.evaluation.objects.rays import nearest_on_ray, rays, triangulate
 from tests.arms import two_arms
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES, world_spec

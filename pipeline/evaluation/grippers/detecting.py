@@ -23,8 +23,8 @@ from envs.geometry.cameras import project
 from envs.rng import seed_process
 from envs.targets import options as options_of
 from learners.training.fit import FitConfig, fit
-from pipeline.evaluation.ewmbench.detector import GripperDetector
-from pipeline.evaluation.ewmbench.end_effectors import EndEffectors
+from pipeline.evaluation.grippers.detector import GripperDetector
+from pipeline.evaluation.grippers.end_effectors import EndEffectors
 from pipeline.evaluation.quantiles import quantiles
 from pipeline.graph.artefact import save_weights
 

@@ -17,7 +17,7 @@ from envs.embodiment import EmbodimentError
 from envs.episodes.clips import ClipStore
 from envs.manifest import digest_of
 from envs.targets import ConfigError
-from pipeline.evaluation.ewmbench.detecting import (
+from pipeline.evaluation.grippers.detecting import (
     WEIGHTS,
     Sights,
     build_detector,
@@ -26,11 +26,11 @@ from pipeline.evaluation.ewmbench.detecting import (
     train_detector,
     unseen,
 )
-from pipeline.evaluation.ewmbench.detector import GripperDetector
-from pipeline.evaluation.ewmbench.end_effectors import EndEffectors, arm_names, known_end_effectors
+from pipeline.evaluation.grippers.detector import GripperDetector
+from pipeline.evaluation.grippers.end_effectors import EndEffectors, arm_names, known_end_effectors
 from pipeline.graph.code_version import code_of, digest
 
-_MODULE = "pipeline.evaluation.ewmbench.detecting"
+_MODULE = "pipeline.evaluation.grippers.detecting"
 
 
 @dataclass(frozen=True)
