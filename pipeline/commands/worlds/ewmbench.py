@@ -21,7 +21,7 @@ from envs.judges.vlm import VLMJudge
 from envs.targets import ConfigError, build, target
 from pipeline.commands.worlds.subject import Subject
 from pipeline.evaluation.by_task import tasks_of_episodes
-from pipeline.evaluation.ewmbench.choose import BenchSet, choose, in_pictures, in_space
+from pipeline.evaluation.ewmbench.choose import BenchSet, Paths, choose, in_pictures, in_space
 from pipeline.evaluation.ewmbench.features import PatchExtractor, TextExtractor
 from pipeline.evaluation.ewmbench.measure import Instruments
 from pipeline.evaluation.ewmbench.page import build_page, summary_text
@@ -132,7 +132,7 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
     )
     true, made = measured(samples, chosen.episodes, section["samples"])
     scoring = Scoring(
-        tuple(store.spec.size),
+        store.spec.size,
         section["strict_parity"],
         extractors.texts,
         () if reader is None else reader.errors,
@@ -188,6 +188,7 @@ def reader_of(cfg: Mapping[str, Any]) -> Reader | None:
 def bench_set(cfg: Mapping[str, Any], store: ClipStore, held: Tensor, ruler: GripperRuler | None) -> BenchSet:
     """The set out of held-out episodes int64 [N], by paths in space, else in pictures, else by none."""
     section = cfg["ewmbench"]
+    paths: Paths | None
     try:
         paths = in_space(store, known_ends(cfg, store), held)
     except EmbodimentError:
