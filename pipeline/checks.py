@@ -54,6 +54,9 @@ _SECTIONS = {
     "policy_value": measuring.PolicyValueSection,
     "fidelity": measuring.FidelitySection,
     "fidelity.long": measuring.LongSection,
+    "ewmbench": measuring.EwmbenchSection,
+    "ewmbench.detector": measuring.DetectorSection,
+    "ewmbench.prompts": measuring.PromptsSection,
     "sweep": measuring.SweepSection,
     "track": running.TrackSection,
     "serve": ServeConfig,
@@ -64,7 +67,7 @@ _FITS = (
     *("imitation.perception", "imitation.fit", "clone.perception", "clone.fit", "tokenizer_fit"),
     *(f"{stage}.{phase}.fit" for stage in ("state_fit", "judge_fit") for phase in ("first", "refresh")),
     *(f"text_world_fit.{part}" for part in ("tokenizer", "first", "refresh")),
-    "finetune.state.fit",
+    *("finetune.state.fit", "ewmbench.detector.fit"),
 )
 _SIMULATOR_FITS = (
     *(f"{stage}.{phase}" for stage in ("simulator_fit", "distill") for phase in ("first", "refresh")),
@@ -79,6 +82,9 @@ _TARGETS = {
     "task.suite": (),
     "fidelity.frames_extractor": (),
     "fidelity.clips_extractor": (),
+    "ewmbench.patches": (),
+    "ewmbench.frames": (),
+    "ewmbench.texts": (),
 }
 _TOP = {key.partition(".")[0] for key in (*_SECTIONS, *_FITS, *_SIMULATOR_FITS, *_TARGETS, "rl", "launch")}
 

@@ -98,7 +98,8 @@ class TaskSuite(ABC):
         """What only physics knows, by name; recorded under `privileged.*`, and {} is fine.
 
         Evaluation measures the first of `object_poses` [O, n], a row per object that begins with its centre's
-        x, y, z in metres. Shapes are those of the suite, whatever the task and the frame.
+        x, y, z in metres, and takes `flange_poses` [arms, n], x, y, z, roll, pitch, yaw, for where end
+        effectors truly are. Shapes are those of the suite, whatever the task and the frame.
         """
 
     @abstractmethod

@@ -39,6 +39,7 @@ def replay(
     bf16: bool = True,
     alone: int | None = None,
     stride: int = 1,
+    draw: int = 0,
 ) -> Replay:
     """Generate the given episodes from their first frames on, to the end of the longest.
 
@@ -47,6 +48,7 @@ def replay(
         decoder: decodes the robot's states along the way; without one `states` repeats the first.
         batch: episodes generated side by side.
         stride: recorded frames from one generated frame to the next; T is then so many times smaller.
+        draw: number of the sample; each draws noise of its own.
     """
     device, chunk = simulator.device, simulator.spec.chunk
     steps = -(-(int(store.length[episodes].max()) - 1) // (chunk * stride))
@@ -55,15 +57,16 @@ def replay(
     for ids in episodes.split(batch):
         start, last = store.start[ids], store.length[ids][:, None] - 1
         first = store.first(ids)
-        # Whoever asks the same simulator twice gets the same noise.
-        state = simulator.reset(first.to(device), ids.to(device), capacity=1 + steps * chunk, stride=stride)
+        # Whoever asks the same simulator twice for the same draw gets the same noise.
+        seeds = (ids + draw * len(store)).to(device)
+        state = simulator.reset(first.to(device), seeds, capacity=1 + steps * chunk, stride=stride)
         made: list[tuple[Tensor, ...]] = []
         for step in range(steps):
             if alone and step and step % alone == 0:
                 known = stride * torch.arange(1 + step * chunk)
                 past = store.at(ids[:, None].expand(-1, len(known)), known)
                 length, room = torch.full_like(ids, len(known)), len(known) + chunk * alone
-                state = simulator.resume(past.to(device), length.to(device), ids.to(device), room, stride)
+                state = simulator.resume(past.to(device), length.to(device), seeds, room, stride)
             ahead = stride * (step * chunk + torch.arange(1, chunk + 1)[None])
             rows = start[:, None] + torch.minimum(ahead.expand(len(ids), -1), last)
             shown = future_of(simulator, store, rows)

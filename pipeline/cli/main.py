@@ -22,7 +22,15 @@ COMMANDS: dict[str, Callable[[Words], None]] = {
     command.__name__.replace("_", "-"): command
     for command in (
         *(runs.run, runs.rl, runs.stage, runs.stages, runs.evaluate, runs.trust, runs.controls, runs.study),
-        *(worlds.policy_value, worlds.fidelity, worlds.sweep, worlds.rewards, worlds.gridworld, tools.judge),
+        *(
+            worlds.policy_value,
+            worlds.fidelity,
+            worlds.ewmbench,
+            worlds.sweep,
+            worlds.rewards,
+            worlds.gridworld,
+        ),
+        tools.judge,
         *(runs.compare, runs.finetune, tools.serve, tools.play, tools.convert, tools.inspect, tools.bench),
         *(tools.verify, tools.submit, tools.chaos, tools.tasks, tools.config, tools.doctor, tools.completion),
     )

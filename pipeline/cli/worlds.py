@@ -34,6 +34,19 @@ def fidelity(words: Words) -> None:
     print(f"{root}/fidelity.html, {root}/fidelity.json")
 
 
+def ewmbench(words: Words) -> None:
+    """scene consistency, trajectories of grippers, semantics and diversity of generated video, as in
+    EWMBench: worldloop ewmbench experiment=... [ewmbench.samples=3] [ewmbench.strict_parity=true] [judge=vlm]
+    """
+    cfg, root = prepared(words)
+    from pipeline.commands.worlds.ewmbench import ewmbench as measure
+    from pipeline.graph.owner import owning
+
+    with owning(root, "ewmbench"):
+        print(measure(cfg, root))
+    print(f"{root}/ewmbench.html, {root}/ewmbench.json")
+
+
 def sweep(words: Words) -> None:
     """move one number of the action at a time and draw what is imagined: worldloop sweep experiment=...
     [sweep.episode=0] [sweep.levels=[-2,2]]

@@ -1,4 +1,4 @@
-"""Sections of what measures: evaluations, studies, values of policies, fidelity."""
+"""Sections of what measures: evaluations, studies, values of policies, fidelity, EWMBench."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from annotated_types import Ge, MinLen
+from annotated_types import Ge, MinLen, MultipleOf
 
 from envs.ranges import Count, Natural, NonNegative, Positive, Seed, Share
-from pipeline.sections.kinds import Choice, Name
+from pipeline.sections.kinds import Choice, Fit, Name
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,45 @@ class FidelitySection:
     frames_extractor: Choice
     clips_extractor: Choice
     long: Mapping[str, Any]
+    end_effectors: bool
     grid: Mapping[Name, Annotated[Sequence[Any], MinLen(1)]] | None
+
+
+@dataclass(frozen=True)
+class EwmbenchSection:
+    """Section ewmbench."""
+
+    episodes: Count
+    voxel: Positive
+    samples: Count
+    cameras: str | Sequence[Name]
+    strict_parity: bool
+    patches: Choice
+    frames: Choice
+    texts: Choice
+    detector: Mapping[str, Any]
+    prompts: Mapping[str, Any]
+    videos: Natural
+
+
+@dataclass(frozen=True)
+class DetectorSection:
+    """Section ewmbench.detector."""
+
+    weights: Name | None
+    width: Annotated[int, Ge(8), MultipleOf(8)]
+    side: Annotated[int, Ge(16)]
+    fit: Fit
+
+
+@dataclass(frozen=True)
+class PromptsSection:
+    """Section ewmbench.prompts."""
+
+    caption: Name
+    steps: Name
+    logic: Name
+    errors: Name
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from envs.files import write_text
 from envs.perceptual import PerceptualDistance
 from envs.targets import ConfigError, build
 from pipeline.commands.worlds.subject import Subject
+from pipeline.evaluation.fidelity.end_effector import end_effector_ruler
 from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.fidelity.grid import Settings, combinations, run_grid, with_settings
 from pipeline.evaluation.fidelity.long import drift, long_episodes, longest
@@ -51,7 +52,8 @@ def fidelity(cfg: Cfg, root: Path) -> str:
     episodes = chosen(subject, store, section["episodes"])
     simulator = subject.simulator()
     labels = part_labels(cfg, store, episodes, section["masks"])
-    loop = OpenLoop(store, episodes, cfg["simulator"]["bf16"], labels, extractors, section["clip"])
+    hands = end_effector_ruler(subject.cfg, store, subject.data, root)
+    loop = OpenLoop(store, episodes, cfg["simulator"]["bf16"], labels, extractors, section["clip"], hands)
     place = {int(number): n for n, number in enumerate(episodes)}
     mine = {
         name: torch.tensor([place[n] for n in some.tolist()])

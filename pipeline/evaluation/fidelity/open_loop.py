@@ -14,6 +14,7 @@ from envs.episodes.clips import ClipStore
 from envs.perceptual import PerceptualDistance
 from envs.simulators.base import Simulator
 from envs.simulators.replay import replay
+from pipeline.evaluation.fidelity.end_effector import EndEffectorRuler, end_effector_summary
 from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.fidelity.frames import by_frame, frame_errors, summary
 from pipeline.evaluation.fidelity.frechet import Moments, frechet
@@ -33,6 +34,7 @@ class OpenLoop:
         labels: uint8 [N, T, V, H, W], see masks.part_labels; None if nobody knows.
         extractors: of Frechet distances.
         clip: frames of a clip.
+        hands: measures end effectors, or why nothing can.
     """
 
     store: ClipStore
@@ -41,6 +43,7 @@ class OpenLoop:
     labels: Tensor | None = None
     extractors: Sequence[Extractor] = ()
     clip: int = 8
+    hands: EndEffectorRuler | str = "nobody asked"
     distance: PerceptualDistance = field(default_factory=PerceptualDistance)
 
     def measure(self, simulator: Simulator) -> Measured:
@@ -59,8 +62,11 @@ class OpenLoop:
                     for pictures in _samples(video, made.valid, extractor.clips, self.clip):
                         moments.add(pictures)
             out.objects.append(object_error(self.store, self.episodes[some], made, true))
+            if isinstance(self.hands, EndEffectorRuler):
+                out.hands.append(self.hands.measure(self.store, self.episodes[some], made, true))
         enough = {name: pair for name, pair in sides.items() if min(one.count for one in pair) > 1}
         out.frechet = [frechet(*pair) for pair in enough.values()]
+        out.end_effector = end_effector_summary(self.hands, out.hands)
         return out
 
 
@@ -72,6 +78,7 @@ class Measured:
         valid: bool [N, T].
         frechet: see frechet.frechet, one for each extractor that had samples enough.
         objects: see objects.error.object_error, of each part.
+        hands: see end_effector.EndEffectorRuler.measure, of each part; end_effector: what they come to.
     """
 
     def __init__(self) -> None:
@@ -79,6 +86,8 @@ class Measured:
         self.valid = torch.zeros(0, 0, dtype=torch.bool)
         self.frechet: list[dict[str, Any]] = []
         self.objects: list[dict[str, Any]] = []
+        self.hands: list[dict[str, Tensor]] = []
+        self.end_effector: dict[str, Any] = {}
 
     def add(self, errors: Mapping[str, Tensor], valid: Tensor) -> None:
         """Take in further episodes, of any number of frames."""
@@ -90,7 +99,7 @@ class Measured:
 
     def result(self, views: Sequence[str], groups: Mapping[str, Tensor]) -> dict[str, Any]:
         """In numbers: overall, by_frame, views (overall of each), groups (overall of some episodes, positions
-        int64 by name), frechet, and objects' errors where physics knows them.
+        int64 by name), frechet, and the errors of objects and end effectors where physics knows them.
         """
         one = {
             view: {name: values[..., k : k + 1] for name, values in self.errors.items()}
@@ -109,6 +118,7 @@ class Measured:
             "frechet": self.frechet,
             "object_cm": _mean([part["object_cm"]["median"] for part in known if "object_cm" in part]),
             "object_lost": _mean([part["object_lost"] for part in known if "object_lost" in part]),
+            "end_effector": self.end_effector,
         }
 
 

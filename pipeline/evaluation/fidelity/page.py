@@ -8,6 +8,7 @@ from typing import Any
 from markupsafe import Markup
 
 from pipeline.evaluation.charts import Curve, line_chart
+from pipeline.evaluation.fidelity.end_effector import end_effector_text
 from pipeline.evaluation.report import templates
 
 # Figures of a row: key, heading and form.
@@ -40,6 +41,7 @@ def build_page(result: Mapping[str, Any]) -> str:
             long=_long(result["long"]) if result["long"] else [],
             grid=_grid(result["grid"]) if result["grid"] else None,
             collapse=collapse_text(result["long"]),
+            end_effector=end_effector_text(result["end_effector"]),
         )
     )
 
@@ -59,6 +61,7 @@ def summary_text(result: Mapping[str, Any]) -> str:
     lines.append("")
     for one in result["frechet"]:
         lines.append(f"Frechet distance {one['value']:.4g} of {one['samples']} samples by {one['extractor']}")
+    lines.append(end_effector_text(result["end_effector"]))
     lines.append(collapse_text(result["long"]))
     if result["grid"]:
         table = _grid(result["grid"])

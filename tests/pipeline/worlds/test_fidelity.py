@@ -45,6 +45,9 @@ def test_fidelity_with_masks_from_physics(tmp_path: Path) -> None:
         {"simulator.context": 4, "simulator.horizon": 4},
     ]
     assert result["grid"]["figure"] == "arm_mse" and "Least arm MSE: simulator.context=" in said
+    hands = result["end_effector"]
+    assert hands["truth"] == "physics" and "line of sight of head" in hands["method"]
+    assert hands["generated_cm"]["median"] > 0 and "End effectors lie" in said
     page = (tmp_path / "run/fidelity.html").read_text()
     assert "Frechet distances" in page and not re.findall(r'(?:src|href)=(?!"#)', page)
     with pytest.raises(ConfigError, match="another architecture"):

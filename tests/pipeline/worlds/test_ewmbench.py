@@ -1,0 +1,86 @@
+"""EWMBench by one command: page, figures, what is kept, and what is said where nothing can be known."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from envs.embodiment import Embodiment
+from envs.targets import ConfigError
+from pipeline.commands.worlds.ewmbench import ewmbench
+from pipeline.config import load_config
+from tests.embodiments import ARM_DELTAS
+from tests.envs.judges.chat_server import MODEL, Asked, serving
+from tests.worlds import scripted_set, untrained_world
+
+SMOKE = ["experiment=smoke", "track=disabled", "launch.workers=1", "cameras=main", "task.size=[32,32]"]
+SMOKE += ["ewmbench.episodes=2", "ewmbench.videos=1", "ewmbench.detector.fit={steps: 4, batch: 8, lr: 1e-3}"]
+FORCING = ["simulator=forcing_small", "task.suite.cameras=[head,hand_left]"]  # which draws noise
+
+
+def told(asked: Asked) -> str:
+    """A model that says of every video the same."""
+    if "numbered list" in asked.text:
+        return "1. The arm comes down.\n2. It pushes."
+    return "Something is gone.\nErrors: vanishing object" if "Errors:" in asked.text else "push the block"
+
+
+def test_two_arms_in_physics_with_a_model_that_reads(tmp_path: Path) -> None:
+    cfg = load_config([*SMOKE, *FORCING])
+    data = scripted_set(cfg, tmp_path / "set", 4)
+    world = untrained_world(cfg, tmp_path)
+    with serving(told) as server:
+        words = [*SMOKE, *FORCING, *world, f"imagined.data=[{data}]", "judge=vlm"]
+        words += [f"judge.chat.url={server.url}", f"judge.chat.model={MODEL}", "judge.pictures.side=0"]
+        words += [f"judge.asking.cache={tmp_path}/cache"]
+        said = ewmbench(load_config(words), tmp_path / "run")
+        asked = server.tries
+        assert asked == 3 * 2 * 3  # questions of each sample and recording of both episodes
+        assert "4 samples were reused" in ewmbench(load_config(words), tmp_path / "run")
+        more = load_config([*words, "ewmbench.samples=3", "ewmbench.strict_parity=false"])
+        assert "4 samples were reused" in ewmbench(more, tmp_path / "run")
+        assert server.tries == asked + 3 * 2
+    result = json.loads((tmp_path / "run/ewmbench.json").read_text())
+    assert len(result["rows"]) == 2 and len(result["rows"][0]["samples"]) == 3
+    assert result["set"]["of"] == 4 and "end effectors in space (commanded poses)" in result["set"]["by"]
+    whole = result["overall"]
+    assert None not in (whole["recorded"][name] for name in ("scene", "bleu", "steps", "logic"))
+    assert whole["generated"]["logic"] == pytest.approx(0.6) and whole["generated"]["steps"] == pytest.approx(
+        1
+    )
+    assert whole["generated"]["diversity"] > 0 and 0 <= whole["generated"]["missing"] <= 1
+    for row in result["rows"]:  # the best is the least of those that have a trajectory
+        known = [sample["hsd"] for sample in row["samples"] if sample["hsd"] is not None]
+        assert row["generated"]["hsd"] == (min(known) if known else None)
+    assert (
+        set(result["detector"]["cameras"]) == {"head"} and result["detector"]["source"] == "commanded poses"
+    )
+    page = (tmp_path / "run/ewmbench.html").read_text()
+    assert "Best samples" in page and page.count("<video") == 1 and "best of 2" in said
+    assert not re.findall(r'(?:src|href)=(?!"(?:#|data:))', page)
+    with pytest.raises(ConfigError, match=r"ewmbench\.patches\._target_=.*should be a PatchExtractor"):
+        words += ["ewmbench.patches._target_=pipeline.evaluation.fidelity.extractors.PyramidFrames"]
+        ewmbench(load_config(words), tmp_path / "run")
+
+
+def test_one_arm_that_nobody_calibrated(tmp_path: Path, tiny_data: Callable[[Embodiment], Path]) -> None:
+    words = [*SMOKE, "task=lerobot", f"task.data=[{tiny_data(ARM_DELTAS)}]", "task.chunk=4", "task.horizon=8"]
+    words += untrained_world(load_config(words), tmp_path)
+    said = ewmbench(load_config(words), tmp_path / "run")
+    assert "No trajectories (SA, TA, DYN): the cameras of one_arm_deltas are not all calibrated" in said
+    assert "No semantics" in said and "All samples of each episode came out alike" in said
+    result = json.loads((tmp_path / "run/ewmbench.json").read_text())
+    assert "positions in the state" in result["set"]["by"] and result["detector"] is None
+    assert 0 <= result["set"]["overlap"] <= 1
+    whole = result["overall"]
+    for name in ("sa", "ta", "dyn", "bleu", "steps", "logic"):  # unknown is not nothing
+        assert whole["generated"][name] is None and whole["recorded"].get(name) is None
+    assert whole["generated"]["scene"] is not None and whole["generated"]["diversity"] == pytest.approx(0)
+    with pytest.raises(ConfigError, match=r"ewmbench\.cameras=\['side'\] must be some of"):
+        ewmbench(load_config([*words, "ewmbench.cameras=[side]"]), tmp_path / "run")
+    with pytest.raises(ConfigError, match=r"ewmbench\.detector\.weights=.*nowhere is not there"):
+        ewmbench(load_config([*words, f"ewmbench.detector.weights={tmp_path}/nowhere"]), tmp_path / "run")
