@@ -1,5 +1,5 @@
-"""How much a judge must see (WPE): its verdicts on whole episodes of which it is shown all frames, every n-th,
-or the first and the last alone.
+"""How much a judge must see (WPE): its verdicts on whole episodes of which it is shown all frames, every
+n-th, or the first and the last alone.
 """
 
 from __future__ import annotations

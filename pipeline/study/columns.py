@@ -89,7 +89,7 @@ class Column(ABC):
         """A cell in words."""
 
     def pool(self, several: Sequence[Measured]) -> Measured:
-        """What was found of one row with several seeds: here the means of all figures that all of them have."""
+        """What was found of one row with several seeds; here means of the figures that all of them have."""
         labels = [label for label in several[0].cells if all(label in one.cells for one in several)]
         return Measured({label: _mean([one.cells[label] for one in several]) for label in labels})
 

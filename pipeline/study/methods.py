@@ -17,10 +17,11 @@ from typing import Annotated, Any, Literal
 from annotated_types import Gt, Le
 
 from actors.world_config import rewards_of
+from envs.targets import ConfigError
 from pipeline.acting import acting
 from pipeline.graph.graph import Graph, Names
 from pipeline.graph.stage import Stage
-from pipeline.loop import World, add_world, build_loop, deployed_episodes, imagined_iterations
+from pipeline.loop import World, add_world, build_loop, deployed_episodes, imagined_iterations, last_round
 from pipeline.stages import collect, imitation, prove, rl
 from pipeline.stages.variant import fewer_episodes
 
@@ -102,15 +103,23 @@ class Loop(Method):
     Args:
         rl: false leaves the iterations of RL out of every round: what is deployed is what was cloned, from as
             many physics episodes.
+        kept: the better of the last policy and the best before, as a last deployment says; false takes what
+            the last round's RL left, and deploys it no more.
+
+    Raises:
+        ConfigError: for what RL left, without RL.
     """
 
-    def __init__(self, rl: bool = True):
-        self.rl = rl
+    def __init__(self, rl: bool = True, kept: bool = True):
+        if not rl and not kept:
+            raise ConfigError("rl=false leaves no policy of RL's to take; say kept=true")
+        self.rl, self.kept = rl, kept
 
     def make(self, cfg: Cfg, root: Path) -> Made:
         """See Method.make."""
         graph = build_loop(cfg, root, with_rl=self.rl)
-        return Made(graph, str(graph.nodes["evaluate-after"].inputs["policy"]))
+        last = graph.nodes["evaluate-after"].inputs["policy"] if self.kept else f"rl-{last_round(cfg)}"
+        return Made(graph, str(last))
 
 
 class RLInPhysics(Method):

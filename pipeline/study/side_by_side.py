@@ -52,7 +52,9 @@ def _rows(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
             if not any(known[name].values()):
                 known[name] = cells
     for row in table["pooled"]:
-        out[row["title"]].update({name: row["cells"][name] for name, seeds in row["seeds"].items() if len(seeds) > 1})
+        out[row["title"]].update(
+            {name: row["cells"][name] for name, seeds in row["seeds"].items() if len(seeds) > 1}
+        )
     return out
 
 

@@ -30,7 +30,10 @@ def study_table(study: Study) -> Table:
     """
     found = measured(study)
     rows = {row.key: row for row in study.rows}
-    labels = {key: {name: column.labels(row.cfg) for name, column in study.columns.items()} for key, row in rows.items()}
+    labels = {
+        key: {name: column.labels(row.cfg) for name, column in study.columns.items()}
+        for key, row in rows.items()
+    }
     return {
         "name": study.cfg["name"],
         "columns": {
@@ -45,8 +48,7 @@ def study_table(study: Study) -> Table:
                 "title": row.title,
                 "seeds": {name: list(found[key, name]) for name in study.columns},
                 "cells": {
-                    name: _cells(pooled(study, found, key, name), labels[key][name])
-                    for name in study.columns
+                    name: _cells(pooled(study, found, key, name), labels[key][name]) for name in study.columns
                 },
             }
             for key, row in rows.items()
@@ -74,9 +76,7 @@ def measured(study: Study) -> dict[tuple[Key, str], dict[int, Measured]]:
     return out
 
 
-def pooled(
-    study: Study, found: Mapping[tuple[Key, str], BySeed], key: Key, column: str
-) -> Measured | None:
+def pooled(study: Study, found: Mapping[tuple[Key, str], BySeed], key: Key, column: str) -> Measured | None:
     """What a column found of a row with all seeds that were run; None if there are none."""
     several = list(found[key, column].values())
     return study.columns[column].pool(several) if len(several) > 1 else next(iter(several), None)
@@ -104,9 +104,7 @@ def _entry(
         "note": row.note,
         "physics_episodes": row.made.physics_episodes() if there else None,
         "minutes": row.made.seconds() / 60 if there else None,
-        "cells": {
-            name: _cells(found[row.key, name].get(row.seed), labels[name]) for name in study.columns
-        },
+        "cells": {name: _cells(found[row.key, name].get(row.seed), labels[name]) for name in study.columns},
     }
 
 

@@ -11,14 +11,15 @@ from pipeline.study.columns import Cell, Cfg, Column, Measured
 from pipeline.study.methods import Made
 from pipeline.study.worlds import measuring
 
+_FIGURES = {"Pearson": "pearson", "Spearman": "spearman", "MMRV": "mmrv", "mean |dSR|": "difference"}
+
 
 class PolicyValues(Column):
-    """Values of the row's policy, of the same under noise, and of scripted experts, as the section policy_value
-    says, against their true ones; correlations are over all of them.
+    """Values of the row's policy, of the same under noise, and of scripted experts, as the section
+    policy_value says, against their true ones; correlations are over all of them.
     """
 
     headline = "Pearson"
-    _figures = {"Pearson": "pearson", "Spearman": "spearman", "MMRV": "mmrv", "mean |dSR|": "difference"}
 
     def add(self, cfg: Cfg, made: Made) -> Sequence[str]:
         """See Column.add."""
@@ -31,12 +32,12 @@ class PolicyValues(Column):
 
     def labels(self, cfg: Cfg) -> list[str]:
         """See Column.labels."""
-        return [*self._figures, "order kept", "confusion, all episodes"]
+        return [*_FIGURES, "order kept", "confusion, all episodes"]
 
     def read(self, cfg: Cfg, folders: Sequence[Path]) -> Measured:
         """See Column.read."""
         found = result_of(folders[0])
-        cells: dict[str, Cell] = {label: {"value": found.get(key)} for label, key in self._figures.items()}
+        cells: dict[str, Cell] = {label: {"value": found.get(key)} for label, key in _FIGURES.items()}
         cells["order kept"] = found.get("order", {"kept": 0, "pairs": 0})
         cells["confusion, all episodes"] = found.get("micro", {})
         return Measured(cells)

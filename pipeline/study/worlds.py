@@ -1,5 +1,5 @@
-"""What a study says of imagined worlds: how they were trained, their video, their speed, and how far they lead
-policies and judges astray.
+"""What a study says of imagined worlds: how they were trained, their video, their speed, and how far they
+lead policies and judges astray.
 """
 
 from __future__ import annotations
@@ -18,21 +18,22 @@ from pipeline.study.columns import ALL, Cell, Cfg, Column, Measured, Success, ou
 from pipeline.study.methods import Made
 from pipeline.study.table import gain_of
 
+_PARTS = {"tokenizer": "tokenizer", "simulator-1": "simulator", "state-1": "state expert"}
+
 
 class Training(Column):
     """How long, in how many steps, the parts of the first world were trained."""
 
     headline = "simulator"
-    _parts = {"tokenizer": "tokenizer", "simulator-1": "simulator", "state-1": "state expert"}
 
     def add(self, cfg: Cfg, made: Made) -> Sequence[str]:
         """See Column.add."""
-        return [name for name in self._parts if name in made.graph.nodes]
+        return [name for name in _PARTS if name in made.graph.nodes]
 
     def labels(self, cfg: Cfg) -> list[str]:
         """See Column.labels."""
         tokens = "codec" in cfg["simulator"]
-        return [label for name, label in self._parts.items() if tokens or name != "tokenizer"]
+        return [label for name, label in _PARTS.items() if tokens or name != "tokenizer"]
 
     def read(self, cfg: Cfg, folders: Sequence[Path]) -> Measured:
         """See Column.read."""
@@ -42,7 +43,7 @@ class Training(Column):
             assert manifest is not None, f"{folder} is finished"
             found = manifest["result"]
             spent = sum(found.get(f"{kind}_seconds", 0.0) for kind in ("data", "compute", "features"))
-            cells[self._parts[manifest["stage"]]] = {"seconds": spent, "steps": found["steps"]}
+            cells[_PARTS[manifest["stage"]]] = {"seconds": spent, "steps": found["steps"]}
         return Measured(cells)
 
     def text(self, cell: Cell) -> str:
@@ -120,8 +121,8 @@ class Speed(Column):
 
 
 class Verdicts(Column):
-    """Verdicts of the judge on held-out episodes of deployed policies, or of all where no policy was deployed,
-    that agree with recorded success.
+    """Verdicts of the judge that agree with recorded success, on held-out episodes of deployed policies, or
+    on all where no policy was deployed.
     """
 
     headline = "generated"
@@ -194,7 +195,7 @@ class Gap(Column):
 
 
 class Gain(Success):
-    """True success of the row's policy, and what it gained on the policy of imitation, on the same episodes."""
+    """True success of the row's policy, and its gain on the policy of imitation, on the same episodes."""
 
     def add(self, cfg: Cfg, made: Made) -> Sequence[str]:
         """See Column.add."""

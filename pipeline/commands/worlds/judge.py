@@ -87,7 +87,9 @@ def judge_study(cfg: Mapping[str, Any], root: Path, selection: Selection) -> str
         after = kind.spent(cfg["judge"])  # type: ignore[attr-defined]
         spent = {key: after[key] - before[key] for key in after}
         cost = ", ".join(f"{key.replace('_', ' ')} {value:g}" for key, value in spent.items() if value)
-        lines.append(f"{_line([frames, *_cells(found)])}  {cost or ('free' if not spent else 'all remembered')}")
+        lines.append(
+            f"{_line([frames, *_cells(found)])}  {cost or ('free' if not spent else 'all remembered')}"
+        )
     return "\n".join(lines)
 
 

@@ -27,8 +27,8 @@ _VALUES = tuple(f"policy_value.{key}" for key in ("noise", "experts", "starts", 
 
 @stage(reads=(*PHYSICS, "evaluate.envs", *_VALUES), place=Place.EVALUATOR)
 def true_values(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """Success in physics of the role `policy`, of the same under noise on its actions, and of scripted experts,
-    from the starts of held-out episodes; no imagined world has a part in it.
+    """Success in physics of the role `policy`, of the same under noise on its actions, and of scripted
+    experts, from the starts of held-out episodes; no imagined world has a part in it.
     """
     prepare_process(cfg["seed"], cfg["threads"])
     found = _comparison(cfg, inputs).true({}, Kept(folder / "tried"))
@@ -46,9 +46,7 @@ def estimated_values(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     and how far these values agree with the role `true`; cells.json has each of them.
     """
     prepare_process(cfg["seed"], cfg["threads"])
-    kept: Mapping[str, Mapping[str, Tensors]] = torch.load(
-        inputs.folder("true") / TRUE, weights_only=True
-    )
+    kept: Mapping[str, Mapping[str, Tensors]] = torch.load(inputs.folder("true") / TRUE, weights_only=True)
     true = {(task, name): outcome for task, some in kept.items() for name, outcome in some.items()}
     simulator = build_simulator(cfg, inputs.weights("simulator"))
     parts = (
