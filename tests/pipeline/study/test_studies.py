@@ -144,6 +144,6 @@ def test_judges_are_shown_more_and_fewer_frames(root: Path) -> None:
     text = run_study(planned(root, JUDGES))
     assert "not run" not in text and "first and last" in text and "(2 frames)" in text
     with pytest.raises(
-        ConfigError, match="in the row proxy: judge=.*Embedding.* reads a simulator's features"
+        ConfigError, match=r"in the row proxy: judge=.*Embedding.* reads a simulator's features"
     ):
         planned(root, [*JUDGES, row("proxy", "judge=embedding")])
