@@ -14,7 +14,6 @@ from envs.manifest import write_manifest
 from envs.targets import ConfigError
 from pipeline.config import load_config
 from pipeline.stages import pace
-from pipeline.stages.world import SIMULATOR
 from pipeline.study.columns import Measured, Success
 from pipeline.study.curves import SuccessOverTime
 from pipeline.study.judges import FramesShown
@@ -179,4 +178,3 @@ def test_seconds_are_shared_out_among_the_parts_that_there_are(
     assert pace.seconds_of(load_config(["experiment=soak"]), "state", "first") == {}
     with pytest.raises(ConfigError, match=r"equal_time\.tokenizer=0\.9 and equal_time\.state=0\.15"):
         load_config(["equal_time.tokenizer=0.9"])
-    assert "equal_time" not in SIMULATOR
