@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from annotated_types import Gt, Lt, MinLen
+from annotated_types import Gt, Le, Lt, MinLen
 
 from envs.ranges import Count, Discount, Natural, NonNegative, Share
 from pipeline.sections.kinds import Choice, Fit, Name, Side
@@ -128,7 +128,7 @@ class EqualTimeSection:
     seconds: NonNegative
     tokenizer: Annotated[float, Gt(0), Lt(1)]
     state: Annotated[float, Gt(0), Lt(1)]
-    refresh: Share
+    refresh: Annotated[float, Gt(0), Le(1)]
     measured: Count
 
 

@@ -32,12 +32,14 @@ def seconds_of(cfg: Cfg, part: str, phase: str) -> dict[str, float]:
     count.
     """
     section = cfg["equal_time"]
+    if not section["seconds"]:
+        return {}
     whole = section["seconds"] * (section["refresh"] if phase == "refresh" else 1.0)
     shares = {"tokenizer": section["tokenizer"], "state": section["state"]}
     if "codec" not in cfg["simulator"] or phase == "refresh":  # a tokenizer stays as it was first trained
         del shares["tokenizer"]
     share = shares.get(part, 1.0 - sum(shares.values()))
-    return {"seconds": whole * share} if whole else {}
+    return {"seconds": whole * share}
 
 
 def in_time(inputs: Inputs, part: str, fit: FitConfig) -> FitConfig:
