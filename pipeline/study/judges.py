@@ -11,7 +11,7 @@ from annotated_types import MinLen
 from envs.ranges import Count
 from envs.targets import ConfigError, target
 from pipeline.evaluation.result import result_of
-from pipeline.evaluation.shown import check_frames
+from pipeline.evaluation.rewards.shown import check_frames
 from pipeline.stages.measured.frames import shown_frames
 from pipeline.study.columns import Cell, Cfg, Column, Measured
 from pipeline.study.methods import Made

@@ -58,7 +58,10 @@ from pipeline.loop import build_loop
         (["simulator=gesim", "task=lerobot", "task.data=[x]", "distill.steps=5"], r"distilled sampler has 4"),
         (["distill.method.critic_lr=0"], r"distill\.method\.critic_lr=0"),
         (["+if_chosen.judge.learned.pionts=3"], r"if_chosen\.judge\.learned\.pionts is no option of"),
-        (["+if_chosen.jugde.learned.points=3"], r"if_chosen\.jugde is no group of choices; did you mean judge"),
+        (
+            ["+if_chosen.jugde.learned.points=3"],
+            r"if_chosen\.jugde is no group of choices; did you mean judge",
+        ),
         (["task=tabletop", "task.suite.scenes=3"], r"task\.suite\.scenes=3"),
         (["task=tabletop", "+task.variants.x={scene: a}"], r"task\.variants\.x\.scene is not an option"),
     ],

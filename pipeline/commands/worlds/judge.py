@@ -17,7 +17,7 @@ from actors.factory import build_judge, open_clips
 from envs.judges.base import Judge
 from envs.targets import ConfigError, target
 from pipeline.evaluation.judging import labelled
-from pipeline.evaluation.shown import check_frames, shown_table
+from pipeline.evaluation.rewards.shown import check_frames, shown_table
 from pipeline.loop import build_loop, has_physics, last_round
 from pipeline.stages.given import datasets, learns
 

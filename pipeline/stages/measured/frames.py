@@ -10,7 +10,7 @@ from actors.process import prepare_process
 from envs.targets import ConfigError
 from pipeline.evaluation.judging import labelled
 from pipeline.evaluation.measurement import evenly
-from pipeline.evaluation.shown import shown_table
+from pipeline.evaluation.rewards.shown import shown_table
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import ROBOT, Cfg, open_store
 from pipeline.stages.judge_cost import priced
@@ -21,7 +21,7 @@ from pipeline.stages.judge_cost import priced
 def shown_frames(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Verdicts of the role `judge` on recorded held-out episodes by what it is shown of them.
 
-    Settings: frames, a list of choices (evaluation/shown.py); episodes, at most so many.
+    Settings: frames, a list of choices (evaluation/rewards/shown.py); episodes, at most so many.
     """
     prepare_process(cfg["seed"], cfg["threads"])
     store, judge = open_store(cfg, inputs), build_judge(cfg, inputs.weights("judge")).eval()
