@@ -55,7 +55,8 @@ class Comparison:
         Args:
             identity: what tells this physics from others.
         """
-        physics, out = Physics(self.cfg, identity, kept, self.spread), {}
+        physics = Physics(self.cfg, identity, kept, self.spread)
+        out: dict[tuple[str, str], Tensors] = {}
         try:
             with self._bar("true values") as bar:
                 for task, episodes in self.starts.items():
