@@ -23,7 +23,7 @@ def video_errors(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     held = store.split("held_out")
     episodes = evenly(held[store.length[held] > 1], cfg["fidelity"]["episodes"])
     loop = OpenLoop(store, episodes, cfg["simulator"]["bf16"])
-    simulator = build_simulator(cfg, inputs.weights("simulator"))
+    simulator = build_simulator(cfg, inputs.weights("simulator")).eval()
     found = loop.measure(simulator).result(store.spec.embodiment.views, {})
     kept = ("episodes", "overall", "by_frame", "object_cm", "object_lost")
     still = held_still(store, episodes, loop.distance)
