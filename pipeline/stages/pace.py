@@ -50,7 +50,7 @@ def in_time(inputs: Inputs, part: str, fit: FitConfig) -> FitConfig:
         return fit
     manifest = read_manifest(inputs.folder("pace"))
     assert manifest is not None, "a role is played by finished stages"
-    speed = manifest["result"].get(f"{part}_samples_per_second")
+    speed = manifest["result"].get(f"{part}_speed")
     if speed is None:  # of what learns nothing
         return fit
     return replace(fit, steps=max(1, round(inputs.settings["seconds"] * speed / fit.batch)))
@@ -93,7 +93,7 @@ def pace(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         fit = replace(fit, steps=cfg["equal_time"]["measured"])
         spent = train(fit, trial / part)
         seconds = sum(spent.get(f"{kind}_seconds", 0.0) for kind in ("data", "compute", "features"))
-        out[f"{part}_samples_per_second"] = fit.steps * fit.batch / seconds
+        out[f"{part}_speed"] = fit.steps * fit.batch / seconds
     if leads():
         shutil.rmtree(trial)
     return out

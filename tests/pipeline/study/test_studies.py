@@ -58,7 +58,7 @@ def test_worlds_stand_side_by_side_after_equal_time(root: Path) -> None:
     for entry, cells in zip(study.rows, (one["cells"] for one in table["rows"]), strict=True):
         graph = entry.made.graph
         speeds, settings = graph.result("pace"), graph.nodes["simulator-1"].settings
-        steps = round(settings["seconds"] * speeds["simulator_samples_per_second"] / 2)
+        steps = round(settings["seconds"] * speeds["simulator_speed"] / 2)
         assert (
             cells["training"]["simulator"]["steps"] == max(1, steps) == graph.result("simulator-1")["steps"]
         )
