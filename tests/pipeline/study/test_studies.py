@@ -34,7 +34,7 @@ def table_of(root: Path) -> dict[str, Any]:
 
 
 def row(name: str, *changes: str) -> str:
-    return f"study.methods.{name}.changes=[{','.join(changes)}]"
+    return f"study.methods.{name}.changes={list(changes)}"
 
 
 WORLDS = (
