@@ -62,11 +62,18 @@ def check_world(cfg: Mapping[str, Any]) -> None:
     """
     robot, wrong = world_spec(cfg).embodiment, []
     if cfg["task"].get("suite") is not None:
+        seen, known = _suite(cfg["task"]["suite"])
         for name in task_names(cfg["task"]["name"]):
             try:
-                check_task(name, _suite(cfg["task"]["suite"])[1])
+                check_task(name, known)
             except SuiteError as error:
                 wrong.append(str(error))
+        sizes = sorted({tuple(camera.size) for camera in seen.cameras})
+        if sizes != [tuple(cfg["task"]["size"])]:
+            wrong.append(
+                f"task.size={list(cfg['task']['size'])}, but the suite renders {list(map(list, sizes))}; give"
+                " all its cameras that size (a suite with an option for it takes task.suite.size=${..size})"
+            )
     named = {"": cfg, "policy.": cfg["policy"], "judge.": cfg["judge"]}
     for key, section in named.items():
         # what other packages' classes mean by the word is theirs

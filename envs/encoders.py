@@ -15,26 +15,39 @@ from envs.specs import WorldSpec
 
 _NATIVE = 64  # pixels of a view's shorter side that the encoder is laid out for; larger ones are halved first
 _LOOK = 4  # features said of each key-point
+_ASKING = 128  # width of the network that turns what is told into what is looked for
+_WAVES = 4  # of which the place of a pixel is told to key-points that are asked for, along either side
 
 
 class ResidualBlock(nn.Module):
-    """x + conv(silu(norm(x))) of [B, channels, H, W]."""
+    """x + conv(silu(norm(x))) of [B, channels, H, W]; with `told` numbers [B, told] what is normalised is
+    scaled and shifted by what they say (FiLM, Perez et al. 2018), at first not at all.
+    """
 
-    def __init__(self, channels: int):
+    def __init__(self, channels: int, told: int = 0):
         super().__init__()
         self.norm = nn.GroupNorm(8, channels)
         self.conv = nn.Conv2d(channels, channels, 3, padding=1)
+        self.film = nn.Linear(told, 2 * channels) if told else None
+        if self.film is not None:
+            nn.init.zeros_(self.film.weight)
+            nn.init.zeros_(self.film.bias)
 
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.conv(F.silu(self.norm(x)))
+    def forward(self, x: Tensor, told: Tensor | None = None) -> Tensor:
+        y = self.norm(x)
+        if self.film is not None:
+            gain, shift = self.film(told)[:, :, None, None].chunk(2, 1)
+            y = y * (1 + gain) + shift
+        return x + self.conv(F.silu(y))
 
 
 class MultiViewEncoder(nn.Module):
     """One convolutional trunk for all views; each view has its own embedding and its own key-points.
 
     It says three things of every view: where soft key-points are (spatial soft-argmax, Finn et al. 2016),
-    what the features look like there, and a coarse grid of features. What some key-points look for may hang
-    on the words: where many things lie about, they find the one that is spoken of.
+    what the features look like there, and a coarse grid of features. What some key-points look for, and
+    where, may hang on what the encoder is told beside the pictures, such as the instruction: where many
+    things lie about, they find the one that is spoken of. The features themselves hang on it then, too.
 
     Args:
         spec: what the world shows.
@@ -44,11 +57,11 @@ class MultiViewEncoder(nn.Module):
         blocks: residual blocks at the lowest resolution.
         grid: rows and columns of the coarse grid.
         cameras: which are looked through (Embodiment.views_of); the others cost nothing.
-        asked: key-points per view that look for what the words say, beside `points`.
-        words: numbers that an instruction is encoded as, of `asked` key-points.
+        asked: key-points per view that look for what the encoder is told, beside `points`.
+        told: numbers that it is told, of `asked` key-points.
 
     Forward takes uint8, or float in -1..1, [B, V, 3 * pictures, H, W] of all cameras, and with `asked`
-    key-points float32 [B, words]; it returns float32 [B, out_features].
+    key-points float32 [B, told]; it returns float32 [B, out_features].
     """
 
     def __init__(
@@ -61,7 +74,7 @@ class MultiViewEncoder(nn.Module):
         grid: int = 4,
         cameras: str | Sequence[str] = "all",
         asked: int = 0,
-        words: int = 0,
+        told: int = 0,
     ):
         super().__init__()
         self.chosen = list(spec.embodiment.views_of(cameras))
@@ -74,51 +87,89 @@ class MultiViewEncoder(nn.Module):
         self.view = nn.Parameter(0.02 * torch.randn(views, width))
         self.norm = nn.GroupNorm(8, width)
         self.down = nn.Conv2d(width, deep, 3, stride=2, padding=1)
-        self.blocks = nn.Sequential(*(ResidualBlock(deep) for _ in range(blocks)))
+        self.blocks = nn.ModuleList(ResidualBlock(deep, told if asked else 0) for _ in range(blocks))
         self.norm_out = nn.GroupNorm(8, deep)
         self.fine = nn.Conv2d(width, width, 1)
         self.lift = nn.Conv2d(deep, width, 1)
         self.heat = nn.Parameter(torch.randn(views, points, width) / width**0.5)
         # Sharp from the start: over a near-uniform softmax, key-points sit in the middle and hardly learn.
-        self.temperature = nn.Parameter(torch.full((views, points + asked, 1), 2.3))
+        self.temperature = nn.Parameter(torch.full((views, points, 1), 2.3))
         self.look = nn.Parameter(torch.randn(views, points + asked, width, _LOOK) / width**0.5)
-        if asked:
-            self.ask = nn.Sequential(
-                nn.Linear(words, words), nn.SiLU(), nn.Linear(words, views * asked * width)
-            )
+        self.asked = Asked(views, asked, width, told) if asked else None
         # Pooled before it is convolved, which is the same and sixteen times cheaper.
         self.grid = nn.Sequential(
             nn.AdaptiveAvgPool2d(grid), nn.Conv2d(deep, width, 1), nn.SiLU(), nn.Flatten()
         )
         self.out_features = views * ((points + asked) * (2 + _LOOK) + width * grid * grid)
 
-    def forward(self, pictures: Tensor, words: Tensor | None = None) -> Tensor:
+    def forward(self, pictures: Tensor, told: Tensor | None = None) -> Tensor:
+        return self.gaze(pictures, told)[0]
+
+    def gaze(self, pictures: Tensor, told: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """What `forward` returns, and how well every pixel fits what each key-point looks for: logits float32
+        [B, views looked through, points + asked, h, w] at the encoder's finest resolution.
+        """
         pictures = pictures[:, self.chosen]
         batch, views = pictures.shape[:2]
         flat = to_signed(pictures).flatten(0, 1).contiguous(memory_format=torch.channels_last)
         x = self.halve(self.stem(flat))
         x = F.silu(self.norm(x + self.view.repeat(batch, 1)[:, :, None, None]))
-        y = F.silu(self.norm_out(self.blocks(self.down(x))))
+        y = self.down(x)
+        of_views = None if told is None else told.repeat_interleave(views, 0)
+        for block in self.blocks:
+            y = block(y, of_views)
+        y = F.silu(self.norm_out(y))
         # Coarse features say what it is, fine ones where exactly.
         x = F.silu(self.fine(x) + F.interpolate(self.lift(y), size=x.shape[-2:], mode="nearest"))
         height, width = x.shape[-2:]
         places = x.flatten(2).unflatten(0, (batch, views)).float()  # [B, V, C, H * W]
-        share = ((self._sought(words) @ places) * self.temperature.exp()).softmax(-1)  # [B, V, P, H * W]
+        found = (self.heat @ places) * self.temperature.exp()  # [B, V, P, H * W]
+        if self.asked is not None:
+            found = torch.cat((found, self.asked(places, told, (height, width))), 2)
+        share = found.softmax(-1)
         looks = torch.einsum("bvpc,vpcl->bvpl", share @ places.transpose(-1, -2), self.look)
         said = (
             centres(share.unflatten(-1, (height, width))).flatten(1),
             looks.flatten(1),
             self.grid(y).float().unflatten(0, (batch, views)).flatten(1),
         )
-        return torch.cat(said, -1)
+        return torch.cat(said, -1), found.unflatten(-1, (height, width))
 
-    def _sought(self, words: Tensor | None) -> Tensor:
-        """What key-points look for, [V, P, C] or, with words [B, words], [B, V, P, C]."""
-        if words is None:
-            return self.heat
-        views, _, width = self.heat.shape
-        spoken = self.ask(words).reshape(len(words), views, -1, width)
-        return torch.cat((self.heat.expand(len(words), -1, -1, -1), spoken), 2)
+
+class Asked(nn.Module):
+    """Key-points that look for what they are told, by what things look like and by where they are.
+
+    Args:
+        views: cameras; each is asked otherwise.
+        points: key-points per view.
+        width: channels of the features.
+        told: numbers that say what to look for.
+
+    Forward takes features float [B, V, width, H * W], what is told [B, told] and (H, W), and returns how well
+    every pixel fits, [B, V, points, H * W].
+    """
+
+    def __init__(self, views: int, points: int, width: int, told: int):
+        super().__init__()
+        self.views, self.points, keys = views, points, width + 4 * _WAVES
+        self.ask = nn.Sequential(
+            nn.Linear(told, _ASKING), nn.SiLU(), nn.Linear(_ASKING, views * points * keys)
+        )
+        self.temperature = nn.Parameter(torch.full((points, 1), 1.0 - 0.5 * math.log(keys)))
+
+    def forward(self, places: Tensor, told: Tensor | None, size: tuple[int, int]) -> Tensor:
+        assert told is not None
+        sought = self.ask(told).unflatten(-1, (self.views, self.points, -1))
+        features, where = sought.split((places.shape[2], 4 * _WAVES), -1)
+        return (features @ places + where @ waves(size, places.device)) * self.temperature.exp()
+
+
+def waves(size: tuple[int, int], device: torch.device) -> Tensor:
+    """Sines and cosines of the places of pixels, [4 * _WAVES, H * W]; the slowest turns by a half."""
+    v, u = (pixel_centres(count, device) for count in size)
+    along = torch.stack(torch.meshgrid(v, u, indexing="ij")).flatten(1)  # [2, H * W]
+    turns = torch.arange(1, _WAVES + 1, device=device)[:, None, None] * along * (math.pi / 2)
+    return torch.cat((turns.sin(), turns.cos())).flatten(0, 1)
 
 
 def pixel_centres(count: int, device: torch.device) -> Tensor:

@@ -14,6 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.episodes.clips import ClipStore
+from envs.targets import ConfigError
 
 
 @dataclass
@@ -102,10 +103,10 @@ def decision_points(store: ClipStore, episodes: Tensor) -> tuple[Tensor, Tensor]
     """Episode and frame, each int64 [N], of all chunks of `episodes` that were begun.
 
     Raises:
-        ValueError: if there are none.
+        ConfigError: if there are none.
     """
     if not len(episodes):
-        raise ValueError(
+        raise ConfigError(
             "no recorded episode is left to begin imagined ones in; deploy or collect more, or set"
             " rl.starts=first"
         )

@@ -11,6 +11,8 @@ import difflib
 import importlib
 import inspect
 import re
+import sys
+import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, is_dataclass
 from functools import lru_cache, partial
@@ -18,6 +20,7 @@ from typing import Any, TypeVar, get_type_hints
 
 T = TypeVar("T")
 TARGET = "_target_"
+ROOMS = ("envs", "actors", "learners", "pipeline")  # packages of this repository
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,8 @@ def build(section: Mapping[str, Any], key: str, **context: Any) -> Any:
     except ConfigError:
         raise
     except (TypeError, ValueError, ImportError) as error:
-        raise ConfigError(f"{key} ({section[TARGET]}): {error}") from error
+        where = _place(error, getattr(factory, "__module__", ""))
+        raise ConfigError(f"{key} ({section[TARGET]}): {error}{where}") from error
 
 
 def options(kind: type[T], section: Mapping[str, Any], key: str) -> T:
@@ -220,6 +224,17 @@ def _allowed(error: Mapping[str, Any]) -> str:
     said = str(error["msg"]).replace("an instance of Sequence", "a list")
     wanted = re.sub(r"^\w+ should ", "", said)
     return wanted if wanted != said else f"be something else: {said}"
+
+
+def _place(error: Exception, module: str) -> str:
+    """Where a module of somebody else raised an error, as " (my_suite.py, line 34)": what Python says of a
+    slip names no place. "" for ours, whose words say what to change.
+    """
+    if module.split(".")[0] in ROOMS:
+        return ""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    lines = [step.lineno for step in traceback.extract_tb(error.__traceback__) if step.filename == file]
+    return f" ({file}, line {lines[-1]})" if lines else ""
 
 
 def _has(value: Any, position: int) -> bool:

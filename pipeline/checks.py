@@ -15,7 +15,15 @@ from actors.serving.sessions import ServeConfig
 from envs.conditioning import PoseMapStyle
 from envs.simulators.base import WORLD_OPTIONS
 from envs.specs import Rewards
-from envs.targets import ConfigError, nearest, options, section_faults, unknown_names, value_faults
+from envs.targets import (
+    ConfigError,
+    nearest,
+    options,
+    section_faults,
+    target,
+    unknown_names,
+    value_faults,
+)
 from learners.rl.algorithm import RLConfig
 from learners.stages.simulator import SimulatorFitConfig
 from learners.training.fit import FitConfig
@@ -212,6 +220,7 @@ def _together(cfg: Cfg) -> Iterator[str]:
         )
     if rl["evaluate_every"] and not task.get("suite"):
         yield f"rl.evaluate_every={rl['evaluate_every']} needs physics, which this task has not; set it to 0"
+    yield from _learning(cfg)
     try:
         acting(cfg)
     except ConfigError as error:
@@ -231,6 +240,25 @@ def _together(cfg: Cfg) -> Iterator[str]:
                 options(FitConfig, {**section, "microbatches": parts}, key)
             except ConfigError as error:
                 yield str(error)
+
+
+def _learning(cfg: Cfg) -> Iterator[str]:
+    """What of an algorithm, its loop and rewards does not go together; stages would find it hours later."""
+    rl, task, kind = cfg["rl"], cfg["task"], target(cfg["algorithm"], "algorithm")
+    name = getattr(kind, "name", kind.__name__)
+    if rl["rewards_later"] and not getattr(kind, "supports_delayed_reward", True):
+        yield (
+            f"rl.rewards_later=true, but algorithm={name} learns from every step as it was rewarded; use grpo"
+            " or filtered_bc"
+        )
+    if rl["schedule"] == "async" and rl["queue"] < rl["shards"]:
+        yield f"rl.queue={rl['queue']} must hold at least the rl.shards={rl['shards']} jobs of one iteration"
+    short = rl["chunks"] is not None and rl["chunks"] * task["chunk"] < task["horizon"]
+    if short and not getattr(kind, "bootstraps", True) and not cfg["judge"]["rewards"]["progress"]:
+        yield (
+            f"rl.chunks={rl['chunks']} cuts episodes short, and neither a critic (algorithm={name}) nor"
+            " judge.rewards.progress=0 says what the rest is worth; set rl.chunks=null"
+        )
 
 
 def _at(cfg: Cfg, path: str) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +27,7 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
     Raises:
         ConfigError: for unknown keys or choices and values that cannot work, naming the nearest fix.
     """
-    try:
-        cfg = composed(overrides)
-    except ConfigError:
-        raise
-    except Exception as error:  # for simulator=null and the like Hydra raises a bare ValueError
-        raise ConfigError(_unknown_key(overrides) or _unreadable(overrides, error)) from error
+    cfg = read_config(overrides)
     from pipeline.checks import faults  # needs torch, which an unknown key should not wait for
 
     if wrong := faults(cfg):
@@ -39,19 +35,36 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
     return cfg
 
 
+def read_config(overrides: Sequence[str]) -> dict[str, Any]:
+    """The resolved config, whose values nobody has looked at.
+
+    Raises:
+        ConfigError: for unknown keys or choices, naming the nearest fix.
+    """
+    try:
+        return composed(overrides)
+    except ConfigError:
+        raise
+    except Exception as error:  # for simulator=null and the like Hydra raises a bare ValueError
+        raise ConfigError(_unknown_key(overrides) or _unreadable(overrides, error)) from error
+
+
 def groups() -> list[str]:
     """Names of the folders of choices."""
     return sorted(p.name for p in CONFIGS.iterdir() if p.is_dir() and not p.name.startswith("_"))
 
 
-def choices(group: str) -> list[str]:
-    """What can be chosen for a group, such as policy."""
-    return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
+def choices(group: str, overrides: Sequence[str] = ()) -> list[str]:
+    """What can be chosen for a group, such as policy: in configs/, and in folders that
+    hydra.searchpath=[file://FOLDER] among the overrides names.
+    """
+    folders = [CONFIGS, *_searched(overrides)]
+    return sorted({path.stem for folder in folders for path in (folder / group).glob("*.yaml")})
 
 
 def offered(group: str, choice: str, overrides: Sequence[str]) -> bool:
-    """Whether a group has a choice: in configs/, or in a folder that hydra.searchpath names."""
-    if choice in choices(group):
+    """Whether a group has a choice: in configs/, or in a folder or package that hydra.searchpath names."""
+    if choice in choices(group, overrides):
         return True
     elsewhere = [word for word in overrides if word.startswith("hydra.searchpath=")]
     try:
@@ -104,11 +117,18 @@ def _leaves(section: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield str(key), value
 
 
+def _searched(overrides: Sequence[str]) -> list[Path]:
+    """Folders with choices of somebody's own."""
+    values = [word.partition("=")[2] for word in overrides if word.startswith("hydra.searchpath=")]
+    names = [part.strip(" '\"") for value in values for part in value.strip("[]").split(",")]
+    return [Path(name.removeprefix("file://")) for name in names if name.startswith("file://")]
+
+
 def _unknown_key(overrides: Sequence[str]) -> str:
     """What to say of the first override whose key does not exist, "" if all do."""
-    choices = [word for word in overrides if word.split("=")[0] in groups()]
+    chosen = [word for word in overrides if word.split("=")[0] in (*groups(), "hydra.searchpath")]
     try:
-        base = composed(choices)
+        base = composed(chosen)
     except Exception:  # a choice is what is wrong
         return ""
     paths = list(_paths(base))
@@ -116,16 +136,32 @@ def _unknown_key(overrides: Sequence[str]) -> str:
         key = word.split("=")[0]
         if not key:
             return f"{word} names no key; say key=value"
-        if word in choices or key.startswith(("+", "~")) or key in paths:
+        if word in chosen or key.startswith(("+", "~")) or key in paths:
             continue
+        if elsewhere := _other_choices(key, chosen):
+            return f"{key} is no key of the {key.partition('.')[0]} that is chosen, but of {elsewhere}"
         parent = key.rpartition(".")[0]
         siblings = [path for path in paths if path.rpartition(".")[0] == parent]
         same = [path for path in paths if path.rpartition(".")[2] == key.rpartition(".")[2]]
         near = difflib.get_close_matches(key, paths, 3, 0.75)
         if near or same:
-            return f"{key} is not a key; did you mean {' or '.join((near + same)[:3])}?"
+            return f"{key} is not a key; did you mean {' or '.join(list(dict.fromkeys(near + same))[:3])}?"
         return f"{key} is not a key{nearest(key, siblings or [*base, *groups()])}"
     return ""
+
+
+def _other_choices(key: str, chosen: Sequence[str]) -> str:
+    """Which other choices of its group have a key, such as simulator=gesim; "" if none has."""
+    group = key.partition(".")[0]
+    if group not in groups():
+        return ""
+    found = []
+    for name in choices(group, chosen):
+        others = [word for word in chosen if word.split("=")[0] != group]
+        with suppress(Exception):  # one that does not go with the others is no advice
+            if key in _paths(composed([*others, f"{group}={name}"])):
+                found.append(f"{group}={name}")
+    return " or ".join(found)
 
 
 def _unreadable(overrides: Sequence[str], error: Exception) -> str:
@@ -139,6 +175,10 @@ def _unreadable(overrides: Sequence[str], error: Exception) -> str:
             where, error = f"{word} cannot be read: ", found
             break
         taken.append(word)
+    if "Ambiguous value" in str(error):
+        word = where.removesuffix(" cannot be read: ")
+        key, _, value = word.partition("=")
+        return f"{word} names several values, and a run takes one: say a list as {key}=[{value}], or run each"
     text = str(error).split("\nSee https")[0].split("\nfull_key")[0].strip()
     return (
         f"{where}{text}\nGroups are {', '.join(groups())}; `worldloop config` prints every key and its value."

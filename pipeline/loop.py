@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from envs.episodes.formats.lerobot_columns import SUCCESS
+from envs.episodes.formats.lerobot_files import read_info
 from envs.manifest import digest_of
-from envs.targets import target
+from envs.targets import ConfigError, target
 from pipeline.acting import acting
 from pipeline.graph.graph import Graph
 from pipeline.graph.workers import learners_of
@@ -65,6 +67,26 @@ def build_loop(cfg: Cfg, root: Path, with_rl: bool = True) -> Graph:
 def has_physics(cfg: Cfg) -> bool:
     """Whether the task is one that can be tried; else there are recordings only (task.data)."""
     return bool(cfg["task"].get("suite"))
+
+
+def check_labels(cfg: Cfg, graph: Graph, until: str = "") -> None:
+    """See that recordings say what the judge is taught by, hours before it is its turn.
+
+    Args:
+        until: the last node that is wanted; "" wants all.
+
+    Raises:
+        ConfigError: naming the column and the fix.
+    """
+    judge: Any = target(cfg["judge"], "judge")
+    if has_physics(cfg) or not judge.needs_labels or (until and "judge-1" not in graph.needs(until)):
+        return
+    if not any(SUCCESS in read_info(Path(folder))["features"] for folder in cfg["task"]["data"]):
+        raise ConfigError(
+            f"judge={cfg['judge']['_target_']} learns from success, which no data set of"
+            f" task.data={cfg['task']['data']} says; record {SUCCESS}, or choose a judge that needs none, as"
+            " judge=goal_image judge.picture=<file> or judge=vlm"
+        )
 
 
 def last_round(cfg: Cfg) -> int:
@@ -149,8 +171,8 @@ def _extra_starts(graph: Graph, cfg: Cfg) -> list[str]:
 def _data_loop(graph: Graph, cfg: Cfg) -> None:
     mark = collect.fingerprint(cfg["task"]["data"])
     data = [graph.add("recordings", collect.recordings, fingerprint=mark)]
-    made = add_world(graph, cfg, data, World(), 1)
     first = graph.add("imitation", imitation.imitation, {"data": data})
+    made = add_world(graph, cfg, data, World(), 1)
     starts = _extra_starts(graph, cfg)
     policy = _learn(graph, cfg, data, made, first, 1, starts, deployed=0)
     _conclude(graph, data, made, first, policy, {})

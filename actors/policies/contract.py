@@ -12,9 +12,11 @@ Whatever else a policy has is used if it is there:
 - `encoder`: the module that writes those, if it can be run alone;
 - `trained`: the part that learners train and score, if that is not all of it;
 - `freeze_perception()`: for rl.freeze_perception;
-- `normalise(chunks [N, K, A], states [N, S])`: takes units from demonstrations;
+- `normalise(chunks [N, K, A], states [N, S], commands in force [N, A])`: takes units from demonstrations;
 - `policy_features(observed)` [B, width] and `width`: through them perception is taught on all recorded
   frames;
+- `gaze(observed)`, those features and what key-points look for (vla.py), `asked` and `views`: the last
+  `asked` key-points are taught where hands go;
 - `imitation_loss(observed, chunks [B, K, A])`: a better one than the negative log-likelihood.
 """
 

@@ -60,7 +60,7 @@ class MainViewPolicy(TensorDictModuleBase):
         return self.policy.get_dist(self._main_view(observed))  # type: ignore[no-any-return]
 
     @torch.no_grad()
-    def normalise(self, chunks: Tensor, states: Tensor) -> None:
+    def normalise(self, chunks: Tensor, states: Tensor, commands: Tensor) -> None:
         """Let tokens span demonstrated chunks [N, K, A] and a tenth more on either side."""
         rows = chunks.flatten(0, 1)
         low, high = rows.amin(0), rows.amax(0)

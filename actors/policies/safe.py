@@ -11,6 +11,7 @@ from torch import Tensor
 
 from actors.policies.contract import VISUAL_FEATURES, input_keys, inputs_for
 from envs.specs import CHUNK, COMMAND, INVALID_ACTION, LOG_PROB, ActionMode, WorldSpec
+from envs.targets import ConfigError
 
 
 class SafePolicyWrapper(TensorDictModuleBase):
@@ -36,7 +37,7 @@ class SafePolicyWrapper(TensorDictModuleBase):
         """Writes what the policy writes, and INVALID_ACTION bool [B, 1].
 
         Raises:
-            ValueError: if the policy's chunks are of another size than the world takes.
+            ConfigError: if the policy's chunks are of another size than the world takes.
         """
         said = self.policy(inputs_for(observed, self.policy))
         for key in self.policy.out_keys:
@@ -45,7 +46,7 @@ class SafePolicyWrapper(TensorDictModuleBase):
                 observed[key] = value.to(observed[COMMAND].device)
         chunk = observed[CHUNK]
         if tuple(chunk.shape[1:]) != (self.spec.chunk, self.spec.action_dim):
-            raise ValueError(
+            raise ConfigError(
                 f"the policy says chunks {list(chunk.shape[1:])}, but {self.spec.embodiment.robot} takes"
                 f" [{self.spec.chunk}, {self.spec.action_dim}]; build it for this robot and task.chunk"
             )

@@ -11,25 +11,68 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
 
 from actors.policies.contract import POLICY_FEATURES, VISUAL_FEATURES
 from actors.policies.heads import RESOLUTION, Head, varying
+from envs.embodiment import Embodiment
 from envs.encoders import MultiViewEncoder
 from envs.language import TextEncoder
 from envs.ranges import Count, Natural
-from envs.specs import CHUNK, IMAGE, INSTRUCTION_UTF8, LOG_PROB, STATE, WorldSpec
+from envs.specs import CHUNK, COMMAND, IMAGE, INSTRUCTION_UTF8, LOG_PROB, STATE, WorldSpec
 from envs.targets import build
 
 _TEXT_FEATURES = 32
-_STATE_FEATURES = 64
-_WORDS = 64  # numbers that say what key-points shall look for
+_BODY_FEATURES = 64
+_WORDS = 64  # numbers of the instruction that say what key-points shall look for
+_BLOCKS = 2  # residual blocks of an encoder whose features hang on what it is told
+
+
+def body_keys(robot: Embodiment) -> tuple[NestedKey, ...]:
+    """What a policy reads of the robot itself: its state, and the command in force where it says a place.
+
+    Chunks may be meant relative to that, and it is exact where states are measured or imagined. Of commands
+    that are changes, the one in force says only what was done last, which imitation would copy.
+    """
+    return (STATE,) if robot.delta else (STATE, COMMAND)
+
+
+class Body(nn.Module):
+    """What the robot knows of itself, in units of its own spread.
+
+    Args:
+        robot: whose.
+
+    Forward takes the values of `body_keys`, float [..., S] and [..., A], and returns float32 [..., size]
+    within -5..5.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, robot: Embodiment):
+        super().__init__()
+        self.size = len(robot.state_names) + (0 if robot.delta else robot.action_dim)
+        self.register_buffer("mean", torch.zeros(self.size))
+        self.register_buffer("std", torch.ones(self.size))
+
+    @torch.no_grad()
+    def normalise(self, *values: Tensor) -> None:
+        """Take units from values [N, S] and [N, A]; what hardly varies keeps its own."""
+        joined = torch.cat(values, -1)
+        spread = joined.std(0, unbiased=False)
+        self.mean.copy_(joined.mean(0))
+        self.std.copy_(torch.where(spread > RESOLUTION, spread, 1.0))
+
+    def forward(self, *values: Tensor) -> Tensor:
+        return ((torch.cat(values, -1) - self.mean) / self.std).clamp(-5, 5)
 
 
 class Perception(nn.Module):
-    """Encodes pictures and the instruction.
+    """Encodes pictures and the instruction; key-points that are asked for look where the instruction and the
+    robot's own body say.
 
     Args:
         spec: what the world shows.
@@ -38,51 +81,60 @@ class Perception(nn.Module):
 
     def __init__(self, spec: WorldSpec, points: int, width: int, cameras: str | Sequence[str], asked: int):
         super().__init__()
-        self.views = MultiViewEncoder(spec, points, width, cameras=cameras, asked=asked, words=_WORDS)
+        told, blocks = (_WORDS + _BODY_FEATURES, _BLOCKS) if asked else (0, 1)
+        self.views = MultiViewEncoder(
+            spec, points, width, blocks=blocks, cameras=cameras, asked=asked, told=told
+        )
         self.text = TextEncoder(_TEXT_FEATURES)
         self.words = TextEncoder(_WORDS) if asked else None
+        self.body = Body(spec.embodiment) if asked else None
+        self.posture = _of_body(self.body.size) if self.body is not None else None
         self.out_features = self.views.out_features + _TEXT_FEATURES
+        self.in_keys = [IMAGE, INSTRUCTION_UTF8, *(body_keys(spec.embodiment) if asked else ())]
 
-    def forward(self, image: Tensor, text: Tensor) -> Tensor:
-        """uint8, or float in -1..1, [..., V, 3, H, W] and bytes uint8 [..., TEXT_BYTES] -> float32 [...,
-        out_features].
+    def forward(self, image: Tensor, text: Tensor, *body: Tensor) -> Tensor:
+        """Pictures uint8, or float in -1..1, [..., V, 3, H, W], bytes uint8 [..., TEXT_BYTES] and the further
+        `in_keys` -> float32 [..., out_features].
         """
-        lead = image.shape[:-4]
-        flat = text.reshape(-1, text.shape[-1])
-        words = self.words(flat) if self.words is not None else None
-        seen = self.views(image.reshape(-1, *image.shape[-4:]), words)
-        said = self.text(flat)
-        return torch.cat((seen, said), -1).reshape(*lead, -1)
+        lead, flat = image.shape[:-4], (value.flatten(0, -2) for value in (text, *body))
+        return self.gaze(image.reshape(-1, *image.shape[-4:]), *flat)[0].reshape(*lead, -1)
+
+    def gaze(self, image: Tensor, text: Tensor, *body: Tensor) -> tuple[Tensor, Tensor]:
+        """Features of observations [B], and what each key-point looks for, as MultiViewEncoder.gaze."""
+        told = None
+        if self.words is not None and self.body is not None and self.posture is not None:
+            told = torch.cat((self.words(text), self.posture(self.body(*body))), -1)
+        seen, found = self.views.gaze(image, told)
+        return torch.cat((seen, self.text(text)), -1), found
 
 
 class Fusion(nn.Module):
-    """Joins visual features with the robot's state.
+    """Joins visual features with what the robot knows of itself.
 
     Args:
         visual: number of visual features.
-        states: numbers of the robot's state, S.
+        robot: whose.
         width: size of the output.
     """
 
-    state_mean: Tensor
-    state_std: Tensor
-
-    def __init__(self, visual: int, states: int, width: int):
+    def __init__(self, visual: int, robot: Embodiment, width: int):
         super().__init__()
-        self.register_buffer("state_mean", torch.zeros(states))
-        self.register_buffer("state_std", torch.ones(states))
+        self.body = Body(robot)
         self.norm = nn.LayerNorm(visual)
-        self.state = nn.Sequential(
-            nn.Linear(states, _STATE_FEATURES), nn.SiLU(), nn.Linear(_STATE_FEATURES, _STATE_FEATURES)
-        )
+        self.state = _of_body(self.body.size)
         self.mix = nn.Sequential(
-            nn.Linear(visual + _STATE_FEATURES, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU()
+            nn.Linear(visual + _BODY_FEATURES, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU()
         )
 
-    def forward(self, visual: Tensor, state: Tensor) -> Tensor:
-        """float [..., visual], float [..., S] -> float32 [..., width]."""
-        proprio = ((state - self.state_mean) / self.state_std).clamp(-5, 5)
-        return self.mix(torch.cat((self.norm(visual), self.state(proprio)), -1))
+    def forward(self, visual: Tensor, *body: Tensor) -> Tensor:
+        """float [..., visual] and the values of `body_keys` -> float32 [..., width]."""
+        return self.mix(torch.cat((self.norm(visual), self.state(self.body(*body))), -1))
+
+
+def _of_body(size: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(size, _BODY_FEATURES), nn.SiLU(), nn.Linear(_BODY_FEATURES, _BODY_FEATURES)
+    )
 
 
 class ChunkPolicy(ProbabilisticTensorDictSequential):
@@ -94,9 +146,10 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         width: of the hidden vector.
         points, channels: key-points per view and width of the encoder.
         cameras: which it looks through: "all", "main", or names.
-        asked: key-points per view that look for what the instruction says.
+        asked: key-points per view that look for what the instruction says, with an encoder that is told it.
 
-    Reads image, state and the instruction's bytes; writes ("vla_action", "chunk") and its log-probability.
+    Reads image, the instruction's bytes, state and, of robots whose commands say places, the command in
+    force; writes ("vla_action", "chunk") and its log-probability.
 
     Raises:
         ConfigError: if the head cannot be built.
@@ -114,10 +167,10 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         asked: Natural,
     ):
         eyes = Perception(spec, points, channels, cameras, asked)
-        perception = TensorDictModule(eyes, in_keys=[IMAGE, INSTRUCTION_UTF8], out_keys=[VISUAL_FEATURES])
+        perception = TensorDictModule(eyes, in_keys=eyes.in_keys, out_keys=[VISUAL_FEATURES])
         fusion = TensorDictModule(
-            Fusion(eyes.out_features, spec.state_dim, width),
-            in_keys=[VISUAL_FEATURES, STATE],
+            Fusion(eyes.out_features, spec.embodiment, width),
+            in_keys=[VISUAL_FEATURES, *body_keys(spec.embodiment)],
             out_keys=[POLICY_FEATURES],
         )
         action_head: Head = build(head, "policy.head", width=width, chunk=spec.chunk, actions=spec.action_dim)
@@ -173,8 +226,26 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         """
         seen = observed.get(VISUAL_FEATURES, None)
         if seen is None:
-            seen = self.perception(observed[IMAGE], observed[INSTRUCTION_UTF8])
-        return self.fusion(seen, observed[STATE])
+            seen = self.perception(*(observed[key] for key in self.perception.in_keys))
+        return self.fusion(seen, *(observed[key] for key in body_keys(self.spec.embodiment)))
+
+    @property
+    def asked(self) -> int:
+        """Key-points per view, the last ones, that look for what perception is told."""
+        return self.perception.views.asked.points if self.perception.views.asked is not None else 0
+
+    @property
+    def views(self) -> list[int]:
+        """Numbers of the cameras that it looks through."""
+        return self.perception.views.chosen
+
+    def gaze(self, observed: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """`policy_features` of observations [B], and what each key-point looks for: logits float32 [B, views,
+        points, h, w].
+        """
+        eyes = self.perception
+        seen, found = eyes.gaze(*(observed[key] for key in eyes.in_keys))
+        return self.fusion(seen, *(observed[key] for key in body_keys(self.spec.embodiment))), found
 
     @property
     def trained(self) -> ProbabilisticTensorDictSequential:
@@ -191,16 +262,17 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         self.frozen = True
 
     @torch.no_grad()
-    def normalise(self, chunks: Tensor, states: Tensor) -> None:
+    def normalise(self, chunks: Tensor, states: Tensor, commands: Tensor) -> None:
         """Take units from demonstrations; numbers that hardly vary become constants (heads.varying).
 
         Args:
-            chunks: [N, K, A] as the policy will emit them; states: [N, S].
+            chunks: [N, K, A] as the policy will emit them; states: [N, S]; commands: [N, A] in force.
         """
-        self.head.normalise(chunks, varying(chunks, self.spec.embodiment))
-        spread = states.std(0, unbiased=False)
-        self.fusion.state_mean.copy_(states.mean(0))
-        self.fusion.state_std.copy_(torch.where(spread > RESOLUTION, spread, 1.0))
+        robot = self.spec.embodiment
+        self.head.normalise(chunks, varying(chunks, robot))
+        for body in (self.fusion.body, self.perception.body):
+            if body is not None:
+                body.normalise(*((states,) if robot.delta else (states, commands)))
 
     def disagreement(self, one: TensorDictBase, other: TensorDictBase) -> Tensor:
         """By how much the head says something else of observations [B] than of others."""

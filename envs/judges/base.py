@@ -44,6 +44,7 @@ class Judge(nn.Module):
         threshold: probability from which a frame counts as success; calibration sets it later.
 
     Attributes:
+        needs_labels: whether it is taught by recorded success, and cannot do without.
         reads_features: whether `score` must be given the simulator's features of the frames.
         discount: per frame, of the progress that `loss` is given: discount ** (frames until success).
         calibrates: whether the threshold is to be set on recorded video (learners/stages/judge.py).
@@ -53,6 +54,7 @@ class Judge(nn.Module):
     """
 
     threshold: Tensor
+    needs_labels = False
     reads_features = False
     discount = 1.0
     calibrates = True

@@ -26,6 +26,8 @@ class FittedJudge(Judge):
         discount: per frame, of the progress target: discount ** (frames until success).
     """
 
+    needs_labels = True
+
     def __init__(self, hold: int, margin: float, discount: float):
         super().__init__(hold)
         self.margin, self.discount = margin, discount

@@ -49,6 +49,11 @@ class GoalJudge(Judge):
         self.metric = build(metric, "judge.metric")
         self.metric.requires_grad_(False)
 
+    @classmethod
+    def check(cls, options: Mapping[str, Any]) -> None:
+        """See Judge.check: what the metric needs is there."""
+        build(options["metric"], "judge.metric")
+
     def goals(self, first: Tensor, instruction: list[str]) -> Goals:
         """The goals of episodes that began with `first` uint8 [B, V, 3, H, W], on its device."""
         raise NotImplementedError

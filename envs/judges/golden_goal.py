@@ -51,6 +51,8 @@ class GoldenGoalJudge(GoalJudge):
         cache: goals remembered.
     """
 
+    needs_labels = True
+
     def __init__(
         self,
         spec: WorldSpec,
@@ -69,6 +71,13 @@ class GoldenGoalJudge(GoalJudge):
         self.imagined = self.unfinished = 0
         self._known: OrderedDict[bytes, tuple[Tensor, bool]] = OrderedDict()
         self.text_world.register_load_state_dict_post_hook(self._forget)
+
+    @classmethod
+    def check(cls, options: Mapping[str, Any]) -> None:
+        """See Judge.check: what metric and words need is there."""
+        super().check(options)
+        if words := options["text_world"].get("words"):
+            build(words, "judge.text_world.words")
 
     def goals(self, first: Tensor, instruction: list[str]) -> Goals:
         """See GoalJudge.goals; imagines those that are not remembered."""

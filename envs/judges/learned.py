@@ -49,7 +49,7 @@ class LearnedJudge(FrameJudge):
         super().__init__(hold, margin, discount)
         self.spec = spec
         self.encoder = MultiViewEncoder(
-            spec, points, width, pictures=2, cameras=cameras, asked=asked, words=_TEXT
+            spec, points, width, pictures=2, cameras=cameras, asked=asked, told=_TEXT
         )
         self.asked = asked
         self.words = TextEncoder(_TEXT)

@@ -16,6 +16,7 @@ from tensordict import TensorDict
 
 from actors.fleets.fleet import Fleet, FleetError, Result
 from actors.rollouts.host import Job, Stopwatch, Weights
+from envs.targets import ConfigError
 
 
 @dataclass
@@ -153,7 +154,7 @@ class AsyncFeed(Feed):
     def __post_init__(self) -> None:
         self._wave = self.first
         if self.queue < self.shards:
-            raise ValueError(
+            raise ConfigError(
                 f"rl.queue={self.queue} must hold at least the rl.shards={self.shards} jobs of one iteration"
             )
 

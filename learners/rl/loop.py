@@ -1,7 +1,7 @@
 """The reinforcement-learning loop: collect whole episodes, let an algorithm turn them into updates, watch for
 trouble.
 
-Rollouts come from a fleet (actors/fleet.py): this process or any number of Ray actors, in any world of this
+Rollouts come from a fleet (actors/fleets): this process or any number of Ray actors, in any world of this
 project; update.py learns from them. Every iteration starts fresh episodes and draws its randomness from
 (seed, iteration), so a run resumed from its checkpoint repeats what it would have done, and so do any number
 of actors. Of several workers that learn together (parallel.py), the first one has the fleet and shows the
@@ -27,6 +27,7 @@ from tqdm import tqdm
 from actors.fleets.fleet import EpisodeLedger, Fleet
 from actors.rollouts.host import Weights, trained_weights
 from envs.rng import iteration_generator, sampling_seed, update_seed
+from envs.targets import ConfigError
 from learners.rl.alarms import Alarms
 from learners.rl.algorithm import Algorithm, RLConfig
 from learners.rl.feed import AsyncFeed, Feed
@@ -230,17 +231,17 @@ def train_rl(
 
 def _check(fleet: Fleet, algorithm: Algorithm, config: RLConfig) -> None:
     if config.envs // config.shards != fleet.episodes:
-        raise ValueError(
+        raise ConfigError(
             f"rl.envs={config.envs} in rl.shards={config.shards} jobs are {config.envs // config.shards}"
             f" episodes each, but the hosts hold {fleet.episodes}"
         )
     if fleet.episodes % algorithm.group_size:
-        raise ValueError(
+        raise ConfigError(
             f"rl.envs / rl.shards = {fleet.episodes} must be a multiple of"
             f" algorithm.group={algorithm.group_size}, or groups would be torn apart"
         )
     if config.rewards_later and not algorithm.supports_delayed_reward:
-        raise ValueError(
+        raise ConfigError(
             f"rl.rewards_later=true, but algorithm={algorithm.name} learns from every step as it was"
             " rewarded; use grpo or filtered_bc"
         )

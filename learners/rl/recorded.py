@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from actors.policies.contract import action_key, device_of, distribution, inputs_for, trained_part
 from envs.episodes.clips import ClipStore
 from envs.specs import CHUNK, IMAGE, LOG_PROB, ActionMode
+from envs.targets import ConfigError
 from learners.rl.algorithm import Anchor
 from learners.stages.imitation import chunks_ahead
 from learners.stages.observed import observe
@@ -34,7 +35,7 @@ class RecordedDecisions:
         mode: how the numbers of the policy's chunks are meant.
 
     Raises:
-        ValueError: if the policy is scored on action tokens, which no recording holds.
+        ConfigError: if the policy is scored on action tokens, which no recording holds.
 
     Chunks are those that were carried out. Some the robot's limits have cut short of what the policy said; it
     would hardly ever say those, and they are left out.
@@ -42,7 +43,7 @@ class RecordedDecisions:
 
     def __init__(self, policy: TensorDictModuleBase, store: ClipStore, rollout: TensorDict, mode: ActionMode):
         if action_key(policy) != CHUNK:
-            raise ValueError(f"{type(policy).__name__} is scored on action tokens, and recordings hold none")
+            raise ConfigError(f"{type(policy).__name__} is scored on action tokens, and recordings hold none")
         self.policy, self.store = trained_part(policy), store
         pick = (rollout["valid"] & rollout["whole"]).flatten()
         self.known = rollout.exclude("next", "valid", "whole").flatten(0, 1)[pick].cpu()

@@ -25,6 +25,7 @@ from envs.specs import (
     ActionMode,
     to_chunk,
 )
+from envs.targets import ConfigError
 from learners.stages.observed import observe
 from learners.stages.pictures import augment
 from learners.stages.simulator import last_rows
@@ -60,6 +61,7 @@ class Cloning:
         self.rows = rows[store.arrays["present"][rows]]
         self.targets = chunks_ahead(store, self.rows, mode)
         self.states = store.arrays["states"][self.rows]
+        self.commands = store.arrays["commands"][self.rows]
         self.state_noise = _STATE_NOISE * self.states.std(0)
         self._features: Tensor | None = None
 
@@ -67,10 +69,10 @@ class Cloning:
         """Compute the policy's visual features of every frame once, for a policy whose perception is frozen.
 
         Raises:
-            ValueError: if the policy writes no ("policy", "visual_features").
+            ConfigError: if the policy writes no ("policy", "visual_features").
         """
         if VISUAL_FEATURES not in self.policy.out_keys:
-            raise ValueError(
+            raise ConfigError(
                 f"{type(self.policy).__name__} writes no {VISUAL_FEATURES}; set rl.freeze_perception=false"
             )
         encoder = feature_part(self.policy)
@@ -145,7 +147,7 @@ def train_imitation(
     """
     policy = cloning.policy
     if fresh and hasattr(policy, "normalise"):
-        policy.normalise(cloning.targets, cloning.states)
+        policy.normalise(cloning.targets, cloning.states, cloning.commands)
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         return cloning.loss(data, generator), {}

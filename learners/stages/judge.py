@@ -16,6 +16,7 @@ from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge, MissingFeatures
 from envs.judges.labels import progress_to_success, success_labels
 from envs.specs import Status
+from envs.targets import ConfigError
 from learners.stages.pictures import augment
 from learners.stages.simulator import owners
 from learners.training.fit import FitConfig, fit
@@ -41,7 +42,7 @@ class JudgeData:
         share: fraction of the labelled frames that show success.
 
     Raises:
-        ValueError: if no episode is labelled.
+        ConfigError: if no episode is labelled.
     """
 
     def __init__(
@@ -60,8 +61,8 @@ class JudgeData:
         known = store.arrays["present"][given["row"]] & torch.isfinite(self.labels[given["row"]])
         given = given[known]
         if not len(given):
-            raise ValueError(
-                "no episode of the data says whether it succeeded (next.success or next.reward), so a judge"
+            raise ConfigError(
+                "no episode of the data says whether it succeeded (next.success), so a judge"
                 " cannot learn from them; label some, or use a judge that needs no labels"
             )
         when = torch.arange(len(self.labels)) - torch.repeat_interleave(store.start, store.length)

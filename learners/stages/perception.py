@@ -1,8 +1,9 @@
 """Stage: teach a policy's perception on every recorded frame, good or bad, before it clones the few good
 ones.
 
-Two questions whose answers hang on where things are, and which every recording answers: what did whoever
-acted do next, given whether the episode went on to succeed; and how soon is success, as its discounted time.
+Questions whose answers hang on where things are, and which every recording answers: what did whoever acted
+do next, given whether the episode went on to succeed; how soon is success, as its discounted time; and, where
+cameras are calibrated and key-points are told what to look for, where hands will be seen (traces.py).
 """
 
 from __future__ import annotations
@@ -22,13 +23,15 @@ from envs.specs import ActionMode
 from learners.stages.imitation import Cloning
 from learners.stages.judge import frame_targets
 from learners.stages.observed import observe
+from learners.stages.traces import Hands, trace_loss
 from learners.training.fit import FitConfig, fit
 
+_TRACES = 0.1  # weight of where hands will be, beside the others
 _SPREAD = 1e-3  # of a number of the chunk below which it is a constant that nobody need predict
 
 
 class PerceptionTasks(nn.Module):
-    """Heads on a policy's features [B, width] that answer the two questions; they are dropped afterwards.
+    """Heads on a policy's features [B, width] that answer the questions; they are dropped afterwards.
 
     Args:
         policy: with `policy_features(observed) -> [B, width]` and `width`.
@@ -54,27 +57,36 @@ class PerceptionTasks(nn.Module):
         self.spread.copy_(chunks.std(0))
 
     def loss(
-        self, observed: TensorDict, chunks: Tensor, progress: Tensor
+        self, observed: TensorDict, chunks: Tensor, progress: Tensor, hands: Tensor | None = None
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Absolute error of the chunk, in its spread, plus cross-entropy of the discounted time to success.
+        """Absolute error of the chunk, in its spread, plus cross-entropies of the discounted time to success
+        and of where hands will be.
 
         Args:
             observed: [B], what the policy sees, its pictures float in -1..1.
             chunks: [B, K, A] that followed.
             progress: [B] discounted time to success, 0 in episodes that failed, NaN where nobody labelled.
+            hands: of Hands.ahead, of a policy that can `gaze`.
         """
-        hidden = self.policy.policy_features(observed)  # type: ignore[operator]
+        said: dict[str, Tensor] = {}
+        if hands is None:
+            hidden = self.policy.policy_features(observed)  # type: ignore[operator]
+        else:
+            hidden, found = self.policy.gaze(observed)  # type: ignore[operator]
+            said["traces"] = trace_loss(found[:, :, -self.policy.asked :], hands)  # type: ignore[operator]
         known = torch.isfinite(progress)
         won = (torch.nan_to_num(progress) > 0).float() - 0.5
         told = hidden + self.outcome(torch.where(known, won, 0.0)[:, None])
-        said = self.acted(F.silu(told)).unflatten(-1, tuple(self.centre.shape))
+        guess = self.acted(F.silu(told)).unflatten(-1, tuple(self.centre.shape))
         active = self.spread > _SPREAD
         wanted = (chunks - self.centre) / self.spread.clamp(min=_SPREAD)
-        acted = ((said - wanted).abs() * active).sum() / (active.sum().clamp(min=1) * len(chunks))
+        acted = ((guess - wanted).abs() * active).sum() / (active.sum().clamp(min=1) * len(chunks))
         logits = self.soon(hidden)[:, 0].float()
         soon = F.binary_cross_entropy_with_logits(logits, torch.nan_to_num(progress), reduction="none")
         soon = (soon * known).sum() / known.sum().clamp(min=1)
-        return acted + soon, {"action_error": acted.detach(), "time_to_success": soon.detach()}
+        total = acted + soon + _TRACES * said.get("traces", 0.0)
+        said |= {"action_error": acted, "time_to_success": soon}
+        return total, {name: value.detach() for name, value in said.items()}
 
 
 def train_perception(
@@ -85,6 +97,7 @@ def train_perception(
     options: FitConfig,
     folder: Path,
     discount: float,
+    hands: Hands,
     fresh: bool = True,
 ) -> dict[str, float]:
     """Train the perception of `policy` in place; does nothing for a policy without `policy_features`.
@@ -92,6 +105,7 @@ def train_perception(
     Args:
         episodes: all that may be learned from, whoever acted, int64 [N].
         discount: of the time to success, per frame.
+        hands: by which key-points that are told what to look for learn where hands will be.
         fresh: whether the policy has no units yet; it then takes them from these chunks first.
     """
     if not hasattr(policy, "policy_features") or not options.steps:
@@ -99,21 +113,26 @@ def train_perception(
     frames = Cloning(policy, store, episodes, mode)  # type: ignore[arg-type]
     progress = frame_targets(store, 1, discount)[1][frames.rows]
     if fresh and hasattr(policy, "normalise"):
-        policy.normalise(frames.targets, frames.states)  # type: ignore[operator]
+        policy.normalise(frames.targets, frames.states, frames.commands)  # type: ignore[operator]
     with torch.random.fork_rng(devices=[]):
         seed_process(options.seed)
         tasks = PerceptionTasks(policy, (store.spec.chunk, store.spec.action_dim))
     tasks.to(next(policy.parameters()).device)
     tasks.normalise(frames.targets)
 
+    asked: int = getattr(policy, "asked", 0)  # type: ignore[assignment]
+    traces = hands.ahead(store, frames.rows, policy.views) if asked else None  # type: ignore[arg-type]
+
     def batch(step: int, generator: torch.Generator) -> TensorDict:
         pick = torch.randint(len(frames.rows), (options.part,), generator=generator)
         data = {"target": frames.targets[pick], "progress": progress[pick]}
+        if traces is not None:
+            data["hands"] = traces[pick]
         return TensorDict({"observed": observe(store, frames.rows[pick]), **data}, [])
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         observed = frames.disturbed(data["observed"], generator)
-        # type: ignore[arg-type]
-        return tasks.loss(with_text(observed, policy), data["target"], data["progress"])
+        seen = with_text(observed, policy)  # type: ignore[arg-type]
+        return tasks.loss(seen, data["target"], data["progress"], data.get("hands", None))
 
     return fit("perception", tasks, batch, loss, options, folder, watch="action_error")

@@ -13,6 +13,7 @@ from torch import Tensor
 from envs.episodes.clips import ClipStore
 from envs.ranges import Count
 from envs.simulators.tokens.text_world import TextWorld
+from envs.targets import ConfigError
 from learners.stages.tokenizer import train_tokenizer
 from learners.training.fit import FitConfig, fit
 
@@ -75,11 +76,11 @@ def train_text_world(
         What `fit` does, how many episodes it learned from, and what the tokenizer's training says.
 
     Raises:
-        ValueError: if none of them is a success, or an instruction is longer than its encoder takes.
+        ConfigError: if none of them is a success, or an instruction is longer than its encoder takes.
     """
     good = episodes[[store.episodes[number]["success"] is True for number in episodes.tolist()]]
     if not len(good):
-        raise ValueError(
+        raise ConfigError(
             "no episode of the data is labelled a success (next.success), and a text world learns from those"
             " alone; collect or label some, or use a judge without judge.text_world"
         )

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from envs.episodes.clips import ClipStore
+from envs.targets import ConfigError
 from learners.training.fit import FitConfig, fit
 
 _UNITS = 256  # frames from which the latents' units are taken, and the last figures
@@ -71,11 +72,11 @@ def train_tokenizer(
         none.
 
     Raises:
-        ValueError: if the model has none that can be trained.
+        ConfigError: if the model has none that can be trained.
     """
     codec = getattr(model, "codec", None)
     if not isinstance(codec, TrainableCodec) or not isinstance(codec, nn.Module):
-        raise ValueError(
+        raise ConfigError(
             f"{type(model).__name__} has no codec with a loss to train; leave the tokenizer stage out, or use"
             " simulator=dit or simulator=tokens"
         )

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 
 from torch import nn
 
+from envs.targets import ConfigError
+
 # Every projection of attention and feed-forward, in trunk and state expert alike.
 TARGETS = ("to_q", "to_k", "to_v", "to_out.0", "ff.net.0.proj", "ff.net.2")
 
@@ -25,13 +27,13 @@ def low_rank(module: nn.Module, rank: int) -> Iterator[None]:
         rank: of the adapters.
 
     Raises:
-        ValueError: if the module has no such projections.
+        ConfigError: if the module has no such projections.
     """
     if not rank:
         yield
         return
     if not any(name.endswith(TARGETS) for name, _ in module.named_modules()):
-        raise ValueError(
+        raise ConfigError(
             f"lora={rank} adapts the projections of transformers, and {type(module).__name__} has none;"
             " set lora=0 to train all weights"
         )

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import atexit
 import os
+import re
 import signal
 import sys
+import textwrap
 from collections.abc import Callable
+from typing import Any
 
-from envs.targets import nearest
+from envs.targets import ROOMS, nearest
 from pipeline.cli import runs, tools, worlds
 from pipeline.cli.words import Words
 
@@ -24,33 +27,47 @@ COMMANDS: dict[str, Callable[[Words], None]] = {
         *(tools.verify, tools.submit, tools.chaos, tools.tasks, tools.config, tools.doctor, tools.completion),
     )
 }
-_ROOMS = ("envs", "actors", "learners", "pipeline")
+# commands whose words are their own, none of configs/
+_NO_KEYS = ("compare", "convert", "inspect", "verify", "tasks", "doctor", "completion")
 
 
 def _help() -> str:
-    lines = [
-        f"  {name:<12} {' '.join((command.__doc__ or '').split())}" for name, command in COMMANDS.items()
-    ]
+    lines = [line for name in COMMANDS for line in _wrapped(_about(name), f"  {name:<13} ", " " * 16)]
     return (
         "worldloop <command> [key=value ...]\n\n"
         + "\n".join(lines)
-        + "\n\nKeys are those of configs/; `worldloop config` prints them. `worldloop <command> --help` says"
+        + "\n\nKeys are those of configs/; `worldloop config` prints them.\n`worldloop <command> --help` says"
         " more of one, `worldloop --version` which this is."
     )
 
 
 def _help_of(name: str) -> str:
-    words = " ".join((COMMANDS[name].__doc__ or "").split())
-    return (
-        f"worldloop {name} [key=value ...]\n\n{words}\n\n"
+    """How a command is called, what it does, and what its words are."""
+    about = _about(name)
+    example = re.search(rf"worldloop {name}( [^;:)]+)?", about)
+    usage = example.group().strip() if example else f"worldloop {name}"
+    if name in _NO_KEYS:
+        return "\n".join([usage, "", *_wrapped(about)])
+    keys = (
         "Keys are those of configs/, as in experiment=smoke rl.lr=1e-4; `worldloop config` prints all with"
         " their values."
     )
+    return "\n".join([f"{usage} [key=value ...]", "", *_wrapped(about), "", *_wrapped(keys)])
+
+
+def _about(name: str) -> str:
+    return " ".join((COMMANDS[name].__doc__ or "").split())
+
+
+def _wrapped(text: str, first: str = "", others: str = "") -> list[str]:
+    """Lines no wider than a terminal that many have; what is typed is not torn apart."""
+    how: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
+    return textwrap.wrap(text, 100, initial_indent=first, subsequent_indent=others, **how)
 
 
 def _explained(error: Exception) -> bool:
     """Whether an error's message is all that a user needs: the system's, and those that Worldloop defines."""
-    return isinstance(error, OSError) or type(error).__module__.split(".")[0] in _ROOMS
+    return isinstance(error, OSError) or type(error).__module__.split(".")[0] in ROOMS
 
 
 def _find_modules_here() -> None:
@@ -66,6 +83,8 @@ def main() -> None:
     """Entry point of `worldloop` and `python -m pipeline`."""
     _find_modules_here()
     words = sys.argv[1:]
+    if words[:1] == ["help"] and words[1:] and words[1] in COMMANDS:
+        words = [words[1], "--help"]
     if not words or words[0] in ("-h", "--help", "help"):
         print(_help())
         return

@@ -17,10 +17,11 @@ def run(words: Words) -> None:
     """run the whole loop of an experiment; finished stages are reused, interrupted ones resume"""
     cfg, root = prepared(words)
     from pipeline.graph.owner import owning
-    from pipeline.loop import build_loop
+    from pipeline.loop import build_loop, check_labels
     from pipeline.track import tracking
 
     graph = build_loop(cfg, root)
+    check_labels(cfg, graph)
     print(f"{len(graph.nodes)} stages in {root}; each says how long it will take after its first steps")
     with owning(root, "run"), tracking(cfg, root) as tracker:
         manifests = graph.run(tracker=tracker)
@@ -171,12 +172,13 @@ def _run_until(name: str, words: Words) -> Path:
     """Run a stage and what it needs; returns its folder."""
     cfg, root = prepared(words)
     from pipeline.graph.owner import owning
-    from pipeline.loop import build_loop
+    from pipeline.loop import build_loop, check_labels
     from pipeline.track import tracking
 
     graph = build_loop(cfg, root)
     if name not in graph.nodes:
         raise ConfigError(f"no stage {name}{nearest(name, graph.nodes)}")
+    check_labels(cfg, graph, name)
     with owning(root, f"stage {name}"), tracking(cfg, root) as tracker:
         graph.run(name, tracker)
     return graph.folder(name)

@@ -46,6 +46,7 @@ def play(words: Words) -> None:
     from actors.serving.sessions import ServeConfig
     from envs.targets import options
     from pipeline.commands.play import build_game, learned_world
+    from pipeline.config import load_config
 
     chosen = [word.removeprefix("actions=") for word in words if word.startswith("actions=")]
     words = [word for word in words if not word.startswith("actions=")]
@@ -53,8 +54,9 @@ def play(words: Words) -> None:
     world = learned_world(cfg, root)
     if not world and (root / "stages").is_dir():
         print(f"{root} holds no world of these options and this code yet (`worldloop stages` says why)")
-    if not world and cfg["task"]["suite"]:  # nothing asks for small pictures
-        cfg, root = prepared([*words, *without_given([_LARGE], words)])
+    larger = [*words, *without_given([_LARGE], words)]
+    if not world and load_config(larger)["task"]["suite"] != cfg["task"]["suite"]:
+        cfg, root = prepared(larger)  # nothing asks for small pictures, and the suite can do otherwise
     config = options(ServeConfig, cfg["serve"], "serve")
     with listening(config) as server:
         sides = " and ".join([*["physics"] * bool(cfg["task"]["suite"]), *["imagination"] * bool(world)])
@@ -91,9 +93,9 @@ def inspect(words: Words) -> None:
 
 
 def bench(words: Words) -> None:
-    """measure performance: worldloop bench
-    conditioning|collection|experts|world|actors|learning|serving|gesim|size|distil|strides|overfit|pretrained;
-    of serving also for how long: worldloop bench serving seconds=7200
+    """measure performance: worldloop bench NAME; names are conditioning, collection, experts, world, actors,
+    learning, serving, gesim, size, distil, strides, overfit and pretrained; of serving also for how long:
+    worldloop bench serving seconds=7200
     """
     from pipeline.benches.bench import run_bench
 
@@ -183,17 +185,19 @@ def tasks(words: Words) -> None:
     """list what can be tried in physics: suites, robots, tasks, scenes; of one all, and its pictures into a
     folder: worldloop tasks task=metaworld [pictures=FOLDER]
     """
-    from pipeline.commands.tasks import table
+    from pipeline.commands.tasks import chosen_tasks, table
 
-    own = {key: value for key, _, value in (word.partition("=") for word in words)}
-    if set(own) - {"task", "pictures"} or ("pictures" in own and not own.get("task")):
-        raise ConfigError("say worldloop tasks, or worldloop tasks task=metaworld [pictures=FOLDER]")
-    print(table(own.get("task", "")))
-    if own.get("pictures"):
+    wanted = [word.partition("=")[2] for word in words if word.startswith("pictures=")]
+    found = chosen_tasks([word for word in words if not word.startswith("pictures=")])
+    if wanted and len(found) > 1:
+        raise ConfigError("say of which task: worldloop tasks task=metaworld pictures=FOLDER")
+    print(table(found))
+    if wanted:
         from pipeline.commands.task_pictures import draw  # loads torch
 
-        for path in draw(own["task"], Path(own["pictures"])):
-            print(path)
+        for choice, task in found.items():
+            for path in draw(choice, task, Path(wanted[-1])):
+                print(path)
 
 
 def config(words: Words) -> None:

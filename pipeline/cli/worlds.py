@@ -61,7 +61,7 @@ def rewards(words: Words) -> None:
             own[key] = value
         else:
             rest.append(word)
-    names, known = listed(own["rewards"]), ["rule", *choices("judge")]
+    names, known = listed(own["rewards"]), ["rule", *choices("judge", rest)]
     for name in names:
         if name not in known:
             raise ConfigError(f"rewards={own['rewards']}: no reward {name}{nearest(name, known)}")

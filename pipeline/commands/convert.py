@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -104,16 +105,20 @@ def inspect(
     source: Path, target: Path, cut: Cut, style: PoseMapStyle, rows: int = 4, episodes: int = 8
 ) -> list[Path]:
     """A picture per episode: some of its frames, a row each with all views side by side, the commanded
-    grippers drawn over them, or a word about why they are not.
+    grippers drawn over them, or a word about why they are not. Where cameras record pictures of different
+    sizes, and no size is asked for, all take the main camera's.
     """
     target.mkdir(parents=True, exist_ok=True)
-    made = []
+    made: list[Path] = []
+    said: set[str] = set()
+    cut = cut if cut.size else replace(cut, size=_common_size(source))
     for number, episode in enumerate(islice(read_any(source, cut), episodes)):
         shown = np.flatnonzero(episode.present)
         shown = shown[np.linspace(0, len(shown) - 1, min(rows, len(shown))).round().astype(int)]
         part, bare = episode.take(shown), why_bare(episode)
-        if bare:
-            tqdm.write(f"{source.name}, episode {number}: {bare}")
+        if bare and bare not in said:
+            tqdm.write(f"{source.name}, from episode {number} on: {bare}")
+            said.add(bare)
         maps = np.full_like(part.frames, CANVAS) if bare else _pose_maps(part, style)
         sheet = np.concatenate(
             [
@@ -127,6 +132,15 @@ def inspect(
         cv2.imwrite(str(path), sheet[..., ::-1])
         made.append(path)
     return made
+
+
+def _common_size(source: Path) -> tuple[int, ...]:
+    """The main camera's (height, width) of a LeRobot data set whose cameras' differ, () elsewhere."""
+    if not (source / "meta/info.json").exists():
+        return ()
+    robot = LeRobotDataset(source, (1, 1)).recorded
+    sizes = {camera.size for camera in robot.cameras}
+    return robot.cameras[robot.main_view].size if len(sizes) > 1 else ()
 
 
 def _pose_maps(episode: Episode, style: PoseMapStyle) -> NDArray[np.uint8]:

@@ -18,7 +18,8 @@ from pipeline.stages.collect import fingerprint
 
 
 def build_finetune(cfg: Mapping[str, Any], root: Path) -> Graph:
-    """The graph of the stages: simulator, its student if distill.steps asks for one, and state.
+    """The graph of the stages: the tokenizer of a simulator that has one to train and begins from nothing,
+    simulator, its student if distill.steps asks for one, and state.
 
     Raises:
         ConfigError: if finetune.data names no data sets.
@@ -33,7 +34,10 @@ def build_finetune(cfg: Mapping[str, Any], root: Path) -> Graph:
     recorded = {**cfg, "task": {**cfg["task"], "suite": None, "data": data}}
     graph, mark = Graph(acting(recorded), root / "finetune"), fingerprint(data)
     learning = graph.under(recorded)  # with the simulator as it is, not as it is acted in
-    made = learning.add("simulator", finetune.simulator, fingerprint=mark)
+    warm = ""
+    if "codec" in cfg["simulator"] and not cfg["finetune"]["weights"]:
+        warm = learning.add("tokenizer", finetune.tokenizer, fingerprint=mark)
+    made = learning.add("simulator", finetune.simulator, {"warm": warm}, fingerprint=mark)
     if cfg["distill"]["steps"]:
         made = learning.add("student", finetune.student, {"simulator": made}, fingerprint=mark)
     graph.add("state", finetune.state, {"simulator": made}, fingerprint=mark)

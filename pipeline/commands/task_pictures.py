@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from envs.physics.suite import build_suite, task_names
 from envs.rng import Stream, episode_rng
-from pipeline.config import composed
 from pipeline.evaluation.media import write_gif
 
 _TILE, _COLUMNS = 112, 10  # pixels of a scene's picture, and pictures in a row
@@ -22,11 +21,10 @@ _SEED = 9_000_000  # of the episodes that are shown
 Picture = NDArray[np.uint8]
 
 
-def draw(choice: str, folder: Path) -> Iterator[Path]:
+def draw(choice: str, task: Mapping[str, Any], folder: Path) -> Iterator[Path]:
     """Write <choice>-scenes.jpg, where the suite has scenes, and <choice>-<task>.gif for the tasks that a
-    choice of configs/task plays; yields their paths.
+    choice of configs/task, of section `task`, plays; yields their paths.
     """
-    task = composed([f"task={choice}"])["task"]
     folder.mkdir(parents=True, exist_ok=True)
     groups = _scenes(task)
     if groups:

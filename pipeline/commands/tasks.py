@@ -3,32 +3,50 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from envs.physics.suite import build_suite
 from envs.targets import ConfigError, nearest
-from pipeline.config import choices, composed
+from pipeline.config import choices, read_config
 
 
-def table(chosen: str = "") -> str:
-    """A paragraph per task of configs/ that has a suite: its robot, its tasks, and what its options choose
-    from; of a suite that is not installed, how to install it.
+def chosen_tasks(words: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Sections task of the config by their choice: of the one that task=... names among the words, or of all.
 
     Args:
-        chosen: one choice of configs/task, of which all is said; "" for all of them in short.
+        words: other overrides among them, such as hydra.searchpath=[file://my_choices].
 
     Raises:
-        ConfigError: if there is no such choice.
+        ConfigError: if there is no such choice, or an override cannot be read.
     """
-    if chosen and chosen not in choices("task"):
-        raise ConfigError(f"task={chosen} is not a choice of configs/task{nearest(chosen, choices('task'))}")
-    names = [chosen] if chosen else choices("task")
-    found = {name: composed([f"task={name}"])["task"] for name in names}
-    return "\n\n".join(_paragraph(name, task, bool(chosen)) for name, task in found.items() if task["suite"])
+    known = choices("task", words)
+    named = [word.partition("=")[2] for word in words if word.startswith("task=")]
+    for name in named:
+        if name not in known:
+            raise ConfigError(f"task={name} is not a choice of configs/task{nearest(name, known)}")
+    rest = [word for word in words if not word.startswith("task=")]
+    return {name: read_config([*rest, f"task={name}"])["task"] for name in named[-1:] or known}
+
+
+def table(found: Mapping[str, Mapping[str, Any]]) -> str:
+    """A paragraph per task that has a suite: its robot, its tasks, and what its options choose from, of one
+    alone all of it; of a suite that is not installed, how to install it.
+
+    Args:
+        found: see chosen_tasks.
+    """
+    whole = len(found) == 1
+    return "\n\n".join(
+        _paragraph(name, task, whole) for name, task in found.items() if task["suite"] or whole
+    )
 
 
 def _paragraph(name: str, task: Mapping[str, Any], whole: bool) -> str:
+    if not task["suite"]:
+        return (
+            f"task={name}\n  no physics: robot and instructions are those of recordings, task.data=[FOLDER]"
+        )
     try:
         suite = build_suite(task["suite"])
     except ConfigError as error:

@@ -153,12 +153,13 @@ def _recorded(store: ClipStore, episode: Tensor, begin: int, physics: PhysicsEnv
     return to_chunk(commands[rows], in_force, physics.mode)
 
 
-def agreement(branches: Branches, seed: int = 0) -> list[dict[str, list[float]]]:
+def agreement(branches: Branches, seed: int = 0) -> list[dict[str, list[float | None]]]:
     """Correlations among the futures of one moment, by chunks since then.
 
     Of each depth: "frames", imagined progress with what the judge makes of the true frames (what the
     simulator loses); "judged", that with the outcome (what judge and chance lose); "imagined", imagined
-    progress with the outcome. Each [value, low, high], 95% by resampling moments.
+    progress with the outcome. Each [value, low, high], 95% by resampling moments; None where one of the two
+    is the same in all futures of a moment, so that nothing can be said.
     """
     generator = resampling_generator(seed)
     moments, out = len(branches.outcome), []
@@ -173,15 +174,17 @@ def agreement(branches: Branches, seed: int = 0) -> list[dict[str, list[float]]]
     return out
 
 
-def _interval(one: Tensor, other: Tensor, draws: Tensor) -> list[float]:
+def _interval(one: Tensor, other: Tensor, draws: Tensor) -> list[float | None]:
     """[value, low, high] of the correlation within rows of [N, G], by rows resampled as draws [R, N] say."""
     one, other = (values - values.mean(1, keepdim=True) for values in (one, other))
     sums = torch.stack([(one * other).sum(1), one.square().sum(1), other.square().sum(1)])  # [3, N]
     some = sums[:, draws].sum(-1)  # [3, R]
     value = _ratio(sums.sum(-1))
-    low, high = torch.quantile(_ratio(some), torch.tensor([0.025, 0.975]))
-    return [round(float(x), 3) for x in (value, low, high)]
+    low, high = torch.nanquantile(_ratio(some), torch.tensor([0.025, 0.975]))
+    return [round(float(x), 3) if torch.isfinite(x) else None for x in (value, low, high)]
 
 
 def _ratio(sums: Tensor) -> Tensor:
-    return sums[0] / (sums[1] * sums[2]).sqrt().clamp(min=1e-9)
+    """Correlations of sums [3, ...]; NaN where one of the two never varies."""
+    scale = (sums[1] * sums[2]).sqrt()
+    return torch.where(scale > 1e-9, sums[0] / scale, torch.nan)

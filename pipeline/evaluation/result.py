@@ -14,6 +14,7 @@ from pipeline.evaluation.by_task import by_scene, by_task, scenes_of_seeds, task
 from pipeline.evaluation.statistics import mcnemar, rate, rate_entry
 from pipeline.graph.stage import Inputs
 
+_BLIND = 0.3  # imagined minus true success from which on imagination says nothing of the truth
 _ENTRY = ("successes", "episodes", "low", "high")
 
 
@@ -30,7 +31,7 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         (see the measure stage); tasks (the same rates by task, {} if there is one); scenes (the same rates of
         each task in each scene that occurs, [] if there is one); rounds (gaps); episodes used and held out;
         seconds per stage; training (see `_training`); what the judge has cost (stages/judge_cost.py), {} if
-        it is free; alarms.
+        it is free; alarms (see `_alarms`).
     """
     finished = manifests(inputs)
     imagined, measured = (result_of(inputs.folder(role)) for role in ("imagined", "measured"))
@@ -62,7 +63,7 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         "stage_seconds": {name: entry["seconds"] for name, entry in finished.items()},
         "training": _training(finished),
         "judge_cost": _judge_cost(finished),
-        "alarms": [text for entry in learned for text in entry["result"]["alarms"]],
+        "alarms": _alarms(finished),
     }
     result["verdict"] = verdict(result)
     return result
@@ -123,8 +124,22 @@ def _why(result: Mapping[str, Any], points: float, imagined: float) -> str:
             f" exploits the simulator (gap in the last round {100 * gap:+.0f} points); deploy more episodes"
             " per round"
         )
-    if imagined > -2 and result["alarms"]:
-        return f"RL did not improve even imagined success; {result['alarms'][0]}"
+    if gap > _BLIND:
+        true, said = (100 * rate(result["rounds"][-1][key]) for key in ("true", "imagined"))
+        return (
+            f"the imagined world is no guide: in the last round it says {said:.0f}% of a policy that succeeds"
+            f" in {true:.0f}%, so RL has little to learn from; see by `worldloop trust` and the judge's table"
+            " whether simulator or judge mistakes failures for successes, and train it longer"
+        )
+    tried = ("physics_before", "physics_after", "imagined_before", "imagined_after")
+    if not any(result[key]["successes"] for key in tried):
+        return (
+            "no policy succeeded even once, in truth or in imagination, so RL had nothing to go on; give"
+            " imitation more demonstrations (imitation.demos) or steps (imitation.fit.steps)"
+        )
+    alarms = [text for text in result["alarms"] if text.startswith("rl-")]
+    if imagined > -2 and alarms:
+        return f"RL did not improve even imagined success; {alarms[0]}"
     return (
         f"RL moved imagined success by {imagined:+.0f} points only; give it more iterations"
         " (rounds.iterations) or a higher rl.lr"
@@ -180,6 +195,18 @@ def _scenes(cfg: Mapping[str, Any], inputs: Inputs, imagined: Mapping[str, Any])
     for part in parts:
         found.setdefault((part["task"], part["scene"]), {}).update(part)
     return [found[where] for where in sorted(found)]
+
+
+def _alarms(finished: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What stages were alarmed by, each with the stage's name: RL that goes nowhere, tokenizers that keep
+    little.
+    """
+    out = []
+    for name, entry in finished.items():
+        made = entry["result"]
+        said = [*made.get("alarms", []), made.get("alarm", ""), made.get("tokenizer_alarm", "")]
+        out += [f"{name}: {text}" for text in said if text]
+    return out
 
 
 def _training(finished: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, float]]:

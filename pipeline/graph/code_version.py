@@ -15,8 +15,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from envs.targets import ROOMS
+
 ROOT = Path(__file__).resolve().parents[2]
-ROOMS = ("envs", "actors", "learners", "pipeline")  # packages of this repository
 _INSTALLED = ("site-packages", "dist-packages")
 
 

@@ -1,11 +1,12 @@
-"""Stages of `worldloop finetune`: a simulator, its student and its state expert on recordings."""
+"""Stages of `worldloop finetune`: a simulator, its tokenizer, student and state expert on recordings.
+
+Held-out episodes are left out: by those `fidelity` and `policy-value` measure what came of it.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from actors.factory import build_simulator, build_state_decoder, open_clips
 from actors.process import prepare_process
@@ -14,15 +15,26 @@ from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
-from pipeline.stages.given import TASK, Cfg, fit_options
-from pipeline.stages.world import distil
+from pipeline.stages.given import TASK, Cfg, fit_options, learning_episodes
+from pipeline.stages.world import distil, train_codec
 
 _READS = ("seed", "threads", *TASK, "simulator", "microbatches")
 
 
+@stage(reads=(*_READS, "tokenizer_fit"), place=Place.LEARNERS)
+def tokenizer(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """The autoencoder of a simulator that works on latents or tokens and begins from nothing.
+
+    Settings: fingerprint of the data.
+    """
+    store = open_clips(cfg, cfg["task"]["data"])
+    return train_codec(cfg, folder, inputs, store, learning_episodes(store))
+
+
 @stage(reads=(*_READS, "finetune.simulator", "finetune.weights"), place=Place.LEARNERS)
 def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """The simulator, all of it or its adapters, from finetune.weights or as simulator.checkpoint has it.
+    """The simulator, all of it or its adapters, going on from finetune.weights, from the role `warm` (its
+    tokenizer), or from simulator.checkpoint.
 
     Settings: fingerprint of the data.
     """
@@ -31,9 +43,9 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     how = options(SimulatorFitConfig, section, "finetune.simulator")
     store = open_clips(cfg, cfg["task"]["data"])
     prepare_process(cfg["seed"], cfg["threads"])
-    model = build_simulator(cfg, Path(weights) if weights else None)
+    model = build_simulator(cfg, Path(weights) if weights else inputs.weights("warm"))
     fresh = not (weights or cfg["simulator"].get("checkpoint"))
-    stats = train_simulator(model, store, torch.arange(len(store)), how, fit, folder, fresh=fresh)
+    stats = train_simulator(model, store, learning_episodes(store), how, fit, folder, fresh=fresh)
     save_weights(model, folder)
     return dict(stats)
 
@@ -45,7 +57,7 @@ def student(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     Settings: fingerprint of the data.
     """
     store = open_clips(cfg, cfg["task"]["data"])
-    return distil(cfg, folder, inputs, "distill.first", store, torch.arange(len(store)))
+    return distil(cfg, folder, inputs, "distill.first", store, learning_episodes(store))
 
 
 @stage(reads=(*_READS, "finetune.state"), place=Place.LEARNERS)
@@ -60,6 +72,6 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     model = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, model)
     fit = fit_options(cfg, section["fit"], "finetune.state.fit")
-    stats = train_state(decoder, model, store, torch.arange(len(store)), fit, folder, section["lora"])
+    stats = train_state(decoder, model, store, learning_episodes(store), fit, folder, section["lora"])
     save_weights(decoder, folder)
     return dict(stats)

@@ -104,7 +104,7 @@ def demonstrations(cfg: Cfg, store: ClipStore) -> Tensor:
         raise ConfigError(
             f"imitation.demos={section['demos']}, but the data hold {len(chosen)} successful episodes of"
             f" imitation.sources={list(section['sources'])} for learning (sources there: {sources[:8]});"
-            " lower imitation.demos, name other sources ['*' for all], or collect more"
+            " say \"imitation.sources=['*']\" for all or name others, lower imitation.demos, or collect more"
         )
     return chosen
 

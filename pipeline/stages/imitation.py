@@ -9,9 +9,11 @@ import torch
 
 from actors.factory import build_policy, build_simulator
 from actors.process import prepare_process
+from actors.world_config import build_kinematics, pose_style
 from learners.stages.generated import generated_frames
 from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.perception import train_perception
+from learners.stages.traces import Hands
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import (
@@ -37,7 +39,10 @@ def imitation(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     section, mode = cfg["imitation"], mode_of(cfg)
     eyes = fit_options(cfg, section["perception"], "imitation.perception")
     everything = learning_episodes(store)
-    seen = train_perception(policy, store, everything, mode, eyes, folder / "perception", section["discount"])
+    discount = section["discount"]
+    seen = train_perception(
+        policy, store, everything, mode, eyes, folder / "perception", discount, _hands(cfg)
+    )
     fit = fit_options(cfg, section["fit"], "imitation.fit")
     # Perception has taken its units from all frames; demonstrations must not change them again.
     stats = train_imitation(Cloning(policy, store, demos, mode), fit, folder, fresh=not seen)
@@ -64,12 +69,17 @@ def clone(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     eyes = fit_options(cfg, section["perception"], "clone.perception")
     everything = learning_episodes(store)
     seen = train_perception(
-        policy, store, everything, mode, eyes, folder / "perception", discount, fresh=False
+        policy, store, everything, mode, eyes, folder / "perception", discount, _hands(cfg), fresh=False
     )
     fit = fit_options(cfg, section["fit"], "clone.fit")
     stats = train_imitation(Cloning(policy, store, episodes, mode, made), fit, folder, fresh=False)
     save_weights(policy, folder)
     return {**_both(stats, seen), "episodes": len(episodes), "generated_frames": len(made)}
+
+
+def _hands(cfg: Cfg) -> Hands:
+    """How commands say where fingertips are."""
+    return Hands(pose_style(cfg).tool_offset, build_kinematics(cfg))
 
 
 def _both(stats: dict[str, float], seen: dict[str, float]) -> dict[str, float]:

@@ -51,10 +51,15 @@ def tokenizer(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     expert, the role `pace` says how many steps take the seconds that settings may ask for.
     """
     store = open_store(cfg, inputs)
+    return train_codec(cfg, folder, inputs, store, learning_episodes(store))
+
+
+def train_codec(cfg: Cfg, folder: Path, inputs: Inputs, store: ClipStore, episodes: Tensor) -> dict[str, Any]:
+    """A simulator whose autoencoder was trained on some episodes; nothing else of it was."""
     prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg)
     fit = in_time(inputs, "tokenizer", fit_options(cfg, cfg["tokenizer_fit"], "tokenizer_fit"))
-    stats = train_tokenizer(model, store, learning_episodes(store), fit, folder)
+    stats = train_tokenizer(model, store, episodes, fit, folder)
     save_weights(model, folder)
     return {**stats, "steps": fit.steps}
 

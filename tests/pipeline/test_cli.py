@@ -89,6 +89,11 @@ def test_every_command_explains_itself_at_once_and_starts_nothing() -> None:
     for name in ("run", "chaos", "convert"):
         out = worldloop(name, "--help")
         assert out.returncode == 0 and out.stdout.startswith(f"worldloop {name} "), out
+    assert "[key=value ...]" in worldloop("run", "--help").stdout
+    for words in (("convert", "--help"), ("help", "convert")):  # whose words are none of configs/
+        usage, _, rest = worldloop(*words).stdout.partition("\n")
+        assert usage == "worldloop convert SRC DST [frames=N] [size=[H,W]]" and "configs/" not in rest
+    assert max(map(len, worldloop("--help").stdout.splitlines())) <= 100
     assert all(command.__doc__ for command in COMMANDS.values())
     assert worldloop("--version").stdout.startswith("worldloop 0.")
 
@@ -108,11 +113,16 @@ def test_shells_complete_commands_and_choices() -> None:
     assert "say which shell" in worldloop("completion", "fish").stderr
 
 
-def test_tasks_are_listed_with_what_can_be_chosen() -> None:
+def test_tasks_are_listed_with_what_can_be_chosen(tmp_path: Path) -> None:
     some, one = worldloop("tasks"), worldloop("tasks", "task=metaworld")
     assert "task=push" in some.stdout and "hand_left" in some.stdout and "(50; " in some.stdout, some
     assert "window-open-v3" in one.stdout and "task=push" not in one.stdout
     assert "did you mean metaworld" in worldloop("tasks", "task=metawrld").stderr
+    assert "no physics" in worldloop("tasks", "task=lerobot").stdout
+    assert "say of which task" in worldloop("tasks", f"pictures={tmp_path}").stderr
+    mine = f"hydra.searchpath=[file://{ROOT}/examples/configs]"
+    drawn = worldloop("tasks", mine, "task=dot", f"pictures={tmp_path}")
+    assert "robot dot" in drawn.stdout and (tmp_path / "dot-reach.gif").exists(), drawn
 
 
 def test_choices_and_classes_of_the_folder_one_stands_in_are_found(

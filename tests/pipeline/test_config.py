@@ -25,6 +25,8 @@ from pipeline.loop import build_loop
         (["rl.learningrate=1"], r"rl\.learningrate is not a key"),
         (["rl.minibach=1"], r"did you mean rl\.minibatch"),
         (["simulater=dit"], "simulator"),
+        (["simulator.sampling.kind=edm"], r"no key of the simulator that is chosen, but of simulator=gesim"),
+        (["seed=1,2"], r"seed=1,2 names several values.*seed=\[1,2\], or run each"),
         (["simulator=gan"], "gan"),
         (["task.horizon=41"], r"task\.horizon"),
         (["task.mode=sideways"], r"task\.mode"),
@@ -41,6 +43,12 @@ from pipeline.loop import build_loop
         (["policy.head.std=wide"], r"policy\.head\.std='wide' should be a valid number"),
         (["judge._target_=judges.Mine"], r"judge\._target_=judges\.Mine does not import"),
         (["algorithm=grpo", "rl.envs=40"], r"algorithm\.group"),
+        (
+            ["algorithm=grpo", "judge.rewards.progress=0"],
+            r"rl\.chunks=2 cuts episodes short.*rl\.chunks=null",
+        ),
+        (["rl.rewards_later=true"], r"rl\.rewards_later=true, but algorithm=ppo"),
+        (["rl.schedule=async", "rl.queue=2"], r"rl\.queue=2 must hold at least the rl\.shards=4"),
         (["imitation.fit.batch=7", "microbatches=2"], r"imitation\.fit: batch=7 must be a multiple of micro"),
         (["collect.noise_level=[0.6,0.1]"], r"collect\.noise_level"),
         (["simulator=null"], r"simulator=null cannot be read"),
@@ -162,6 +170,7 @@ def test_drawn_overrides_are_understood_or_refused(seed: int) -> None:
         ("cameras=[hed]", r"^cameras=\['hed'\] must be some of"),
         ("policy.cameras=[hed]", r"policy\.cameras=\['hed'\] must be some of .*head"),
         ("judge.cameras=most", r"judge\.cameras='most' must be all, main or"),
+        ("task.suite.size=[32,48]", r"task\.size=\[64, 64\], but the suite renders \[\[32, 48\]\]"),
     ],
 )
 def test_what_the_robot_has_not_is_told_before_any_work(word: str, said: str) -> None:

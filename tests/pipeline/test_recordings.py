@@ -11,13 +11,15 @@ from safetensors.torch import load_file
 
 from actors.factory import build_judge, build_simulator, build_state_decoder, build_world, open_clips
 from actors.world_config import world_spec
+from envs.episodes import EpisodeError
+from envs.episodes.splits import write_splits
 from envs.initial_states import DecisionPoints, InitialStates
 from envs.specs import CHUNK, IMAGE, STATE
 from envs.targets import ConfigError
 from pipeline.commands.finetune import build_finetune
 from pipeline.config import load_config
 from pipeline.graph.graph import Graph
-from pipeline.loop import build_loop
+from pipeline.loop import build_loop, check_labels
 from tests.envs.episodes.lerobot_sets import SETS, write_set
 
 
@@ -57,6 +59,34 @@ def test_finetune_on_a_set_of_lerobots(kind: str, tmp_path: Path) -> None:
     starts = InitialStates.of(open_clips(graph.cfg, [tmp_path / "set"]))
     world = build_world(graph.cfg, trained, decoder, build_judge(graph.cfg), starts, 2)
     assert world.rollout(2)["next", STATE].shape == (2, 2, robot.state_dim)
+
+
+def test_a_world_of_latents_is_finetuned_on_a_tokenizer_that_has_learned(tmp_path: Path) -> None:
+    words = (
+        "simulator=dit_small",
+        f"finetune.data=[{tmp_path / 'set'}]",
+        "tokenizer_fit={steps: 2, batch: 4}",
+    )
+    cfg = config(tmp_path, "labelled", *words, *smoke("finetune.simulator", "finetune.state"))
+    graph = build_finetune(cfg, tmp_path / "smoke")
+    assert list(graph.run("simulator")) == ["tokenizer", "simulator"]
+    coded, tuned = (
+        load_file(graph.folder(name) / "weights.safetensors") for name in graph.nodes if name != "state"
+    )
+    torch.manual_seed(cfg["seed"])
+    untrained = build_simulator(graph.cfg).state_dict()
+    codec = [name for name in coded if name.startswith("codec.")]
+    assert any(not torch.equal(untrained[name], coded[name]) for name in codec)
+    assert codec and all(torch.equal(coded[name], tuned[name]) for name in codec)
+    going_on = {**cfg, "finetune": {**cfg["finetune"], "weights": str(graph.folder("simulator"))}}
+    assert "tokenizer" not in build_finetune(going_on, tmp_path / "smoke").nodes
+
+
+def test_finetuning_leaves_held_out_episodes_alone(tmp_path: Path) -> None:
+    cfg = config(tmp_path, "single_arm", f"finetune.data=[{tmp_path / 'set'}]", *smoke("finetune.simulator"))
+    write_splits(tmp_path / "set", {"train": 0, "calibration": 0, "held_out": 4})
+    with pytest.raises(EpisodeError, match="no episode is left to draw clips from"):
+        build_finetune(cfg, tmp_path / "smoke").run("simulator")
 
 
 @pytest.fixture(scope="module", params=["labelled", "pusht"])
@@ -108,3 +138,14 @@ def test_a_set_without_labels_teaches_no_judge(tmp_path: Path) -> None:
     cfg = config(tmp_path, "so101", *smoke("simulator_fit.first"))
     with pytest.raises(ConfigError, match=r"no training episode of the data says; record next\.success"):
         build_loop(cfg, tmp_path / "smoke").run(until="judge-1")
+
+
+def test_missing_labels_are_told_before_anything_runs(tmp_path: Path) -> None:
+    cfg, other = config(tmp_path, "so101"), config(tmp_path / "other", "labelled")
+    graph = build_loop(cfg, tmp_path / "smoke")
+    with pytest.raises(ConfigError, match=r"record next\.success, or choose a judge that needs none"):
+        check_labels(cfg, graph)
+    check_labels(cfg, graph, "simulator-1")  # which asks for none
+    check_labels(other, build_loop(other, tmp_path / "other/smoke"))
+    order = list(graph.nodes)
+    assert order.index("imitation") < order.index("simulator-1")  # missing demonstrations are told early, too

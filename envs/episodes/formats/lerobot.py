@@ -71,8 +71,8 @@ class LeRobotDataset:
         sizes = {camera.name: camera.size for camera in recorded.cameras}
         if size is None and len(set(sizes.values())) > 1:
             raise EpisodeError(
-                f"{self.root}: cameras record pictures of different sizes {sizes}; give one size to"
-                " bring them to"
+                f"{self.root}: cameras record pictures of different sizes {sizes}; give one size to bring"
+                f" them to, such as size={list(recorded.cameras[recorded.main_view].size)}"
             )
         self.recorded = recorded
         self.size: tuple[int, int] = size or next(iter(sizes.values()))

@@ -13,6 +13,7 @@ from envs.language import FEATURES, TextEncoder
 from envs.ranges import Count
 from envs.simulators.row_linear import RowLinear
 from envs.specs import TEXT_BYTES, text_to_bytes
+from envs.targets import ConfigError
 
 _SHOWN = 60  # letters of a text in a message
 
@@ -32,7 +33,7 @@ class WordEncoder(Protocol):
         """Refuse texts that it would cut.
 
         Raises:
-            ValueError: naming the text and the fix.
+            ConfigError: naming the text and the fix.
         """
 
     def encode(self, texts: Sequence[str], device: torch.device) -> Tensor:
@@ -52,7 +53,7 @@ class HashedWords:
         """See WordEncoder."""
         for text in texts:
             if len(text.encode()) > TEXT_BYTES:
-                raise ValueError(
+                raise ConfigError(
                     f"the instruction {text[:_SHOWN]!r}... has {len(text.encode())} bytes, and this encoder"
                     f" takes {TEXT_BYTES}; shorten it, or use"
                     " text_world.words._target_=envs.simulators.tokens.words.T5Words"
@@ -99,7 +100,7 @@ class T5Words:
         """See WordEncoder."""
         for text, numbers in zip(texts, self._cut(list(texts))["input_ids"], strict=True):
             if len(numbers) > self.tokens:
-                raise ValueError(
+                raise ConfigError(
                     f"the instruction {text[:_SHOWN]!r}... has {len(numbers)} tokens, more than"
                     f" text_world.words.max_tokens={self.tokens}; raise it, or shorten the text"
                 )

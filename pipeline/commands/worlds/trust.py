@@ -83,8 +83,8 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
     return _table(rows, compared, futures)
 
 
-def _table(rows: list[dict[str, list[float]]], moments: int, futures: int) -> str:
-    """Markdown."""
+def _table(rows: list[dict[str, list[float | None]]], moments: int, futures: int) -> str:
+    """Markdown; "-" where all futures of each moment are alike."""
     lines = [
         f"Correlations among {futures} futures of each of {moments} moments [95% interval]",
         "",
@@ -92,6 +92,11 @@ def _table(rows: list[dict[str, list[float]]], moments: int, futures: int) -> st
         "| --- | --- | --- | --- |",
     ]
     for number, row in enumerate(rows, 1):
-        cells = [f"{value:.2f} [{low:.2f}, {high:.2f}]" for value, low, high in row.values()]
+        cells = [_interval(values) for values in row.values()]
         lines.append(f"| {number} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _interval(values: list[float | None]) -> str:
+    numbers = [value for value in values if value is not None]
+    return "{:.2f} [{:.2f}, {:.2f}]".format(*numbers) if len(numbers) == len(values) else "-"

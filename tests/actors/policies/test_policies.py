@@ -41,7 +41,14 @@ from envs.targets import ConfigError, build
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_POSES, EMBODIMENTS, observations, world_spec
 from tests.sections import offered, section
 
-SMALL: dict[str, dict[str, Any]] = {"chunk_gaussian": {"width": 32}, "chunk_tokens": {"width": 32}}
+SMALL: dict[str, dict[str, Any]] = {
+    "chunk_gaussian": {"width": 32},
+    "chunk_tokens": {
+        "width": 32,
+        "asked": 3,
+        "channels": 8,
+    },  # with an encoder that is told what is asked for
+}
 POLICIES = [name for name in offered("policy") if name != "openpi"]  # that one needs a server
 MAIN_VIEW_ALONE = ("tiny_vla",)  # all others look at every view
 
@@ -120,6 +127,10 @@ def test_every_view_word_and_state_matters(name: str, robot: Embodiment) -> None
         moved = seen.clone()
         moved[STATE][:, number] += 1.0
         assert matters(moved), f"state {number}"
+    for number in range(spec.action_dim if COMMAND in policy.in_keys else 0):
+        moved = seen.clone()
+        moved[COMMAND][:, number] += 1.0
+        assert matters(moved), f"command in force {number}"
 
 
 @pytest.mark.parametrize("robot", EMBODIMENTS.values(), ids=list(EMBODIMENTS))
@@ -164,7 +175,7 @@ def test_imitates_a_few_chunks_after_taking_units_from_them(name: str) -> None:
     rise = torch.linspace(0, 1, spec.chunk)[None, :, None]
     chunks = 20.0 + rise * 3 * torch.randn(6, 1, spec.action_dim)
     chunks[..., 1] = 5.0  # a joint that never moves
-    policy.normalise(chunks, seen["observation", "state"])
+    policy.normalise(chunks, seen[STATE], seen[COMMAND])
     if hasattr(policy, "head"):
         for parameter in policy.head.exploration():
             parameter.requires_grad_(False)
@@ -190,7 +201,7 @@ def test_learns_to_act_alike_on_other_pictures_of_the_same_moments(name: str) ->
     one, other = observations(spec, 6), observations(spec, 6)
     other["observation", "image"] = 255 - one["observation", "image"]
     other["observation", "state"] = one["observation", "state"]
-    policy.normalise(torch.randn(6, spec.chunk, spec.action_dim), one["observation", "state"])
+    policy.normalise(torch.randn(6, spec.chunk, spec.action_dim), one[STATE], one[COMMAND])
 
     def apart() -> float:
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):

@@ -23,6 +23,7 @@ from envs.episodes.video import write_video
 from envs.specs import WorldSpec
 from pipeline.commands.convert import convert, inspect
 from pipeline.graph.owner import RunInUse, owning
+from tests.envs.episodes.lerobot_sets import SETS, write_set
 from tests.moving_square import moving_square
 
 
@@ -158,6 +159,12 @@ def test_inspect_says_when_actions_tell_no_pose(tmp_path: Path, capsys: pytest.C
     LeRobotWriter(tmp_path / "set", robot).write([moving_square(robot, 0)])
     inspect(tmp_path / "set", tmp_path / "seen", Cut(), PoseMapStyle())
     assert "actions of genie (joints, delta=False) do not say" in "".join(capsys.readouterr())
+
+
+def test_inspect_brings_cameras_of_different_sizes_to_the_main_ones(tmp_path: Path) -> None:
+    write_set(tmp_path / "set", SETS["single_arm"])  # 48 x 64, and 32 x 32 on the wrist
+    (sheet,) = inspect(tmp_path / "set", tmp_path / "seen", Cut(), PoseMapStyle(), rows=2, episodes=1)
+    assert cv2.imread(str(sheet)).shape == (2 * 48, 2 * 64, 3)
 
 
 def _agibot(root: Path, length: int = 6) -> Path:

@@ -42,6 +42,18 @@ def test_progress_rises_towards_a_given_picture(tmp_path: Path) -> None:
         GoalImageJudge(SPEC, 1, 0.9, METRIC, None)
 
 
+def test_what_is_missing_is_said_before_anything_is_learned() -> None:
+    lpips = {"_target_": "envs.judges.lpips.LPIPS", "network": "nowhere.pth", "linear": "nowhere.pth"}
+    with pytest.raises(ConfigError, match=r"judge\.picture=goal\.png is no picture"):
+        GoalImageJudge.check({"metric": METRIC, "picture": "goal.png"})
+    with pytest.raises(ConfigError, match=r"judge\.metric .*network=nowhere\.pth does not exist"):
+        GoldenGoalJudge.check(section("judge/golden_goal", metric=lpips))
+    words = {"_target_": "envs.simulators.tokens.words.T5Words", "folder": "nowhere", "max_tokens": 8}
+    with pytest.raises(ConfigError, match=r"judge\.text_world\.words .*nowhere"):
+        GoldenGoalJudge.check(section("judge/golden_goal", text_world={"words": words}))
+    GoldenGoalJudge.check(section("judge/golden_goal"))
+
+
 def golden(fallback: str = "drop", threshold: float = 0.0, cache: int = 8) -> GoldenGoalJudge:
     """With a text world of random weights, which ends as soon as it says more than `threshold`."""
     torch.manual_seed(0)

@@ -63,3 +63,6 @@ def test_only_what_differs_within_a_moment_counts() -> None:
     assert unlike["judged"][0] == pytest.approx(1.0, abs=1e-3)
     for value, low, high in (same["frames"], unlike["imagined"]):
         assert low < value < high and abs(value) < 0.2  # though moments differ far more than futures
+    nobody_won = Branches(torch.stack((outcome, noise)), torch.stack((signal, outcome)), torch.zeros(40, 8))
+    silent = agreement(nobody_won)[0]
+    assert silent["judged"] == silent["imagined"] == [None, None, None] and silent["frames"][0] is not None

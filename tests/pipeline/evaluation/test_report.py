@@ -99,6 +99,14 @@ def test_the_verdict_can_say_no_and_why() -> None:
     assert "chance" in near and "exploits" not in near
     flat = verdict(result(physics_after=entry(39), imagined_after=entry(40), **small))
     assert "iterations" in flat
+    blind = [{"round": 1, "true": entry(0), "imagined": entry(100), "gap": 1.0}]
+    useless = verdict(result(physics_after=entry(40), imagined_after=entry(40), rounds=blind, **small))
+    assert "it says 100% of a policy that succeeds in 0%" in useless and "iterations" not in useless
+    none = dict.fromkeys(("physics_before", "physics_after", "imagined_before", "imagined_after"), entry(0))
+    assert "more demonstrations" in verdict(result(**none, **small))
+    alarms = ["tokenizer: collapsed", "rl-2: no reward variance"]
+    alarmed = verdict(result(physics_after=entry(39), imagined_after=entry(40), alarms=alarms, **small))
+    assert "even imagined success; rl-2: no reward variance" in alarmed
     alone = verdict(result(physics_before=None, physics_after=None, paired=None))
     assert "without physics" in alone
 
@@ -133,6 +141,15 @@ def test_the_page_is_one_file_with_everything(inputs: Inputs) -> None:
     assert not re.findall(r'(?:src|href)=(?!"data:|"#)', page) and "url(" not in page
     assert "http" not in page.split("<h2 id=config>")[0]
     assert "2 judge" in page and "25.0%" in page and "3.1%" in page and "812" in page
+
+
+def test_the_page_tells_alarms_and_what_nobody_knows(inputs: Inputs) -> None:
+    said = result(alarms=["rl-1: no reward variance: <why>"], judge={}, rollout={}, verdict="-")
+    page = build_report({}, inputs, said)
+    assert "<li>rl-1: no reward variance: &lt;why&gt;</li>" in page
+    assert "No episode was held out" in page and "nobody knows how often the judge is right" in page
+    page = build_report({}, inputs, {**result(), "verdict": "-"})
+    assert "Alarms" not in page and "nobody knows" not in page
 
 
 def test_the_worst_disagreements_come_first_and_pairs_stay_together(inputs: Inputs) -> None:
