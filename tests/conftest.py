@@ -6,6 +6,9 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+# Before torch is imported: small work that is cut in two waits for itself, most of all beside other work.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import pytest
 
 from envs.embodiment import Embodiment
