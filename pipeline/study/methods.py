@@ -148,10 +148,11 @@ class WorldFrom(Method):
 
     Args:
         share: of the episodes that its parts learn from; what is held out is the same with any.
+        judge: whether the row is about the judge alone, for which not all of the world is needed.
     """
 
-    def __init__(self, share: Annotated[float, Gt(0), Le(1)] = 1.0):
-        self.share = share
+    def __init__(self, share: Annotated[float, Gt(0), Le(1)] = 1.0, judge: bool = False):
+        self.share, self.judge = share, judge
 
     def make(self, cfg: Cfg, root: Path) -> Made:
         """See Method.make."""
@@ -162,7 +163,8 @@ class WorldFrom(Method):
             data = graph.add("fewer", fewer_episodes, {"data": data}, share=self.share)
         world = add_world(graph, cfg, [data], World(), 1)
         graph.add("measure", prove.measure, {"data": [data], **world.roles()})
-        return Made(graph, "imitation", tuple(world.roles().values()))
+        roles = world.roles()
+        return Made(graph, "imitation", (roles["judge"],) if self.judge else tuple(roles.values()))
 
 
 def add_rl_in_physics(graph: Graph, cfg: Cfg, equal: Equal) -> str:

@@ -116,7 +116,7 @@ def test_rows_over_seeds_share_evaluation_episodes_and_only_as_many_seeds_as_ask
         (["study.methods.ppo.policy._target_=pathlib.Path"], "which is no pipeline.study.methods.Method"),
         (["study.methods.physics_episodes.policy.equal=hours"], "policy.equal='hours' should be"),
         (["study.places=[moon]"], "study.places holds 'moon', which study.across has not"),
-        (["study.methods.filtered_bc.policy.kept=false"], "rl=false leaves no policy of RL's to take"),
+        (["+study.methods.filtered_bc.policy.kept=false"], "rl=false leaves no policy of RL's to take"),
         (
             ["+study.across={moon: ['task.gravity=1']}", "study.places=[moon]"],
             "study.methods.imitation.changes=['task.gravity=1'] in study.across.moon: task.gravity",
