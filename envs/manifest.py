@@ -105,6 +105,14 @@ def digest_of(path: Path) -> str:
     return found.hexdigest()
 
 
+def mark_of(path: Path) -> str:
+    """What tells a file, such as weights, from others: the key of the stage that left it, else its hash; ""
+    where there is no file.
+    """
+    manifest = read_manifest(path.parent) or {}
+    return str(manifest.get("key") or (digest_of(path) if path.is_file() else ""))
+
+
 def hashes(folder: Path) -> dict[str, str]:
     """SHA-256 of every file of a folder by its path, but for the manifest, what is hidden (caches), and
     checkpoints, which are removed after it.

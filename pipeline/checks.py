@@ -42,6 +42,7 @@ _SECTIONS = {
     "judge_fit.first": learning.JudgeFitSection,
     "judge_fit.refresh": learning.JudgeFitSection,
     "text_world_fit": learning.TextWorldFitSection,
+    "equal_time": learning.EqualTimeSection,
     "state_fit.first": learning.StateFitSection,
     "state_fit.refresh": learning.StateFitSection,
     "finetune": learning.FinetuneSection,
@@ -198,7 +199,7 @@ def _together(cfg: Cfg) -> Iterator[str]:
         if name not in variants:
             yield f"extra_starts.variants holds {name!r}, no key of task.variants{nearest(name, variants)}"
     study = cfg["study"]
-    known = {"rows": "methods", "columns": "measures", "only": "rows", "against": "rows"}
+    known = {"rows": "methods", "columns": "measures", "places": "across", "only": "rows", "against": "rows"}
     for key, among in known.items():
         for name in study[key]:
             if name not in study[among]:
@@ -210,6 +211,12 @@ def _together(cfg: Cfg) -> Iterator[str]:
         yield f"collect.noise_level={[low, high]} must be a range, from low to high"
     if sum(rounds["splits"].values()) >= 1:
         yield f"rounds.splits={rounds['splits']} must add up to less than 1; the rest is for learning"
+    equal = cfg["equal_time"]
+    if equal["tokenizer"] + equal["state"] >= 1:
+        yield (
+            f"equal_time.tokenizer={equal['tokenizer']} and equal_time.state={equal['state']} must add up to"
+            " less than 1; the rest is the simulator's"
+        )
     if rl["envs"] % rl["shards"]:
         yield f"rl.envs={rl['envs']} must be a multiple of rl.shards={rl['shards']}"
     elif rl["envs"] // rl["shards"] % cfg["algorithm"].get("group", 1):

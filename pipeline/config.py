@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
+from omegaconf import OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
 
 from envs.targets import ConfigError, nearest
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
+IF_CHOSEN = "if_chosen"  # options by group and choice, which count where that is what was chosen
 
 
 def load_config(overrides: Sequence[str]) -> dict[str, Any]:
@@ -41,6 +43,8 @@ def read_config(overrides: Sequence[str]) -> dict[str, Any]:
     """
     try:
         return composed(overrides)
+    except ConfigError:
+        raise
     except Exception as error:  # for simulator=null and the like Hydra raises a bare ValueError
         raise ConfigError(_unknown_key(overrides) or _unreadable(overrides, error)) from error
 
@@ -70,11 +74,47 @@ def offered(group: str, choice: str, overrides: Sequence[str]) -> bool:
 
 
 def composed(overrides: Sequence[str]) -> dict[str, Any]:
-    """The resolved config, unchecked."""
+    """The resolved config, unchecked; an experiment's options of what was chosen are put in."""
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        plain = OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+        made = compose("config", list(overrides), return_hydra_config=True)
+    with open_dict(made):
+        chosen, section = made.pop("hydra").runtime.choices, made.pop(IF_CHOSEN)
+    given = [word.split("=")[0].lstrip("+~") for word in overrides]
+    given = [key for key in given if key not in chosen]  # judge=proxy says which, and no option of it
+    for path, value in _of_chosen(OmegaConf.to_container(section), chosen):
+        if any(key == path or path.startswith(f"{key}.") or key.startswith(f"{path}.") for key in given):
+            continue
+        try:
+            OmegaConf.update(made, path, value)
+        except OmegaConfBaseException as error:
+            group, _, option = path.partition(".")
+            raise ConfigError(
+                f"{IF_CHOSEN}.{group}.{chosen[group]}.{option} is no option of {group}={chosen[group]}"
+            ) from error
+    plain = OmegaConf.to_container(made, resolve=True)
     assert isinstance(plain, dict)
     return {str(key): value for key, value in plain.items()}
+
+
+def _of_chosen(section: Any, chosen: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Paths and values of those options in the section if_chosen that belong to what was chosen.
+
+    Raises:
+        ConfigError: for a group of choices that there is not.
+    """
+    for group, by_choice in section.items():
+        if group not in chosen:
+            raise ConfigError(f"{IF_CHOSEN}.{group} is no group of choices{nearest(group, groups())}")
+        for path, value in _leaves(by_choice.get(chosen[group], {})):
+            yield f"{group}.{path}", value
+
+
+def _leaves(section: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    for key, value in section.items():
+        if isinstance(value, Mapping):
+            yield from ((f"{key}.{path}", inner) for path, inner in _leaves(value))
+        else:
+            yield str(key), value
 
 
 def _searched(overrides: Sequence[str]) -> list[Path]:

@@ -18,7 +18,7 @@ from envs.targets import ConfigError, target
 from pipeline.acting import acting
 from pipeline.graph.graph import Graph
 from pipeline.graph.workers import learners_of
-from pipeline.stages import collect, imitation, keep, prove, rl, show, world
+from pipeline.stages import collect, imitation, keep, pace, prove, rl, show, world
 
 Cfg = Mapping[str, Any]
 T = TypeVar("T")
@@ -36,6 +36,7 @@ class World:
     state: str = ""
     judge: str = ""
     text_world: str = ""  # whose weights are the judge's, once it has learned
+    pace: str = ""  # that says how many steps are so many seconds, if time is what counts
 
     def roles(self) -> dict[str, str]:
         """Inputs of whatever runs in it."""
@@ -119,7 +120,7 @@ def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
     for number in range(1, last_round(cfg) + 1):
         deployed = _deploy(graph, cfg, policy, number)
         data = [*data, deployed]
-        made = _refresh(graph, cfg, data, made, number)
+        made = add_world(graph, cfg, data, made, number)
         inputs = {"data": data, **made.roles()}
         graph.add(f"gap-{number}", prove.gap, {**inputs, "policy": policy}, number=number)
         policy, known = _keep(graph, policy, deployed, best, known, number)
@@ -171,32 +172,40 @@ def _data_loop(graph: Graph, cfg: Cfg) -> None:
     mark = collect.fingerprint(cfg["task"]["data"])
     data = [graph.add("recordings", collect.recordings, fingerprint=mark)]
     first = graph.add("imitation", imitation.imitation, {"data": data})
-    made = _refresh(graph, cfg, data, World(), 1)
+    made = add_world(graph, cfg, data, World(), 1)
     starts = _extra_starts(graph, cfg)
     policy = _learn(graph, cfg, data, made, first, 1, starts, deployed=0)
     _conclude(graph, data, made, first, policy, {})
 
 
-def _refresh(graph: Graph, cfg: Cfg, data: list[str], before: World, number: int) -> World:
+def add_world(graph: Graph, cfg: Cfg, data: list[str], before: World, number: int) -> World:
     """The stages that train the imagined world on all data so far, from its predecessor if there is one."""
     phase, warm = ("refresh", before.teacher) if before.teacher else ("first", "")
     learning = graph.under(cfg)  # with the simulator as it is, not as it is acted in
+    speeds = before.pace
+    if cfg["equal_time"]["seconds"] and not speeds:
+        speeds = learning.add("pace", pace.pace, {"data": data})
+    time = {part: pace.seconds_of(cfg, part, phase) for part in ("tokenizer", "simulator", "state")}
     if not warm and "codec" in cfg["simulator"]:
-        warm = learning.add("tokenizer", world.tokenizer, {"data": data})
-    roles = {"data": data, "warm": warm}
-    simulator = teacher = learning.add(f"simulator-{number}", world.simulator, roles, phase=phase)
+        roles = {"data": data, "pace": speeds}
+        warm = learning.add("tokenizer", world.tokenizer, roles, **time["tokenizer"])
+    roles = {"data": data, "warm": warm, "pace": speeds}
+    simulator = teacher = learning.add(
+        f"simulator-{number}", world.simulator, roles, phase=phase, **time["simulator"]
+    )
     if cfg["distill"]["steps"]:
         roles = {"data": data, "simulator": teacher, "warm": before.simulator}
         simulator = learning.add(f"student-{number}", world.student, roles, phase=phase)
     inputs = {"data": data, "simulator": simulator}
-    state = graph.add(f"state-{number}", world.state, {**inputs, "warm": before.state}, phase=phase)
+    roles = {**inputs, "warm": before.state, "pace": speeds}
+    state = graph.add(f"state-{number}", world.state, roles, phase=phase, **time["state"])
     golden = ""
     if "text_world" in cfg["judge"]:
         roles = {"data": data, "warm": before.text_world}
         golden = graph.add(f"text_world-{number}", world.text_world, roles, phase=phase)
     roles = {**inputs, "warm": before.judge, "text_world": golden}
     judge = graph.add(f"judge-{number}", world.judge, roles, phase=phase, **_judge_files(cfg))
-    return World(teacher, simulator, state, judge, golden)
+    return World(teacher, simulator, state, judge, golden, speeds)
 
 
 def _judge_files(cfg: Cfg) -> dict[str, Any]:

@@ -9,7 +9,7 @@ eighth is held out, every fourth calibrates.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Set
 from pathlib import Path
 
 from envs.episodes.episode import EpisodeError
@@ -57,6 +57,34 @@ def write_splits(root: Path, sizes: Mapping[str, int]) -> None:
         begin += size
     text = json.dumps({**info, "splits": splits}, indent=4)
     write_atomically(path, lambda target: target.write_text(text))
+
+
+def read_splits(root: Path) -> dict[str, list[int]]:
+    """The episodes of each of NAMES in a data set, by number."""
+    info = read_info(root)
+    return {name: range_of(info["splits"], name, info["total_episodes"], root) for name in NAMES}
+
+
+def keep_in_splits(root: Path, kept: Mapping[str, Iterable[int]]) -> None:
+    """Say in a data set which episodes each split has; an episode that none has is not used.
+
+    Args:
+        kept: numbers of episodes by split.
+    """
+    path, info = Path(root) / "meta/info.json", read_info(root)
+    splits = {
+        name: ",".join(f"{begin}:{end}" for begin, end in _runs(set(some))) or "0:0"
+        for name, some in kept.items()
+    }
+    text = json.dumps({**info, "splits": splits}, indent=4)
+    write_atomically(path, lambda target: target.write_text(text))
+
+
+def _runs(numbers: Set[int]) -> list[tuple[int, int]]:
+    """First and last + 1 of each run of consecutive numbers."""
+    starts = sorted(n for n in numbers if n - 1 not in numbers)
+    ends = sorted(n + 1 for n in numbers if n + 1 not in numbers)
+    return list(zip(starts, ends, strict=True))
 
 
 def extend_splits(splits: Mapping[str, str], name: str, before: int, count: int) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,9 @@ def train_state(
         fresh: whether it has not been trained before; it then takes its units from these episodes first,
             unless they came with released weights.
 
+    Returns:
+        What `fit` does, and features_seconds, what was spent before on features that are kept.
+
     Raises:
         ValueError: if lora is asked of a decoder without projections to adapt.
     """
@@ -58,8 +62,10 @@ def train_state(
     simulator.eval().requires_grad_(False)
     drawn = step_generator(options.seed, options.steps)
     one = clips.sample(1, drawn)
+    began = time.perf_counter()
     count = min(_CLIPS, options.steps * options.batch // _VISITS, _KEPT // max(1, one["shown"].nbytes))
     kept = clips.many(count, drawn) if count >= options.part else None
+    ahead = time.perf_counter() - began
 
     def batch(step: int, generator: torch.Generator) -> TensorDict:
         if kept is not None:
@@ -75,7 +81,7 @@ def train_state(
         stats = fit("state", decoder, batch, loss, options, folder)
     for name, parameter in simulator.named_parameters():
         parameter.requires_grad_(wanted[name])
-    return stats
+    return {**stats, "features_seconds": ahead}
 
 
 class _Features:

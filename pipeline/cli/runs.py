@@ -125,8 +125,9 @@ def controls(words: Words) -> None:
 
 
 def study(words: Words) -> None:
-    """the table of an experiment, its rows (imitation, the loop with and without RL, RL in physics) by tasks
-    and seeds; goes on where it stopped: worldloop study experiment=bench4 [study.minutes=60]
+    """the table of an experiment: rows (ways to a policy or a world) by what is measured of them, by tasks
+    and seeds; goes on where it stopped: worldloop study experiment=bench4|worlds|roboscape|reward_curves
+    [study=data_size|judges] [study.minutes=60]
     """
     from pipeline.study.plan import plan_study
 

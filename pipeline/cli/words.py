@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ def listed(value: str) -> list[str]:
     return [name.strip() for name in value.strip("[]").split(",") if name.strip()]
 
 
-def root_of(cfg: dict[str, Any]) -> Path:
+def root_of(cfg: Mapping[str, Any]) -> Path:
     """The run's folder."""
     return Path(cfg["runs"]) / cfg["name"]
 

@@ -26,6 +26,11 @@ def groups(store: ClipStore, episodes: Tensor) -> dict[str, Tensor]:
     return {name: torch.tensor(numbers) for name, numbers in sorted(out.items())}
 
 
+def evenly(episodes: Tensor, count: int) -> Tensor:
+    """`count` of some episodes int64 [N] at most, evenly spread over them."""
+    return episodes[torch.linspace(0, len(episodes) - 1, min(count, len(episodes))).round().long()]
+
+
 def rollout_error(store: ClipStore, episodes: Tensor, made: Replay) -> dict[str, Any]:
     """Error of generated episodes against the true ones under the same actions.
 

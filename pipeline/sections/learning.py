@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from annotated_types import Gt, Lt, MinLen
+from annotated_types import Gt, Le, Lt, MinLen
 
-from envs.ranges import Count, Discount, Natural, Share
+from envs.ranges import Count, Discount, Natural, NonNegative, Share
 from pipeline.sections.kinds import Choice, Fit, Name, Side
 
 
@@ -119,6 +119,17 @@ class TextWorldFitSection:
     tokenizer: Fit
     first: Fit
     refresh: Fit
+
+
+@dataclass(frozen=True)
+class EqualTimeSection:
+    """Section equal_time."""
+
+    seconds: NonNegative
+    tokenizer: Annotated[float, Gt(0), Lt(1)]
+    state: Annotated[float, Gt(0), Lt(1)]
+    refresh: Annotated[float, Gt(0), Le(1)]
+    measured: Count
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,8 @@ class StudySection:
     rows: Annotated[Sequence[Name], MinLen(1)]
     columns: Annotated[Sequence[Name], MinLen(1)]
     seeds: Annotated[Sequence[Seed], MinLen(1)]
+    places: Sequence[Name]
+    across: Mapping[Name, Sequence[Name]]
     against: Sequence[Name]
     only: Sequence[Name]
     minutes: NonNegative | None

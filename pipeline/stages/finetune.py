@@ -28,7 +28,7 @@ def tokenizer(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     Settings: fingerprint of the data.
     """
     store = open_clips(cfg, cfg["task"]["data"])
-    return train_codec(cfg, folder, store, learning_episodes(store))
+    return train_codec(cfg, folder, inputs, store, learning_episodes(store))
 
 
 @stage(reads=(*_READS, "finetune.simulator", "finetune.weights"), place=Place.LEARNERS)

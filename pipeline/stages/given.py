@@ -30,13 +30,14 @@ ROBOT = (
 )
 POLICY = (*ROBOT, "threads", "policy")
 WORLD = ("seed", "threads", *TASK, "simulator", "judge")
+SIMULATOR = ("seed", "threads", *TASK, "simulator", "microbatches")
 PHYSICS = (*POLICY, "judge.rewards")
 
 # What a report shows.
 EVERYTHING = (
     *("name", "seed", "threads", "microbatches", "task", "simulator", "judge", "policy", "algorithm", "rl"),
     *("rounds", "collect", "imitation", "extra_starts", "clone", "tokenizer_fit", "simulator_fit", "distill"),
-    *("state_fit", "text_world_fit", "judge_fit"),
+    *("state_fit", "text_world_fit", "judge_fit", "equal_time"),
     *("evaluate", "measure"),
 )
 

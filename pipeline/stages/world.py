@@ -32,7 +32,7 @@ from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import (
     ROBOT,
-    TASK,
+    SIMULATOR,
     WORLD,
     Cfg,
     fit_options,
@@ -42,25 +42,26 @@ from pipeline.stages.given import (
     open_store,
 )
 from pipeline.stages.judge_cost import priced
-
-SIMULATOR = ("seed", "threads", *TASK, "simulator", "microbatches")
+from pipeline.stages.pace import in_time
 
 
 @stage(reads=(*SIMULATOR, "tokenizer_fit"), place=Place.LEARNERS)
 def tokenizer(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """The video autoencoder of a simulator that works on latents."""
+    """The video autoencoder of a simulator that works on latents; of it, as of the simulator and the state
+    expert, the role `pace` says how many steps take the seconds that settings may ask for.
+    """
     store = open_store(cfg, inputs)
-    return train_codec(cfg, folder, store, learning_episodes(store))
+    return train_codec(cfg, folder, inputs, store, learning_episodes(store))
 
 
-def train_codec(cfg: Cfg, folder: Path, store: ClipStore, episodes: Tensor) -> dict[str, Any]:
+def train_codec(cfg: Cfg, folder: Path, inputs: Inputs, store: ClipStore, episodes: Tensor) -> dict[str, Any]:
     """A simulator whose autoencoder was trained on some episodes; nothing else of it was."""
     prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg)
-    fit = fit_options(cfg, cfg["tokenizer_fit"], "tokenizer_fit")
+    fit = in_time(inputs, "tokenizer", fit_options(cfg, cfg["tokenizer_fit"], "tokenizer_fit"))
     stats = train_tokenizer(model, store, episodes, fit, folder)
     save_weights(model, folder)
-    return stats
+    return {**stats, "steps": fit.steps}
 
 
 @stage(reads=(*SIMULATOR, "simulator_fit.{phase}"), place=Place.LEARNERS)
@@ -71,7 +72,7 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     phase = inputs.settings["phase"]
     section = dict(cfg["simulator_fit"][phase])
-    fit = fit_options(cfg, section.pop("fit"), f"simulator_fit.{phase}.fit")
+    fit = in_time(inputs, "simulator", fit_options(cfg, section.pop("fit"), f"simulator_fit.{phase}.fit"))
     how = options(SimulatorFitConfig, section, f"simulator_fit.{phase}")
     store = open_store(cfg, inputs)
     episodes = learning_episodes(store)
@@ -87,7 +88,7 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         else {}
     )
     save_weights(model, folder)
-    return {**stats, "parameters": sum(p.numel() for p in model.parameters())}
+    return {**stats, "steps": fit.steps, "parameters": sum(p.numel() for p in model.parameters())}
 
 
 @stage(reads=(*SIMULATOR, "distill.steps", "distill.method", "distill.{phase}"), place=Place.LEARNERS)
@@ -142,11 +143,11 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     model = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, model, inputs.weights("warm"))
     section = cfg["state_fit"][phase]
-    fit = fit_options(cfg, section["fit"], f"state_fit.{phase}.fit")
+    fit = in_time(inputs, "state", fit_options(cfg, section["fit"], f"state_fit.{phase}.fit"))
     episodes, how = learning_episodes(store), {"lora": section["lora"], "fresh": phase == "first"}
     stats = train_state(decoder, model, store, episodes, fit, folder, **how) if learns(decoder) else {}
     save_weights(decoder, folder)
-    return stats
+    return {**stats, "steps": fit.steps}
 
 
 @stage(reads=(*ROBOT, "threads", "judge.text_world", "text_world_fit", "microbatches"), place=Place.LEARNERS)

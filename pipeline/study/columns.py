@@ -1,24 +1,27 @@
-"""What a study measures of each row: a stage on top of its policy, and the cells that it fills."""
+"""What a study measures of each row: stages on top of what the row is about, and the cells that they fill."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
+from markupsafe import Markup
 
 from envs.physics.suite import task_names
 from envs.targets import ConfigError, nearest
 from pipeline.evaluation.by_task import tasks_of_seeds
 from pipeline.evaluation.result import outcomes
-from pipeline.evaluation.statistics import rate_entry, rate_line
+from pipeline.evaluation.statistics import rate, rate_entry, rate_line
 from pipeline.stages import prove
 from pipeline.study.methods import Made
 
 Cfg = Mapping[str, Any]
+Cell = Mapping[str, Any]
+Outcomes = Mapping[tuple[str, int], bool]
 ALL = "all"  # label of the cell over all tasks
 
 
@@ -29,13 +32,17 @@ class Measured:
     Args:
         cells: figures by label; `text` of the column says them in words.
         outcomes: success by task and episode seed, by which rows are compared; {} if there are none.
+        before: the same of a policy that the row began with, where a column compares the two.
+        curve: (x, y) of a line that the column draws; [] if there is none.
     """
 
-    cells: Mapping[str, Mapping[str, Any]]
-    outcomes: Mapping[tuple[str, int], bool]
+    cells: Mapping[str, Cell]
+    outcomes: Outcomes = field(default_factory=dict)
+    before: Outcomes = field(default_factory=dict)
+    curve: Sequence[tuple[float, float]] = ()
 
     @classmethod
-    def of_success(cls, success: Mapping[tuple[str, int], bool]) -> Measured:
+    def of_success(cls, success: Outcomes) -> Measured:
         """Rates of each task, and of all."""
         tasks = dict.fromkeys(task for task, _ in success)
         cells = {
@@ -50,14 +57,20 @@ class Column(ABC):
 
     Args:
         title: what it is.
+
+    Attributes:
+        headline: label of the cell that stands for the column where all columns stand side by side.
     """
+
+    headline: str = ALL
 
     def __init__(self, title: str):
         self.title = title
 
     @abstractmethod
-    def add(self, cfg: Cfg, made: Made) -> str:
-        """Add the stage that measures to the row's graph, if it is not there; returns its name.
+    def add(self, cfg: Cfg, made: Made) -> Sequence[str]:
+        """Add the stages that measure to the row's graph, as far as they are not there; returns the names of
+        all whose results are read.
 
         Raises:
             ConfigError: if this cannot be measured with the row's config.
@@ -68,12 +81,25 @@ class Column(ABC):
         """Labels of the cells that it fills in a row of this config."""
 
     @abstractmethod
-    def read(self, cfg: Cfg, folder: Path) -> Measured:
-        """What the finished stage found."""
+    def read(self, cfg: Cfg, folders: Sequence[Path]) -> Measured:
+        """What the finished stages found, in the order of their names."""
 
     @abstractmethod
-    def text(self, cell: Mapping[str, Any]) -> str:
+    def text(self, cell: Cell) -> str:
         """A cell in words."""
+
+    def pool(self, several: Sequence[Measured]) -> Measured:
+        """What was found of one row with several seeds; here means of the figures that all of them have."""
+        labels = [label for label in several[0].cells if all(label in one.cells for one in several)]
+        return Measured({label: _mean([one.cells[label] for one in several]) for label in labels})
+
+    def merit(self, cell: Cell) -> float | None:
+        """By what the best row is found, more being better; None where rows are not to be ranked."""
+        return None
+
+    def chart(self, found: Mapping[str, Measured]) -> Markup:
+        """A drawing of what was found of each row, by title; "" for none."""
+        return Markup("")
 
 
 class Success(Column):
@@ -88,31 +114,63 @@ class Success(Column):
         super().__init__(title)
         self.variant = variant
 
-    def add(self, cfg: Cfg, made: Made) -> str:
+    def add(self, cfg: Cfg, made: Made) -> Sequence[str]:
         """See Column.add."""
-        graph, inputs = made.graph, {"policy": made.policy}
+        inputs = {"policy": made.policy}  # the loop proves its own first and last policy
         if not self.variant:
-            for name, node in graph.nodes.items():  # the loop proves its own first and last policy
-                if node.stage is prove.evaluate_physics and node.inputs == inputs:
-                    return name
-            return graph.add(f"evaluate-{made.policy}", prove.evaluate_physics, inputs)
+            return (made.add_once(f"evaluate-{made.policy}", prove.evaluate_physics, inputs),)
         known = cfg["task"].get("variants") or {}
         if self.variant not in known:
             near = nearest(self.variant, known)
             raise ConfigError(f"variant={self.variant} is not one of task.variants{near}")
         name = f"evaluate-{made.policy}-{self.variant}"
-        return graph.add(name, prove.evaluate_variant, inputs, variant=self.variant)
+        return (made.add_once(name, prove.evaluate_variant, inputs, variant=self.variant),)
 
     def labels(self, cfg: Cfg) -> list[str]:
         """See Column.labels."""
-        return [*task_names(cfg["task"]["name"]), ALL]
+        names = task_names(cfg["task"]["name"])
+        return [*names, ALL] if len(names) > 1 else [ALL]
 
-    def read(self, cfg: Cfg, folder: Path) -> Measured:
+    def read(self, cfg: Cfg, folders: Sequence[Path]) -> Measured:
         """See Column.read."""
-        seeds, (success,) = outcomes(folder)
-        keys = zip(tasks_of_seeds(cfg, seeds), seeds, strict=True)
-        return Measured.of_success(dict(zip(keys, success.tolist(), strict=True)))
+        return Measured.of_success(outcomes_of(cfg, folders[0]))
 
-    def text(self, cell: Mapping[str, Any]) -> str:
+    def text(self, cell: Cell) -> str:
         """See Column.text."""
         return rate_line(cell)
+
+    def pool(self, several: Sequence[Measured]) -> Measured:
+        """Success over all seeds of training, each on the same episodes."""
+        return Measured.of_success(together([one.outcomes for one in several]))
+
+    def merit(self, cell: Cell) -> float | None:
+        """See Column.merit."""
+        return rate(cell)
+
+
+def outcomes_of(cfg: Cfg, folder: Path) -> dict[tuple[str, int], bool]:
+    """Success by task and seed of a stage that evaluated a policy in physics."""
+    seeds, (success,) = outcomes(folder)
+    return dict(zip(zip(tasks_of_seeds(cfg, seeds), seeds, strict=True), success.tolist(), strict=True))
+
+
+def together(several: Sequence[Outcomes]) -> dict[tuple[str, int], bool]:
+    """Outcomes of several seeds of training as those of as many times the episodes."""
+    return {
+        (task, number * _APART + seed): won
+        for number, one in enumerate(several)
+        for (task, seed), won in one.items()
+    }
+
+
+_APART = 10**12  # between the episodes of one training seed and those of the next
+
+
+def _mean(cells: Sequence[Cell]) -> dict[str, Any]:
+    """Means of the numbers in cells; of anything else the first one's."""
+    out = dict(cells[0])
+    for key, value in out.items():
+        values = [cell.get(key) for cell in cells]
+        if isinstance(value, (int, float)) and all(isinstance(one, (int, float)) for one in values):
+            out[key] = sum(values) / len(values)  # type: ignore[arg-type]
+    return out

@@ -1,4 +1,6 @@
-"""The plan of a study: its rows, each a config and a way to a policy, and what is measured of them."""
+"""The plan of a study: its rows, each a config and a way to a policy or a world, and what is measured of
+them.
+"""
 
 from __future__ import annotations
 
@@ -21,38 +23,48 @@ Cfg = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Row:
-    """One way to a policy with one seed.
+    """One way to a policy or a world, in one place with one seed.
 
     Args:
         name, title: in the config, and in the table.
-        seed: of everything but the evaluation, whose seeds are the same for all rows.
+        place: of study.across; "" where there is none.
         cfg: resolved.
-        made: the policy and its graph.
-        nodes: the stage behind each column, by the column's name.
+        made: what it is about, and its graph.
+        nodes: the stages behind each column, by the column's name.
         note: what must be known to compare it with other rows; "" for nothing.
     """
 
     name: str
     title: str
-    seed: int
+    place: str
     cfg: Cfg
     made: Made
-    nodes: Mapping[str, str]
+    nodes: Mapping[str, Sequence[str]]
     note: str
+
+    @property
+    def seed(self) -> int:
+        """Of everything but the evaluation, whose seeds are the same for all rows."""
+        return int(self.cfg["seed"])
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """What seeds have in common: name and place."""
+        return self.name, self.place
 
     def finished(self, column: str) -> bool:
         """Whether a column has been measured."""
-        return self.made.graph.finished(self.nodes[column])
+        return all(self.made.graph.finished(node) for node in self.nodes[column])
 
 
 @dataclass(frozen=True)
 class Study:
-    """Rows, seed by seed, and columns.
+    """Rows and columns.
 
     Args:
         cfg: of the study, resolved.
         root: its folder.
-        rows: in the order in which they are run.
+        rows: in the order in which they are run: seed by seed, place by place.
         columns: by name.
         only: names of the rows that are run now; the others are shown as they stand.
         against: names of the rows with which all others are compared.
@@ -69,7 +81,8 @@ class Study:
         """What a column found of a row, None if it was not run."""
         if not row.finished(column):
             return None
-        return self.columns[column].read(row.cfg, row.made.graph.folder(row.nodes[column]))
+        folders = [row.made.graph.folder(node) for node in row.nodes[column]]
+        return self.columns[column].read(row.cfg, folders)
 
     def missing(self) -> list[tuple[Row, str]]:
         """Rows and columns that are still to be run, in their order."""
@@ -92,8 +105,8 @@ class Study:
                     known.setdefault(_kind(name), []).append(graph.manifest(name)["seconds"])
         waiting = {
             graph.folder(name): _kind(name)
-            for graph, node in ((row.made.graph, row.nodes[column]) for row, column in self.missing())
-            for name in graph.needs(node)
+            for graph, nodes in ((row.made.graph, row.nodes[column]) for row, column in self.missing())
+            for name in graph.needs(nodes)
             if not graph.finished(name)
         }
         guesses = [sum(known[kind]) / len(known[kind]) for kind in waiting.values() if kind in known]
@@ -118,23 +131,28 @@ def plan_study(words: Sequence[str]) -> Study:
     columns = {
         name: build(section["measures"][name], f"study.measures.{name}") for name in section["columns"]
     }
-    root = root_of(cfg)
     sections = {
         name: options(RowSection, section["methods"][name], f"study.methods.{name}")
         for name in section["rows"]
     }
-    configs = {name: _config_of(name, row.changes, words) for name, row in sections.items()}
+    places = {name: section["across"][name] for name in section["places"]} or {"": ()}
+    configs = {
+        (name, place): _config_of(name, place, [*without_given(changes, row.changes), *row.changes], words)
+        for place, changes in places.items()
+        for name, row in sections.items()
+    }
     rows = [
-        _row(name, sections[name], {**configs[name], "seed": seed}, root, columns)
+        _row(name, row, place, {**configs[name, place], "seed": seed}, columns)
         for number, seed in enumerate(section["seeds"])
+        for place in places
         for name, row in sections.items()
         if not row.seeds or number < row.seeds
     ]
-    return Study(cfg, root, rows, columns, section["only"] or section["rows"], section["against"])
+    return Study(cfg, root_of(cfg), rows, columns, section["only"] or section["rows"], section["against"])
 
 
-def _config_of(name: str, changes: Sequence[str], words: Sequence[str]) -> Cfg:
-    """The resolved config of a row.
+def _config_of(name: str, place: str, changes: Sequence[str], words: Sequence[str]) -> Cfg:
+    """The resolved config of a row in a place.
 
     Raises:
         ConfigError: naming the row, if its changes cannot work.
@@ -143,25 +161,27 @@ def _config_of(name: str, changes: Sequence[str], words: Sequence[str]) -> Cfg:
         cfg = load_config([*without_given(words, changes), *changes])
         check_world(cfg)
     except ConfigError as error:
-        raise ConfigError(f"study.methods.{name}.changes={list(changes)}: {error}") from error
+        there = f" in study.across.{place}" if place else ""
+        raise ConfigError(f"study.methods.{name}.changes={list(changes)}{there}: {error}") from error
     return cfg
 
 
-def _row(name: str, section: RowSection, cfg: Cfg, root: Path, columns: Mapping[str, Column]) -> Row:
+def _row(name: str, section: RowSection, place: str, cfg: Cfg, columns: Mapping[str, Column]) -> Row:
     method = build(section.policy, f"study.methods.{name}.policy")
     if not isinstance(method, Method):
         raise ConfigError(
             f"study.methods.{name}.policy._target_ makes a {type(method).__name__}, which is no"
             " pipeline.study.methods.Method"
         )
-    made = method.make(cfg, root)
+    made = method.make(cfg, root_of(cfg))
     nodes = {}
     for key, column in columns.items():
         try:
             nodes[key] = column.add(cfg, made)
         except ConfigError as error:
             raise ConfigError(f"study.measures.{key} in the row {name}: {error}") from error
-    return Row(name, section.title, cfg["seed"], cfg, made, nodes, method.note(cfg))
+    title = f"{section.title}, {place}" if place else section.title
+    return Row(name, title, place, cfg, made, nodes, method.note(cfg))
 
 
 def _kind(name: str) -> str:

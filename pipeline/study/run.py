@@ -6,13 +6,14 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from markupsafe import Markup
 from tqdm import tqdm
 
 from envs.files import write_text
 from pipeline.study.deadline import deadline
 from pipeline.study.plan import Row, Study
 from pipeline.study.show import markdown, page
-from pipeline.study.table import study_table
+from pipeline.study.table import measured, pooled, study_table
 from pipeline.track import tracking
 
 NAMES = ("study.json", "study.md", "study.html")
@@ -51,15 +52,28 @@ def write_table(study: Study) -> str:
     """
     table = study_table(study)
     text = markdown(table, study.columns)
-    contents = (json.dumps(table, indent=1, default=float), text, page(table, study.columns))
+    shown = page(table, study.columns, charts(study))
+    contents = (json.dumps(table, indent=1, default=float), text, shown)
     for name, content in zip(NAMES, contents, strict=True):
         write_text(study.root / name, content)
     return text
 
 
+def charts(study: Study) -> list[Markup]:
+    """What columns draw of the rows that were run, place by place."""
+    found = measured(study)
+    out = []
+    for name, column in study.columns.items():
+        for place in dict.fromkeys(row.place for row in study.rows):
+            rows = {row.key: row.title for row in study.rows if row.place == place}
+            known = {title: pooled(study, found, key, name) for key, title in rows.items()}
+            out.append(column.chart({title: one for title, one in known.items() if one is not None}))
+    return [drawn for drawn in out if drawn]
+
+
 def _run_cell(study: Study, row: Row, column: str) -> None:
-    """Run a column's stage and all that it needs, tracked as a run of its own for each row and seed."""
-    name = f"{study.cfg['name']}-{row.name}"
+    """Run a column's stages and all that they need, tracked as a run of its own for each row and seed."""
+    name = "-".join(filter(None, (study.cfg["name"], row.name, row.place)))
     named: Mapping[str, Any] = {**row.cfg, "name": name}
     with tracking(named, study.root / "tracks" / f"{name}-{row.seed}") as tracker:
         row.made.graph.run(row.nodes[column], tracker)

@@ -2,47 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup
 
 from pipeline.study.columns import Column
+from pipeline.study.side_by_side import NOT_RUN, best_of, headlines
 
-NOT_RUN = "not run"
 Lines = list[list[str]]
+Columns = Mapping[str, Column]
 
 
-def sections_of(table: Mapping[str, Any], columns: Mapping[str, Column]) -> list[tuple[str, Lines]]:
-    """Title and lines, the first of which are headings, of each column's cells and of the comparisons."""
-    out = []
+def sections_of(table: Mapping[str, Any], columns: Columns) -> list[tuple[str, Lines]]:
+    """Title and lines, the first of which are headings, of all columns side by side if there are several, of
+    each column's cells, and of the comparisons.
+    """
+    out = [("Side by side", headlines(table, columns))] if len(columns) > 1 else []
     for name, column in columns.items():
         known = table["columns"][name]
         labels = known["labels"]
         lines = [["", "seed", *labels, "physics episodes", "minutes"]]
         for row in table["rows"]:
-            cells = [_cell(column, row["cells"][name][label]) for label in labels]
+            cells = [_cell(column, row["cells"][name], label) for label in labels]
             lines.append([row["title"], str(row["seed"]), *cells, _episodes(row), _minutes(row)])
         for row in table["pooled"]:
             seeds = row["seeds"][name]
             if len(seeds) > 1:
-                cells = [_cell(column, row["cells"][name][label]) for label in labels]
+                cells = [_cell(column, row["cells"][name], label) for label in labels]
                 lines.append([row["title"], ", ".join(map(str, seeds)), *cells, "", ""])
         out.append((known["title"], lines))
     return out + _comparisons(table)
 
 
-def markdown(table: Mapping[str, Any], columns: Mapping[str, Column]) -> str:
+def markdown(table: Mapping[str, Any], columns: Columns) -> str:
     """The whole table as Markdown."""
     parts = [f"# {table['name']}"]
     for title, lines in sections_of(table, columns):
         rows = [lines[0], ["---"] * len(lines[0]), *lines[1:]]
         parts.append(f"## {title}\n\n" + "\n".join(f"| {' | '.join(row)} |" for row in rows))
+    parts += best_of(table, columns)
     parts += [f"{title}: {text}." for title, text in notes_of(table).items()]
     return "\n\n".join(parts) + "\n"
 
 
-def page(table: Mapping[str, Any], columns: Mapping[str, Column]) -> str:
+def page(table: Mapping[str, Any], columns: Columns, charts: Sequence[Markup]) -> str:
     """One self-contained HTML page."""
     made = Environment(
         loader=PackageLoader("pipeline", "evaluation/page"),
@@ -52,7 +57,12 @@ def page(table: Mapping[str, Any], columns: Mapping[str, Column]) -> str:
         lstrip_blocks=True,
     )
     return made.get_template("study.html.j2").render(
-        name=table["name"], sections=sections_of(table, columns), notes=notes_of(table), not_run=NOT_RUN
+        name=table["name"],
+        sections=sections_of(table, columns),
+        best=best_of(table, columns),
+        charts=charts,
+        notes=notes_of(table),
+        not_run=NOT_RUN,
     )
 
 
@@ -63,7 +73,6 @@ def notes_of(table: Mapping[str, Any]) -> dict[str, str]:
 
 def _comparisons(table: Mapping[str, Any]) -> list[tuple[str, Lines]]:
     """For each column and row compared with: gains in points and McNemar's test of the same episodes."""
-    titles = {row["row"]: row["title"] for row in table["rows"]}
     out = []
     for name, known in table["columns"].items():
         for other in dict.fromkeys(entry["other"] for entry in table["comparisons"]):
@@ -71,14 +80,18 @@ def _comparisons(table: Mapping[str, Any]) -> list[tuple[str, Lines]]:
             lines = [["", "seeds", *known["labels"]]]
             for entry in mine:
                 cells = [_gain(entry["cells"].get(label)) for label in known["labels"]]
-                lines.append([titles[entry["row"]], ", ".join(map(str, entry["seeds"])), *cells])
+                lines.append([entry["title"], ", ".join(map(str, entry["seeds"])), *cells])
             if mine:
-                out.append((f"{known['title']}, against {titles[other]} on the same episodes", lines))
+                titles = {row["title"] for row in table["rows"] if row["row"] == other}
+                against = titles.pop() if len(titles) == 1 else other
+                out.append((f"{known['title']}, against {against} on the same episodes", lines))
     return out
 
 
-def _cell(column: Column, cell: Mapping[str, Any] | None) -> str:
-    return NOT_RUN if cell is None else column.text(cell)
+def _cell(column: Column, cells: Mapping[str, Any], label: str) -> str:
+    if label not in cells:  # of other rows
+        return ""
+    return NOT_RUN if cells[label] is None else column.text(cells[label])
 
 
 def _gain(cell: Mapping[str, Any] | None) -> str:

@@ -65,6 +65,11 @@ from pipeline.loop import build_loop
         (["simulator=dit", "distill.steps=5"], r"more than the teacher's simulator\.denoising\.steps=4"),
         (["simulator=gesim", "task=lerobot", "task.data=[x]", "distill.steps=5"], r"distilled sampler has 4"),
         (["distill.method.critic_lr=0"], r"distill\.method\.critic_lr=0"),
+        (["+if_chosen.judge.learned.pionts=3"], r"if_chosen\.judge\.learned\.pionts is no option of"),
+        (
+            ["+if_chosen.jugde.learned.points=3"],
+            r"if_chosen\.jugde is no group of choices; did you mean judge",
+        ),
         (["task=tabletop", "task.suite.scenes=3"], r"task\.suite\.scenes=3"),
         (["task=tabletop", "+task.variants.x={scene: a}"], r"task\.variants\.x\.scene is not an option"),
     ],
@@ -72,6 +77,19 @@ from pipeline.loop import build_loop
 def test_mistakes_name_the_key(words: list[str], match: str) -> None:
     with pytest.raises(ConfigError, match=match):
         load_config(words)
+
+
+def test_options_of_a_choice_count_with_that_choice_alone() -> None:
+    mine = ["+if_chosen.judge={proxy: {width: 4}, learned: {points: 7}}"]
+    mine += ["+if_chosen.task={push: {suite: {hold: 0.2}}}"]
+    proxy = load_config([*mine, "judge=proxy"])
+    assert proxy["judge"]["width"] == 4 and "points" not in proxy["judge"]
+    assert load_config(mine)["judge"]["points"] == 7 and proxy["task"]["suite"]["hold"] == 0.2
+    assert load_config([*mine, "task=tabletop"])["task"]["suite"]["hold"] == 0.4
+    told = load_config([*mine, "judge=proxy", "judge.width=5", "task.suite={hold: 0.3}"])
+    assert (told["judge"]["width"], told["task"]["suite"]["hold"]) == (5, 0.3)
+    for name in choices("judge"):  # an experiment's options of its own judge are no other's
+        assert load_config(["experiment=soak", f"judge={name}"])["judge"]
 
 
 def test_all_mistakes_are_told_at_once() -> None:

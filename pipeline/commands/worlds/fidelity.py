@@ -25,7 +25,7 @@ from pipeline.evaluation.fidelity.long import drift, long_episodes, longest
 from pipeline.evaluation.fidelity.masks import part_labels
 from pipeline.evaluation.fidelity.open_loop import OpenLoop, held_still
 from pipeline.evaluation.fidelity.page import build_page, summary_text
-from pipeline.evaluation.measurement import groups, speed
+from pipeline.evaluation.measurement import evenly, groups, speed
 from pipeline.loop import has_physics
 
 Cfg = Mapping[str, Any]
@@ -49,7 +49,8 @@ def fidelity(cfg: Cfg, root: Path) -> str:
     for other in settled:  # options that change what the weights are of are refused here
         subject.simulator(other)
     store = subject.store()
-    episodes = chosen(subject, store, section["episodes"])
+    held = subject.held_out(store)
+    episodes = evenly(held[store.length[held] > 1], section["episodes"])
     simulator = subject.simulator()
     labels = part_labels(cfg, store, episodes, section["masks"])
     hands = end_effector_ruler(subject.cfg, store, subject.data, root)
@@ -98,13 +99,6 @@ def build_extractors(section: Mapping[str, Any]) -> list[Extractor]:
             )
         out.append(extractor)
     return out
-
-
-def chosen(subject: Subject, store: ClipStore, count: int) -> Tensor:
-    """`count` held-out episodes at most, int64 [N], evenly spread over those there are."""
-    held = subject.held_out(store)
-    held = held[store.length[held] > 1]
-    return held[torch.linspace(0, len(held) - 1, min(count, len(held))).round().long()]
 
 
 def _masks(section: Mapping[str, Any], labels: Tensor | None) -> dict[str, Any]:

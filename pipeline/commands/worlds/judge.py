@@ -12,19 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
-from tqdm import tqdm
 
 from actors.factory import build_judge, open_clips
-from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge
-from envs.specs import Status
 from envs.targets import ConfigError, target
-from pipeline.evaluation.judging import Scores, judge_frames, judge_table, labelled
+from pipeline.evaluation.judging import labelled
+from pipeline.evaluation.rewards.shown import check_frames, shown_table
 from pipeline.loop import build_loop, has_physics, last_round
 from pipeline.stages.given import datasets, learns
 
-_BATCH = 16  # episodes judged at once
 _SPLITS = ("train", "held_out", "calibration")
 
 
@@ -59,8 +55,7 @@ class Selection:
         if not episodes.isdigit():
             raise ConfigError(f"episodes={episodes} should be a whole number; 0 for all")
         for name in frames:
-            if name not in ("all", "ends") and not (name.isdigit() and int(name)):
-                raise ConfigError(f"frames={name} should be all, ends, or a number n for every n-th frame")
+            check_frames(name)
         return cls(data, split, int(episodes), frames)
 
 
@@ -88,12 +83,21 @@ def judge_study(cfg: Mapping[str, Any], root: Path, selection: Selection) -> str
     lines = [f"{name} on {len(episodes)} recorded episodes ({selection.split})", _line(_HEAD)]
     for frames in selection.frames:
         before = kind.spent(cfg["judge"])  # type: ignore[attr-defined]
-        row = _row(judge, store, episodes, frames)
+        found = shown_table(judge, store, episodes, frames)
         after = kind.spent(cfg["judge"])  # type: ignore[attr-defined]
         spent = {key: after[key] - before[key] for key in after}
         cost = ", ".join(f"{key.replace('_', ' ')} {value:g}" for key, value in spent.items() if value)
-        lines.append(f"{_line([frames, *row])}  {cost or ('free' if not spent else 'all remembered')}")
+        lines.append(
+            f"{_line([frames, *_cells(found)])}  {cost or ('free' if not spent else 'all remembered')}"
+        )
     return "\n".join(lines)
+
+
+def _cells(found: Mapping[str, Any]) -> list[Any]:
+    """Cells of the table behind the name of the choice of frames."""
+    counts = [found[name] for name in ("tp", "fp", "fn", "tn")]
+    lost = [found[name] for name in ("abstained", "errors")]
+    return [f"{found['shown']:.1f}", *counts, f"{100 * found['accuracy']:.1f}%", *lost]
 
 
 _HEAD = ("frames", "shown", "TP", "FP", "FN", "TN", "accuracy", "abstained", "errors")
@@ -131,34 +135,3 @@ def _judge(cfg: Mapping[str, Any], root: Path) -> Judge:
             f"this judge has learned nothing yet: first `worldloop stage {name}` with the same options"
         )
     return judge.eval()
-
-
-def _row(judge: Judge, store: ClipStore, episodes: Tensor, frames: str) -> list[Any]:
-    """Cells of the table behind the name of the choice of frames."""
-    rows, valid = thinned(store, episodes, frames)
-    parts, held = [], judge.hold
-    # So many of the frames that are left stand for `hold` of all.
-    judge.hold = 1 if frames == "ends" else max(1, round(held / (1 if frames == "all" else int(frames))))
-    try:
-        for some in tqdm(torch.arange(len(episodes)).split(_BATCH), desc=f"judge {frames}", leave=False):
-            parts.append(judge_frames(judge, store.frames(rows[some]), store, episodes[some]))
-        scores = Scores(*(torch.cat(values) for values in zip(*parts, strict=True)))
-        table = judge_table(judge, scores, valid, store, episodes)
-    finally:
-        judge.hold = held
-    lost = [int((scores.status == status.value).sum()) for status in (Status.ABSTAIN, Status.ERROR)]
-    share = f"{100 * table['accuracy']:.1f}%"
-    shown = f"{1 + float(valid.sum(1).float().mean()):.1f}"
-    return [shown, *(table[name] for name in ("tp", "fp", "fn", "tn")), share, *lost]
-
-
-def thinned(store: ClipStore, episodes: Tensor, frames: str) -> tuple[Tensor, Tensor]:
-    """Some rows of each episode but its first, int64 [N, T], the last repeated up to the longest, and which
-    are no repeats, bool [N, T]; see Selection.frames.
-    """
-    length = store.length[episodes] - 1
-    every = {"all": 1, "ends": int(length.max())}.get(frames) or int(frames)
-    count = -(-length // every)
-    behind = (count[:, None] - 1 - torch.arange(int(count.max()))).clamp(min=0) * every
-    valid = torch.arange(int(count.max())) < count[:, None]
-    return store.start[episodes][:, None] + length[:, None] - behind, valid

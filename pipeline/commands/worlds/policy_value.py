@@ -9,32 +9,25 @@ true column stays empty.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
-from tqdm import tqdm
 
-from actors.factory import build_world
-from envs.episodes.clips import ClipStore
 from envs.files import write_text
-from envs.initial_states import InitialStates
 from envs.targets import ConfigError
-from pipeline.commands.worlds.subject import WEIGHTS, Subject, mark, weights_at
-from pipeline.evaluation.by_task import tasks_of_episodes
+from pipeline.commands.worlds.subject import WEIGHTS, Subject, weights_at
 from pipeline.evaluation.value.agreement import Cell, agreement
 from pipeline.evaluation.value.candidates import Candidate, action_spread, candidates
+from pipeline.evaluation.value.estimate import Comparison, starts_of, task_of
 from pipeline.evaluation.value.page import build_page, table_text
-from pipeline.evaluation.value.trials import Imagination, Kept, Physics
+from pipeline.evaluation.value.trials import Kept
 from pipeline.graph.code_version import code_of
 from pipeline.loop import has_physics
 from pipeline.stages import imitation, rl
 from pipeline.stages.given import mode_of
 
-_SIDE_BY_SIDE = 64  # imagined episodes
 _ACTING = (imitation.imitation, imitation.clone, rl.rl)  # stages that leave a policy
 _MODULE = "pipeline.evaluation.value.trials"
 OPEN_LOOP = (
@@ -57,46 +50,15 @@ def policy_value(cfg: Mapping[str, Any], root: Path) -> str:
     given = policies_of(subject)
     everybody = candidates(given, section["noise"], section["experts"] if physics_there else ())
     store = subject.store()
-    starts = starts_of(cfg, subject, store)
+    starts = starts_of(cfg, store, subject.held_out(store))
     spread, kept = action_spread(store, mode_of(cfg)), Kept(root / "policy-value")
-    world = {**subject.identity("simulator", "state", "judge"), **_task(cfg), "code": _code(cfg)}
-    physics = Physics(cfg, {**_task(cfg), "code": _code(cfg)}, kept, spread) if physics_there else None
+    comparison = Comparison(cfg, subject.data, store, starts, everybody, spread)
+    physics = {**task_of(cfg), "code": _code(cfg)}
+    true = comparison.true(physics, kept) if physics_there else {}
     simulator = subject.simulator()
     parts = (simulator, subject.decoder(simulator), subject.judge())
-    # repeats are to draw other noise, whatever the run's episodes share
-    drawn = {**cfg, "simulator": {**cfg["simulator"], "shared_noise": False}}
-    cells: list[Cell] = []
-    with tqdm(
-        total=len(starts) * len(everybody), desc="policy-value", unit="cell", dynamic_ncols=True
-    ) as bar:
-        try:
-            for task, episodes in starts.items():
-                seeds = [int(store.episodes[n]["seed"] or 0) for n in episodes.tolist()]
-                first = InitialStates.of(store, episodes)
-                env = build_world(drawn, *parts, first, min(_SIDE_BY_SIDE, len(episodes)))
-                where = {"data": [str(path) for path in subject.data], "episodes": episodes.tolist()}
-                imagination = Imagination(cfg, env, {**world, **where}, kept, spread)
-                for candidate in everybody:
-                    about = identity_of(candidate, section, spread)
-                    true = physics.outcome(candidate, about, seeds) if physics else None
-                    made = [
-                        imagination.outcome(candidate, about, repeat, true)
-                        for repeat in range(section["repeats"])
-                    ]
-                    cells.append(
-                        Cell(
-                            candidate.name,
-                            task,
-                            candidate.inside,
-                            torch.stack([one["success"] for one in made]),
-                            torch.stack([one["judged"] for one in made]),
-                            true["success"] if true else None,
-                        )
-                    )
-                    bar.update()
-        finally:
-            if physics:
-                physics.close()
+    world = {**subject.identity("simulator", "state", "judge"), **physics}
+    cells = comparison.imagined(parts, world, kept, true)
     result = {
         **subject.about(),
         "starts": {task: len(episodes) for task, episodes in starts.items()},
@@ -139,26 +101,10 @@ def policies_of(subject: Subject) -> dict[str, tuple[Mapping[str, Any], Path | N
     return found
 
 
-def starts_of(cfg: Mapping[str, Any], subject: Subject, store: ClipStore) -> dict[str, Tensor]:
-    """Numbers int64 [N] of held-out episodes by task, policy_value.starts of each at most."""
-    held = subject.held_out(store)
-    tasks = tasks_of_episodes(cfg, store, held)
-    mine = {task: held[torch.tensor([one == task for one in tasks])] for task in sorted(set(tasks))}
-    return {task: episodes[: cfg["policy_value"]["starts"]] for task, episodes in mine.items()}
-
-
-def identity_of(candidate: Candidate, section: Mapping[str, Any], spread: Tensor) -> dict[str, Any]:
-    """What tells a candidate's behaviour from others'; names are none of it."""
-    about = {key: value for key, value in asdict(candidate).items() if key not in ("name", "weights")}
-    weights = "" if candidate.weights is None else mark(candidate.weights)
-    unit = [round(value, 6) for value in spread.tolist()] if candidate.noise else []
-    return {**about, "weights": weights, "stochastic": section["stochastic"], "spread": unit}
-
-
 def notes(
     section: Mapping[str, Any],
     starts: Mapping[str, Tensor],
-    everybody: list[Candidate],
+    everybody: Sequence[Candidate],
     cells: list[Cell],
 ) -> list[str]:
     """What must be known to read the table."""
@@ -180,11 +126,6 @@ def notes(
     if few:
         out.append(f"Fewer held-out starts than policy_value.starts={section['starts']}: {few}.")
     return out
-
-
-def _task(cfg: Mapping[str, Any]) -> dict[str, Any]:
-    task = {key: cfg["task"].get(key) for key in ("suite", "name", "size", "chunk", "horizon", "mode")}
-    return {"task": task, "seed": cfg["seed"]}
 
 
 def _code(cfg: Mapping[str, Any]) -> dict[str, str]:

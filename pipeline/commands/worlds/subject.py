@@ -13,7 +13,7 @@ from actors.factory import build_judge, build_simulator, build_state_decoder, op
 from actors.weights import load
 from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge
-from envs.manifest import digest_of, read_manifest
+from envs.manifest import mark_of
 from envs.simulators.base import Simulator
 from envs.simulators.state_experts.base import StateDecoder
 from envs.targets import ConfigError
@@ -117,7 +117,7 @@ class Subject:
         sections = {"simulator": "simulator", "state": "simulator", "judge": "judge"}
         return {
             "sections": {name: self.cfg[name] for name in sorted({sections[role] for role in roles})},
-            "weights": {role: mark(self.weights[role]) for role in roles},
+            "weights": {role: mark_of(self.weights[role]) for role in roles},
         }
 
 
@@ -136,14 +136,6 @@ def weights_at(graph: Graph, name: str, key: str) -> Path:
             f" {stages}"
         )
     return path
-
-
-def mark(path: Path) -> str:
-    """What tells weights from others: the key of the stage that left them, else a hash of the file; "" where
-    there is no file.
-    """
-    manifest = read_manifest(path.parent) or {}
-    return str(manifest.get("key") or (digest_of(path) if path.is_file() else ""))
 
 
 def _with_weights(part: Any, weights: Path) -> Any:

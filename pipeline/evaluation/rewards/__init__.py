@@ -1,1 +1,1 @@
-"""Rewards side by side: what they are compared by, and the page."""
+"""Rewards and judges side by side: what they are compared by, and the page."""

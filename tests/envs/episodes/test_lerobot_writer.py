@@ -19,7 +19,7 @@ import pytest
 from envs.embodiment import Embodiment
 from envs.episodes import Episode, EpisodeError, LeRobotDataset, LeRobotWriter
 from envs.episodes.clips import ClipStore
-from envs.episodes.splits import write_splits
+from envs.episodes.splits import keep_in_splits, read_splits, write_splits
 from envs.episodes.video import read_clip, read_video, write_video
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, EMBODIMENTS, world_spec
 from tests.envs.episodes.lerobot_sets import SETS, write_set
@@ -316,6 +316,17 @@ def test_splits_stand_in_info_json(dataset: Path, tmp_path: Path) -> None:
     assert info["splits"] == {"train": "0:12", "held_out": "12:17", "calibration": "17:20"}
     with pytest.raises(EpisodeError, match="do not add up to 20"):
         write_splits(root, {"train": 12})
+
+
+def test_fewer_episodes_can_be_kept_in_splits(dataset: Path, tmp_path: Path) -> None:
+    root = tmp_path / "set"
+    shutil.copytree(dataset, root)
+    whole = read_splits(root)  # by number, as the set names none
+    assert whole["held_out"] == [7, 15] and len(whole["train"]) == 13
+    keep_in_splits(root, {"train": whole["train"][:4], "held_out": whole["held_out"], "calibration": []})
+    info = json.loads((root / "meta/info.json").read_text())
+    assert info["splits"] == {"train": "0:2,3:5", "held_out": "7:8,15:16", "calibration": "0:0"}
+    assert read_splits(root) == {"train": [0, 1, 3, 4], "held_out": [7, 15], "calibration": []}
 
 
 def test_appending_leaves_splits_as_they_are(tmp_path: Path) -> None:

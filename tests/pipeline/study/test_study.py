@@ -34,7 +34,7 @@ def test_a_study_runs_what_is_missing_and_says_what_is_not_run(tmp_path: Path) -
     assert nothing.status == 0, nothing.said[-3000:]
     root = tmp_path / "soak"
     assert all(cell is None for row in table_of(root)["rows"] for cell in row["cells"]["success"].values())
-    assert (root / "study.md").read_text().count("not run") == len(ROWS) * (2 * 3 + 2 * 2)
+    assert (root / "study.md").read_text().count("not run") == len(ROWS) * (2 * 3 + 2 * 2 + 2)
     assert "8 cells were not run" in nothing.said
 
     first = worldloop(tmp_path / "logs", *words, "study.only=[imitation]")
@@ -76,7 +76,7 @@ def assert_cells_are_what_the_evaluations_left(words: tuple[str, ...], table: di
     kept = {
         (row.name, column): torch.load(row.made.graph.folder(node) / "outcomes.pt", weights_only=True)
         for row in study.rows
-        for column, node in row.nodes.items()
+        for column, (node,) in row.nodes.items()
     }
     for row in table["rows"]:
         for column, cells in row["cells"].items():
@@ -115,6 +115,12 @@ def test_rows_over_seeds_share_evaluation_episodes_and_only_as_many_seeds_as_ask
         ),
         (["study.methods.ppo.policy._target_=pathlib.Path"], "which is no pipeline.study.methods.Method"),
         (["study.methods.physics_episodes.policy.equal=hours"], "policy.equal='hours' should be"),
+        (["study.places=[moon]"], "study.places holds 'moon', which study.across has not"),
+        (["+study.methods.filtered_bc.policy.kept=false"], "rl=false leaves no policy of RL's to take"),
+        (
+            ["+study.across={moon: ['task.gravity=1']}", "study.places=[moon]"],
+            "study.methods.imitation.changes=['task.gravity=1'] in study.across.moon: task.gravity",
+        ),
     ],
 )
 def test_what_is_wrong_with_a_plan_is_told_by_key(words: list[str], told: str, tmp_path: Path) -> None:

@@ -1,0 +1,130 @@
+"""Values of candidates on the same starts: true ones in physics, estimated ones in an imagined world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from actors.factory import build_world
+from envs.episodes.clips import ClipStore
+from envs.initial_states import InitialStates
+from envs.manifest import mark_of
+from pipeline.evaluation.by_task import tasks_of_episodes
+from pipeline.evaluation.value.agreement import Cell
+from pipeline.evaluation.value.candidates import Candidate
+from pipeline.evaluation.value.trials import Imagination, Kept, Physics, Tensors
+
+Cfg = Mapping[str, Any]
+_SIDE_BY_SIDE = 64  # imagined episodes
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Who is compared on what.
+
+    Args:
+        cfg: the resolved config.
+        data: the data sets behind the store.
+        store: recorded episodes.
+        starts: numbers int64 [N] of those in whose first frames all begin, by task.
+        candidates: everybody.
+        spread: float32 [A], see candidates.action_spread.
+    """
+
+    cfg: Cfg
+    data: Sequence[Path]
+    store: ClipStore
+    starts: Mapping[str, Tensor]
+    candidates: Sequence[Candidate]
+    spread: Tensor
+
+    @property
+    def count(self) -> int:
+        """Candidates over all tasks."""
+        return len(self.starts) * len(self.candidates)
+
+    def true(self, identity: Mapping[str, Any], kept: Kept) -> dict[tuple[str, str], Tensors]:
+        """Outcomes in physics by task and candidate, see Physics.outcome.
+
+        Args:
+            identity: what tells this physics from others.
+        """
+        physics = Physics(self.cfg, identity, kept, self.spread)
+        out: dict[tuple[str, str], Tensors] = {}
+        try:
+            with self._bar("true values") as bar:
+                for task, episodes in self.starts.items():
+                    seeds = [int(self.store.episodes[n]["seed"] or 0) for n in episodes.tolist()]
+                    for candidate in self.candidates:
+                        about = self._about(candidate)
+                        out[task, candidate.name] = physics.outcome(candidate, about, seeds)
+                        bar.update()
+        finally:
+            physics.close()
+        return out
+
+    def imagined(
+        self,
+        parts: tuple[Any, Any, Any],
+        identity: Mapping[str, Any],
+        kept: Kept,
+        true: Mapping[tuple[str, str], Tensors],
+    ) -> list[Cell]:
+        """What comes of every candidate in every task in imagination, beside its true outcomes.
+
+        Args:
+            parts: simulator, state expert on it, and judge.
+            identity: what tells this world from others.
+            true: see `true`; {} where there is no physics.
+        """
+        # repeats are to draw other noise, whatever the run's episodes share
+        drawn = {**self.cfg, "simulator": {**self.cfg["simulator"], "shared_noise": False}}
+        cells = []
+        with self._bar("imagined values") as bar:
+            for task, episodes in self.starts.items():
+                first = InitialStates.of(self.store, episodes)
+                env = build_world(drawn, *parts, first, min(_SIDE_BY_SIDE, len(episodes)))
+                where = {"data": [str(path) for path in self.data], "episodes": episodes.tolist()}
+                imagination = Imagination(self.cfg, env, {**identity, **where}, kept, self.spread)
+                for candidate in self.candidates:
+                    known = true.get((task, candidate.name))
+                    about = self._about(candidate)
+                    made = [
+                        imagination.outcome(candidate, about, repeat, known)
+                        for repeat in range(self.cfg["policy_value"]["repeats"])
+                    ]
+                    won, judged = (torch.stack([one[key] for one in made]) for key in ("success", "judged"))
+                    success = known["success"] if known else None
+                    cells.append(Cell(candidate.name, task, candidate.inside, won, judged, success))
+                    bar.update()
+        return cells
+
+    def _bar(self, title: str) -> tqdm:
+        return tqdm(total=self.count, desc=title, unit="cell", dynamic_ncols=True)
+
+    def _about(self, candidate: Candidate) -> dict[str, Any]:
+        """What tells a candidate's behaviour from others'; names are none of it."""
+        about = {key: value for key, value in asdict(candidate).items() if key not in ("name", "weights")}
+        weights = "" if candidate.weights is None else mark_of(candidate.weights)
+        unit = [round(value, 6) for value in self.spread.tolist()] if candidate.noise else []
+        stochastic = self.cfg["policy_value"]["stochastic"]
+        return {**about, "weights": weights, "stochastic": stochastic, "spread": unit}
+
+
+def starts_of(cfg: Cfg, store: ClipStore, held: Tensor) -> dict[str, Tensor]:
+    """Numbers int64 [N] of held-out episodes by task, policy_value.starts of each at most."""
+    tasks = tasks_of_episodes(cfg, store, held)
+    mine = {task: held[torch.tensor([one == task for one in tasks])] for task in sorted(set(tasks))}
+    return {task: episodes[: cfg["policy_value"]["starts"]] for task, episodes in mine.items()}
+
+
+def task_of(cfg: Cfg) -> dict[str, Any]:
+    """What tells a task from others."""
+    task = {key: cfg["task"].get(key) for key in ("suite", "name", "size", "chunk", "horizon", "mode")}
+    return {"task": task, "seed": cfg["seed"]}

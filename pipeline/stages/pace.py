@@ -1,0 +1,99 @@
+"""Training for equal time: how fast the parts of a world learn is measured once, and kept as an artefact, so
+that a stage that is resumed or run again takes the steps that it took.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from actors.factory import build_simulator, build_state_decoder
+from actors.process import prepare_process
+from envs.manifest import read_manifest
+from envs.targets import options
+from learners.stages.simulator import SimulatorFitConfig, train_simulator
+from learners.stages.state import train_state
+from learners.stages.tokenizer import train_tokenizer
+from learners.training.fit import FitConfig
+from learners.training.parallel import leads
+from pipeline.graph.stage import Inputs, Place, stage
+from pipeline.stages.given import SIMULATOR, Cfg, fit_options, learning_episodes, learns, open_store
+
+_WARM_UP = 2  # steps that fill caches and are not counted
+Train = Callable[[FitConfig, Path], Mapping[str, Any]]
+_FITS = ("tokenizer_fit", "simulator_fit.first", "state_fit.first")
+
+
+def seconds_of(cfg: Cfg, part: str, phase: str) -> dict[str, float]:
+    """The setting `seconds` of a node that trains the part tokenizer, simulator or state; {} where steps
+    count.
+    """
+    section = cfg["equal_time"]
+    if not section["seconds"]:
+        return {}
+    whole = section["seconds"] * (section["refresh"] if phase == "refresh" else 1.0)
+    shares = {"tokenizer": section["tokenizer"], "state": section["state"]}
+    if "codec" not in cfg["simulator"] or phase == "refresh":  # a tokenizer stays as it was first trained
+        del shares["tokenizer"]
+    share = shares.get(part, 1.0 - sum(shares.values()))
+    return {"seconds": whole * share}
+
+
+def in_time(inputs: Inputs, part: str, fit: FitConfig) -> FitConfig:
+    """`fit` with as many steps as take the setting `seconds` at the speed that the role `pace` has measured;
+    as it is where steps count.
+    """
+    if "pace" not in inputs.found:
+        return fit
+    manifest = read_manifest(inputs.folder("pace"))
+    assert manifest is not None, "a role is played by finished stages"
+    speed = manifest["result"].get(f"{part}_speed")
+    if speed is None:  # of what learns nothing
+        return fit
+    return replace(fit, steps=max(1, round(inputs.settings["seconds"] * speed / fit.batch)))
+
+
+@stage(reads=(*SIMULATOR, *_FITS, "equal_time.measured"), place=Place.LEARNERS)
+def pace(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
+    """Samples per second in which a world's tokenizer, simulator and state expert learn, each for a few steps
+    on parts that are thrown away; of those that learn.
+    """
+    store, trial = open_store(cfg, inputs), folder / "trial"
+    episodes = learning_episodes(store)
+    prepare_process(cfg["seed"], cfg["threads"])
+    model = build_simulator(cfg)
+    decoder = build_state_decoder(cfg, model)
+    first = dict(cfg["simulator_fit"]["first"])
+    fits = {
+        "tokenizer": cfg["tokenizer_fit"],
+        "simulator": first.pop("fit"),
+        "state": cfg["state_fit"]["first"]["fit"],
+    }
+    how = options(SimulatorFitConfig, first, "simulator_fit.first")
+    common = (store, episodes)
+    trained: dict[str, Train] = {
+        "tokenizer": lambda fit, where: train_tokenizer(model, *common, fit, where),
+        "simulator": lambda fit, where: train_simulator(model, *common, how, fit, where),
+        "state": lambda fit, where: train_state(decoder, model, *common, fit, where),
+    }
+    present = {
+        "tokenizer": "codec" in cfg["simulator"],
+        "simulator": learns(model),
+        "state": learns(decoder),
+    }
+    out = {}
+    for part, train in trained.items():
+        if not present[part]:
+            continue
+        fit = fit_options(cfg, fits[part], part)
+        train(replace(fit, steps=_WARM_UP), trial / f"{part}-warm-up")
+        fit = replace(fit, steps=cfg["equal_time"]["measured"])
+        spent = train(fit, trial / part)
+        seconds = sum(spent.get(f"{kind}_seconds", 0.0) for kind in ("data", "compute", "features"))
+        out[f"{part}_speed"] = fit.steps * fit.batch / seconds
+    if leads():
+        shutil.rmtree(trial)
+    return out
