@@ -71,8 +71,9 @@ def test_worlds_stand_side_by_side_after_equal_time(root: Path) -> None:
 
 
 ROBOSCAPE = (
-    *("study=roboscape", "task=tabletop", "task.horizon=32", "task.suite.cameras=[head]", "judge=golden_goal"),
-    *("simulator=tokens_small", "study.places=[two_tasks]", "judge.fallback=last_frame", "rounds.clone=0"),
+    *("study=roboscape", "task=tabletop", "task.horizon=32", "task.suite.cameras=[head]"),
+    *("judge=golden_goal", "simulator=tokens_small", "study.places=[two_tasks]"),
+    *("judge.fallback=last_frame", "rounds.clone=0"),
     *("evaluate.episodes=4", "evaluate.envs=4", "extra_starts.variants=[out_of_domain]"),
     *("extra_starts.episodes=2", "rl.envs=4"),
 )
