@@ -30,13 +30,14 @@ _WORDS = 64  # numbers of the instruction that say what key-points shall look fo
 _BLOCKS = 2  # residual blocks of an encoder whose features hang on what it is told
 
 
-def body_keys(robot: Embodiment) -> tuple[NestedKey, ...]:
-    """What a policy reads of the robot itself: its state, and the command in force where it says a place.
+def body_keys(robot: Embodiment, command: bool) -> tuple[NestedKey, ...]:
+    """What a policy reads of the robot itself: its state and, if asked to, the command in force.
 
     Chunks may be meant relative to that, and it is exact where states are measured or imagined. Of commands
-    that are changes, the one in force says only what was done last, which imitation would copy.
+    that are changes, the one in force says only what was done last, which imitation would copy: it is not
+    read.
     """
-    return (STATE,) if robot.delta else (STATE, COMMAND)
+    return (STATE, COMMAND) if command and not robot.delta else (STATE,)
 
 
 class Body(nn.Module):
@@ -44,6 +45,7 @@ class Body(nn.Module):
 
     Args:
         robot: whose.
+        command: see body_keys.
 
     Forward takes the values of `body_keys`, float [..., S] and [..., A], and returns float32 [..., size]
     within -5..5.
@@ -52,9 +54,10 @@ class Body(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, robot: Embodiment):
+    def __init__(self, robot: Embodiment, command: bool):
         super().__init__()
-        self.size = len(robot.state_names) + (0 if robot.delta else robot.action_dim)
+        self.keys = body_keys(robot, command)
+        self.size = len(robot.state_names) + (robot.action_dim if COMMAND in self.keys else 0)
         self.register_buffer("mean", torch.zeros(self.size))
         self.register_buffer("std", torch.ones(self.size))
 
@@ -77,9 +80,18 @@ class Perception(nn.Module):
     Args:
         spec: what the world shows.
         points, width, cameras, asked: of MultiViewEncoder.
+        command: see body_keys; nothing of the body is read without `asked` key-points.
     """
 
-    def __init__(self, spec: WorldSpec, points: int, width: int, cameras: str | Sequence[str], asked: int):
+    def __init__(
+        self,
+        spec: WorldSpec,
+        points: int,
+        width: int,
+        cameras: str | Sequence[str],
+        asked: int,
+        command: bool,
+    ):
         super().__init__()
         told, blocks = (_WORDS + _BODY_FEATURES, _BLOCKS) if asked else (0, 1)
         self.views = MultiViewEncoder(
@@ -87,10 +99,10 @@ class Perception(nn.Module):
         )
         self.text = TextEncoder(_TEXT_FEATURES)
         self.words = TextEncoder(_WORDS) if asked else None
-        self.body = Body(spec.embodiment) if asked else None
+        self.body = Body(spec.embodiment, command) if asked else None
         self.posture = _of_body(self.body.size) if self.body is not None else None
         self.out_features = self.views.out_features + _TEXT_FEATURES
-        self.in_keys = [IMAGE, INSTRUCTION_UTF8, *(body_keys(spec.embodiment) if asked else ())]
+        self.in_keys = [IMAGE, INSTRUCTION_UTF8, *(self.body.keys if self.body is not None else ())]
 
     def forward(self, image: Tensor, text: Tensor, *body: Tensor) -> Tensor:
         """Pictures uint8, or float in -1..1, [..., V, 3, H, W], bytes uint8 [..., TEXT_BYTES] and the further
@@ -114,12 +126,13 @@ class Fusion(nn.Module):
     Args:
         visual: number of visual features.
         robot: whose.
+        command: see body_keys.
         width: size of the output.
     """
 
-    def __init__(self, visual: int, robot: Embodiment, width: int):
+    def __init__(self, visual: int, robot: Embodiment, command: bool, width: int):
         super().__init__()
-        self.body = Body(robot)
+        self.body = Body(robot, command)
         self.norm = nn.LayerNorm(visual)
         self.state = _of_body(self.body.size)
         self.mix = nn.Sequential(
@@ -147,9 +160,10 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         points, channels: key-points per view and width of the encoder.
         cameras: which it looks through: "all", "main", or names.
         asked: key-points per view that look for what the instruction says, with an encoder that is told it.
+        command: whether the command in force is read, of robots whose commands say places.
 
-    Reads image, the instruction's bytes, state and, of robots whose commands say places, the command in
-    force; writes ("vla_action", "chunk") and its log-probability.
+    Reads image, the instruction's bytes, state and, if asked to, the command in force; writes
+    ("vla_action", "chunk") and its log-probability.
 
     Raises:
         ConfigError: if the head cannot be built.
@@ -165,12 +179,13 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         channels: Count,
         cameras: str | Sequence[str],
         asked: Natural,
+        command: bool,
     ):
-        eyes = Perception(spec, points, channels, cameras, asked)
+        eyes = Perception(spec, points, channels, cameras, asked, command)
         perception = TensorDictModule(eyes, in_keys=eyes.in_keys, out_keys=[VISUAL_FEATURES])
         fusion = TensorDictModule(
-            Fusion(eyes.out_features, spec.embodiment, width),
-            in_keys=[VISUAL_FEATURES, *body_keys(spec.embodiment)],
+            Fusion(eyes.out_features, spec.embodiment, command, width),
+            in_keys=[VISUAL_FEATURES, *body_keys(spec.embodiment, command)],
             out_keys=[POLICY_FEATURES],
         )
         action_head: Head = build(head, "policy.head", width=width, chunk=spec.chunk, actions=spec.action_dim)
@@ -227,7 +242,7 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         seen = observed.get(VISUAL_FEATURES, None)
         if seen is None:
             seen = self.perception(*(observed[key] for key in self.perception.in_keys))
-        return self.fusion(seen, *(observed[key] for key in body_keys(self.spec.embodiment)))
+        return self.fusion(seen, *(observed[key] for key in self.fusion.body.keys))
 
     @property
     def asked(self) -> int:
@@ -245,7 +260,7 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         """
         eyes = self.perception
         seen, found = eyes.gaze(*(observed[key] for key in eyes.in_keys))
-        return self.fusion(seen, *(observed[key] for key in body_keys(self.spec.embodiment))), found
+        return self.fusion(seen, *(observed[key] for key in self.fusion.body.keys)), found
 
     @property
     def trained(self) -> ProbabilisticTensorDictSequential:
@@ -268,11 +283,10 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         Args:
             chunks: [N, K, A] as the policy will emit them; states: [N, S]; commands: [N, A] in force.
         """
-        robot = self.spec.embodiment
-        self.head.normalise(chunks, varying(chunks, robot))
+        self.head.normalise(chunks, varying(chunks, self.spec.embodiment))
         for body in (self.fusion.body, self.perception.body):
             if body is not None:
-                body.normalise(*((states,) if robot.delta else (states, commands)))
+                body.normalise(*(states, commands)[: len(body.keys)])
 
     def disagreement(self, one: TensorDictBase, other: TensorDictBase) -> Tensor:
         """By how much the head says something else of observations [B] than of others."""
