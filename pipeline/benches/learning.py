@@ -45,7 +45,9 @@ def build(seed: int, envs: int) -> tuple[ChunkPolicy, LocalFleet]:
     seed_process(seed)
     env = ToyTrackingEnv(envs, seed=seed)
     head = {"_target_": "actors.policies.chunk_tokens.ChunkTokenHead", "bins": 64}
-    policy = ChunkPolicy(env.spec, head, width=128, points=8, channels=16, cameras="all", asked=0)
+    policy = ChunkPolicy(
+        env.spec, head, width=128, points=8, channels=16, cameras="all", asked=0, command=False
+    )
     return policy, LocalFleet(Host(env, policy, bootstrap=False))
 
 
