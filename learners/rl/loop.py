@@ -75,7 +75,7 @@ def train_rl(
         _check(fleet, algorithm, config)
     folder.mkdir(parents=True, exist_ok=True)
     checkpoints, log, learned = Checkpoints(folder), folder / "metrics.jsonl", folder / "learned.jsonl"
-    trainee = Trainee(algorithm.modules())
+    trainee = Trainee(algorithm.modules(), apart=False)  # all that hosts must know is read between updates
     optimiser = torch.optim.Adam(algorithm.groups(config.lr), lr=config.lr, eps=1e-5)
     rates = [group["lr"] for group in optimiser.param_groups]
     alarms, ledger, first, episodes, wave, over = Alarms(), EpisodeLedger(), 0, 0, 0, False

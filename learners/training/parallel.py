@@ -132,10 +132,12 @@ class Trainee:
 
     Args:
         module: all of whose parameters belong to the training, frozen ones included.
+        apart: whether large blocks are gathered one by one, each as it runs. Functions that read weights of
+            blocks which they do not run want all of them whole.
     """
 
-    def __init__(self, module: nn.Module):
-        self.module = module
+    def __init__(self, module: nn.Module, apart: bool = True):
+        self.module, self.apart = module, apart
         self._homes: dict[str, list[tuple[nn.Module, str]]] = {}
         names: dict[int, str] = {}
         for prefix, owner in module.named_modules():
@@ -149,7 +151,7 @@ class Trainee:
 
     def _shard(self) -> None:
         mesh = init_device_mesh(_device(), (workers(),))
-        for blocks in [m for m in self.module.modules() if isinstance(m, nn.ModuleList)]:
+        for blocks in [m for m in self.module.modules() if self.apart and isinstance(m, nn.ModuleList)]:
             for number, block in enumerate(blocks):
                 if sum(p.numel() for p in block.parameters()) >= BLOCK:
                     self._wrapped.append((blocks, number, block))

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from markupsafe import Markup
 
+from envs.ranges import NonNegative
 from envs.targets import ConfigError
 from pipeline.evaluation.charts import Curve, line_chart
 from pipeline.evaluation.result import result_of
@@ -33,7 +34,7 @@ class SuccessOverTime(Column):
 
     headline = "last"
 
-    def __init__(self, title: str, level: float):
+    def __init__(self, title: str, level: NonNegative):
         super().__init__(title)
         self.level = level
 

@@ -253,13 +253,13 @@ def test_servers_that_answer_nonsense(path: str, status: int, body: bytes, messa
 
 def test_servers_that_never_answer_and_that_are_not_there(near: DiTSimulator) -> None:
     # type: ignore[func-returns-value]
-    url, httpd = strange_server(lambda *_: (time.sleep(3), (200, b"{}"))[1])
+    url, httpd = strange_server(lambda *_: (time.sleep(12), (200, b"{}"))[1])
     first, seed = begin(near.spec, 1), torch.zeros(1, dtype=torch.int64)
     try:
         began = time.monotonic()
         with pytest.raises(RemoteError, match=r"deadline_s=0\.3 after 2 tries"):
             remote(url, of=near, deadline_s=0.3).reset(first, seed)
-        assert time.monotonic() - began < 2.5
+        assert time.monotonic() - began < 11
     finally:
         httpd.shutdown()
     with socket.socket() as s:

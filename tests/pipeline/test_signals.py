@@ -73,6 +73,7 @@ LASTS = {
         r"imagined \w|true \w",
     ),
     "fidelity": (["fidelity", *SOAK, "name=known", "fidelity.long.frames=90000"], r"\d+%"),
+    "ewmbench": (["ewmbench", *SOAK, "name=known", "ewmbench.detector.fit.steps=90000"], r"detector: +\d+%"),
     "sweep": (["sweep", *SOAK, "name=known"], r"\w"),
     "rewards": (
         [

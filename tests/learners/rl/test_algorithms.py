@@ -251,7 +251,7 @@ def test_next_features_are_those_of_the_next_observation(monkeypatch: pytest.Mon
     def spying(self: ToyTrackingEnv, td: TensorDict) -> TensorDict:
         out = step(self, td)
         with torch.no_grad():
-            seen.append(policy.perception(out[IMAGE], out[INSTRUCTION_UTF8]))
+            seen.append(policy.perception(*(out[key] for key in policy.perception.in_keys)))
         return out
 
     monkeypatch.setattr(ToyTrackingEnv, "_step", spying)
