@@ -12,20 +12,27 @@ _FOLDER = Path(__file__).parent / "prompts"
 _FIELDS = ("instruction", "count", "cameras")
 
 
+def text_file(folder: Path, name: str, key: str) -> Path:
+    """The text file that a config key names: `name`.txt of a folder of ours, or a path.
+
+    Raises:
+        ConfigError: if there is none.
+    """
+    own = folder / f"{name}.txt"
+    path = own if own.is_file() else Path(name)
+    if not path.is_file():
+        known = [file.stem for file in folder.glob("*.txt")]
+        raise ConfigError(f"{key}={name} is no text file, and no prompt of that name{nearest(name, known)}")
+    return path
+
+
 def prompt_file(name: str) -> Path:
     """The file that judge.prompt names: one of the folder prompts/ beside this file, or a path.
 
     Raises:
         ConfigError: if there is none.
     """
-    own = _FOLDER / f"{name}.txt"
-    path = own if own.is_file() else Path(name)
-    if not path.is_file():
-        known = [file.stem for file in _FOLDER.glob("*.txt")]
-        raise ConfigError(
-            f"judge.prompt={name} is no text file, and no prompt of that name{nearest(name, known)}"
-        )
-    return path
+    return text_file(_FOLDER, name, "judge.prompt")
 
 
 class Prompt:

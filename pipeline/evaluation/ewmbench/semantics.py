@@ -26,7 +26,8 @@ from envs.judges.vlm.asking import Asker, background_loop
 from envs.judges.vlm.chat import Question
 from envs.judges.vlm.judge import VLMJudge
 from envs.judges.vlm.pictures import Pictures
-from envs.targets import ConfigError, nearest
+from envs.judges.vlm.prompt import text_file
+from envs.targets import ConfigError
 from pipeline.evaluation.ewmbench.features import TextExtractor, words_of
 
 _FOLDER = Path(__file__).parent / "prompts"
@@ -177,7 +178,7 @@ def read_errors(name: str) -> tuple[LogicalError, ...]:
     Raises:
         ConfigError: naming the line that is wrong.
     """
-    path, out = _file(name, "errors"), []
+    path, out = text_file(_FOLDER, name, "ewmbench.prompts.errors"), []
     for number, line in enumerate(path.read_text().splitlines(), 1):
         if not line.strip() or line.startswith("#"):
             continue
@@ -248,7 +249,7 @@ def logic(found: Sequence[str], known: Sequence[LogicalError]) -> float:
 
 
 def _template(name: str, key: str) -> Template:
-    path = _file(name, key)
+    path = text_file(_FOLDER, name, f"ewmbench.prompts.{key}")
     template = Template(path.read_text())
     marks = [mark for mark in Template.pattern.finditer(template.template) if mark["escaped"] is None]
     found = {mark["named"] or mark["braced"] or "" for mark in marks}
@@ -258,14 +259,3 @@ def _template(name: str, key: str) -> Template:
             f" {sorted(f'${field}' for field in found)} (a plain $ is written $$)"
         )
     return template
-
-
-def _file(name: str, key: str) -> Path:
-    own = _FOLDER / f"{name}.txt"
-    path = own if own.is_file() else Path(name)
-    if not path.is_file():
-        known = [file.stem for file in _FOLDER.glob("*.txt")]
-        raise ConfigError(
-            f"ewmbench.prompts.{key}={name} is no text file, and no prompt of that name{nearest(name, known)}"
-        )
-    return path
