@@ -183,6 +183,22 @@ def centres(share: Tensor) -> Tensor:
     return torch.stack(((share.sum(-2) * u).sum(-1), (share.sum(-1) * v).sum(-1)), -1)
 
 
+def bells(size: tuple[int, int], at: Tensor, spread: float) -> Tensor:
+    """Gaussians around places, as maps [..., H, W] of sum 1.
+
+    Args:
+        at: (u, v) [..., 2], shares of width and height.
+        spread: in cells.
+    """
+    height, width = size
+
+    def along(cells: int, place: Tensor) -> Tensor:
+        middle = torch.arange(cells, device=at.device) + 0.5
+        return (-(((middle - place[..., None] * cells) / spread) ** 2) / 2).softmax(-1)
+
+    return along(height, at[..., 1])[..., :, None] * along(width, at[..., 0])[..., None, :]
+
+
 def to_signed(frames: Tensor) -> Tensor:
     """uint8 pictures as float32 in -1..1; floats are taken to be so already."""
     return frames if frames.is_floating_point() else frames.float().mul_(1 / 127.5).sub_(1.0)

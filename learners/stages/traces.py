@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from envs.conditioning import end_effector_poses
+from envs.encoders import bells
 from envs.episodes.clips import ClipStore
 from envs.geometry.cameras import project
 from envs.geometry.kinematics import Kinematics
@@ -74,17 +75,8 @@ def trace_loss(found: Tensor, hands: Tensor) -> Tensor:
     """
     points = min(found.shape[2], hands.shape[2])
     found, hands = found[:, :, :points], hands[:, :, :points]
-    height, width = found.shape[-2:]
     inside = ((hands >= 0) & (hands < 1)).all(-1)  # NaN is outside
     hands = torch.where(inside[..., None], hands, 0.0)
-    across = _bump(width, hands[..., 0])
-    along = _bump(height, hands[..., 1])
-    wanted = (along[..., :, None] * across[..., None, :]).flatten(-2)
+    wanted = bells((found.shape[-2], found.shape[-1]), hands, _SPREAD).flatten(-2)
     nats = -(wanted * found.flatten(-2).log_softmax(-1)).sum(-1)
     return (nats * inside).sum() / inside.sum().clamp(min=1)
-
-
-def _bump(cells: int, at: Tensor) -> Tensor:
-    """A bell [..., cells] of sum 1 around shares `at` [...] of a row of cells."""
-    centres = torch.arange(cells, device=at.device) + 0.5
-    return (-(((centres - at[..., None] * cells) / _SPREAD) ** 2) / 2).softmax(-1)

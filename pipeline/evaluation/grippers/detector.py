@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from envs.encoders import ResidualBlock, pixel_centres, to_signed
+from envs.encoders import ResidualBlock, bells, pixel_centres, to_signed
 
 _NEAR = 2  # cells around the largest within which the centre of mass is taken
 _AT_ONCE = 64  # pictures
@@ -65,15 +65,11 @@ class GripperDetector(nn.Module):
         Args:
             pixels: float32 [B, arms, 2] (u, v) in the pictures given, NaN where there is nothing to be found.
         """
-        logits, (height, width) = self(pictures, views)
+        logits, cells = self(pictures, views)
         there = torch.isfinite(pixels).all(-1)  # [B, arms]
-        # cells cover the picture evenly; the first goes from 0 to 1
-        scale = torch.tensor([width / pictures.shape[-1], height / pictures.shape[-2]], device=pixels.device)
-        at = torch.nan_to_num(pixels) * scale
-        across = torch.arange(width, device=at.device) + 0.5 - at[..., :1]
-        along = torch.arange(height, device=at.device) + 0.5 - at[..., 1:]
-        near = -0.5 * (along.square()[..., :, None] + across.square()[..., None, :]).flatten(-2)
-        wanted = torch.cat((near.softmax(-1) * there[..., None], (~there)[..., None].float()), -1)
+        shown = pixels.new_tensor((pictures.shape[-1], pictures.shape[-2]))
+        near = bells(cells, torch.nan_to_num(pixels) / shown, 1.0).flatten(-2)
+        wanted = torch.cat((near * there[..., None], (~there)[..., None].float()), -1)
         return -(wanted * logits.log_softmax(-1)).sum(-1).mean()
 
     @torch.no_grad()
