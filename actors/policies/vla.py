@@ -11,76 +11,56 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
 
 from actors.policies.contract import POLICY_FEATURES, VISUAL_FEATURES
-from actors.policies.heads import RESOLUTION, Head, varying
+from actors.policies.heads import Head, varying
+from actors.policies.proprioception import FEATURES, Proprioception, encoded, proprioception_keys
 from envs.embodiment import Embodiment
 from envs.encoders import MultiViewEncoder
 from envs.language import TextEncoder
 from envs.ranges import Count, Natural
-from envs.specs import CHUNK, COMMAND, IMAGE, INSTRUCTION_UTF8, LOG_PROB, STATE, WorldSpec
+from envs.specs import CHUNK, IMAGE, INSTRUCTION_UTF8, LOG_PROB, WorldSpec
 from envs.targets import build
 
 _TEXT_FEATURES = 32
-_BODY_FEATURES = 64
 _WORDS = 64  # numbers of the instruction that say what key-points shall look for
 _BLOCKS = 2  # residual blocks of an encoder whose features hang on what it is told
 
 
-def body_keys(robot: Embodiment, command: bool) -> tuple[NestedKey, ...]:
-    """What a policy reads of the robot itself: its state and, if asked to, the command in force.
-
-    Chunks may be meant relative to that, and it is exact where states are measured or imagined. Of commands
-    that are changes, the one in force says only what was done last, which imitation would copy: it is not
-    read.
-    """
-    return (STATE, COMMAND) if command and not robot.delta else (STATE,)
-
-
-class Body(nn.Module):
-    """What the robot knows of itself, in units of its own spread.
+class Query(nn.Module):
+    """What key-points are asked to look for: the instruction and proprioception, as numbers.
 
     Args:
         robot: whose.
-        command: see body_keys.
+        command: see proprioception_keys.
 
-    Forward takes the values of `body_keys`, float [..., S] and [..., A], and returns float32 [..., size]
-    within -5..5.
+    Forward takes bytes uint8 [B, TEXT_BYTES] and the values of `proprioception_keys`, and returns float32 [B,
+    size].
     """
 
-    mean: Tensor
-    std: Tensor
+    size = _WORDS + FEATURES
 
     def __init__(self, robot: Embodiment, command: bool):
         super().__init__()
-        self.keys = body_keys(robot, command)
-        self.size = len(robot.state_names) + (robot.action_dim if COMMAND in self.keys else 0)
-        self.register_buffer("mean", torch.zeros(self.size))
-        self.register_buffer("std", torch.ones(self.size))
+        self.words = TextEncoder(_WORDS)
+        self.proprioception = Proprioception(robot, command)
+        self.posture = encoded(self.proprioception.size)
 
-    @torch.no_grad()
-    def normalise(self, *values: Tensor) -> None:
-        """Take units from values [N, S] and [N, A]; what hardly varies keeps its own."""
-        joined = torch.cat(values, -1)
-        spread = joined.std(0, unbiased=False)
-        self.mean.copy_(joined.mean(0))
-        self.std.copy_(torch.where(spread > RESOLUTION, spread, 1.0))
-
-    def forward(self, *values: Tensor) -> Tensor:
-        return ((torch.cat(values, -1) - self.mean) / self.std).clamp(-5, 5)
+    def forward(self, text: Tensor, *values: Tensor) -> Tensor:
+        return torch.cat((self.words(text), self.posture(self.proprioception(*values))), -1)
 
 
 class Perception(nn.Module):
-    """Encodes pictures and the instruction; key-points that are asked for look where the instruction and the
-    robot's own body say.
+    """Encodes pictures and the instruction; key-points that are asked look where instruction and
+    proprioception say.
 
     Args:
         spec: what the world shows.
         points, width, cameras, asked: of MultiViewEncoder.
-        command: see body_keys; nothing of the body is read without `asked` key-points.
+        command: see proprioception_keys; no proprioception is read without `asked` key-points.
     """
 
     def __init__(
@@ -93,29 +73,26 @@ class Perception(nn.Module):
         command: bool,
     ):
         super().__init__()
-        told, blocks = (_WORDS + _BODY_FEATURES, _BLOCKS) if asked else (0, 1)
+        told, blocks = (Query.size, _BLOCKS) if asked else (0, 1)
         self.views = MultiViewEncoder(
             spec, points, width, blocks=blocks, cameras=cameras, asked=asked, told=told
         )
         self.text = TextEncoder(_TEXT_FEATURES)
-        self.words = TextEncoder(_WORDS) if asked else None
-        self.body = Body(spec.embodiment, command) if asked else None
-        self.posture = _of_body(self.body.size) if self.body is not None else None
+        self.query = Query(spec.embodiment, command) if asked else None
         self.out_features = self.views.out_features + _TEXT_FEATURES
-        self.in_keys = [IMAGE, INSTRUCTION_UTF8, *(self.body.keys if self.body is not None else ())]
+        further = self.query.proprioception.keys if self.query is not None else ()
+        self.in_keys = [IMAGE, INSTRUCTION_UTF8, *further]
 
-    def forward(self, image: Tensor, text: Tensor, *body: Tensor) -> Tensor:
+    def forward(self, image: Tensor, text: Tensor, *values: Tensor) -> Tensor:
         """Pictures uint8, or float in -1..1, [..., V, 3, H, W], bytes uint8 [..., TEXT_BYTES] and the further
         `in_keys` -> float32 [..., out_features].
         """
-        lead, flat = image.shape[:-4], (value.flatten(0, -2) for value in (text, *body))
+        lead, flat = image.shape[:-4], (value.flatten(0, -2) for value in (text, *values))
         return self.gaze(image.reshape(-1, *image.shape[-4:]), *flat)[0].reshape(*lead, -1)
 
-    def gaze(self, image: Tensor, text: Tensor, *body: Tensor) -> tuple[Tensor, Tensor]:
+    def gaze(self, image: Tensor, text: Tensor, *values: Tensor) -> tuple[Tensor, Tensor]:
         """Features of observations [B], and what each key-point looks for, as MultiViewEncoder.gaze."""
-        told = None
-        if self.words is not None and self.body is not None and self.posture is not None:
-            told = torch.cat((self.words(text), self.posture(self.body(*body))), -1)
+        told = None if self.query is None else self.query(text, *values)
         seen, found = self.views.gaze(image, told)
         return torch.cat((seen, self.text(text)), -1), found
 
@@ -126,28 +103,22 @@ class Fusion(nn.Module):
     Args:
         visual: number of visual features.
         robot: whose.
-        command: see body_keys.
+        command: see proprioception_keys.
         width: size of the output.
     """
 
     def __init__(self, visual: int, robot: Embodiment, command: bool, width: int):
         super().__init__()
-        self.body = Body(robot, command)
+        self.proprioception = Proprioception(robot, command)
         self.norm = nn.LayerNorm(visual)
-        self.state = _of_body(self.body.size)
+        self.state = encoded(self.proprioception.size)
         self.mix = nn.Sequential(
-            nn.Linear(visual + _BODY_FEATURES, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU()
+            nn.Linear(visual + FEATURES, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU()
         )
 
-    def forward(self, visual: Tensor, *body: Tensor) -> Tensor:
-        """float [..., visual] and the values of `body_keys` -> float32 [..., width]."""
-        return self.mix(torch.cat((self.norm(visual), self.state(self.body(*body))), -1))
-
-
-def _of_body(size: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Linear(size, _BODY_FEATURES), nn.SiLU(), nn.Linear(_BODY_FEATURES, _BODY_FEATURES)
-    )
+    def forward(self, visual: Tensor, *values: Tensor) -> Tensor:
+        """float [..., visual] and the values of `proprioception_keys` -> float32 [..., width]."""
+        return self.mix(torch.cat((self.norm(visual), self.state(self.proprioception(*values))), -1))
 
 
 class ChunkPolicy(ProbabilisticTensorDictSequential):
@@ -185,7 +156,7 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         perception = TensorDictModule(eyes, in_keys=eyes.in_keys, out_keys=[VISUAL_FEATURES])
         fusion = TensorDictModule(
             Fusion(eyes.out_features, spec.embodiment, command, width),
-            in_keys=[VISUAL_FEATURES, *body_keys(spec.embodiment, command)],
+            in_keys=[VISUAL_FEATURES, *proprioception_keys(spec.embodiment, command)],
             out_keys=[POLICY_FEATURES],
         )
         action_head: Head = build(head, "policy.head", width=width, chunk=spec.chunk, actions=spec.action_dim)
@@ -242,7 +213,7 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         seen = observed.get(VISUAL_FEATURES, None)
         if seen is None:
             seen = self.perception(*(observed[key] for key in self.perception.in_keys))
-        return self.fusion(seen, *(observed[key] for key in self.fusion.body.keys))
+        return self.fusion(seen, *(observed[key] for key in self.fusion.proprioception.keys))
 
     @property
     def asked(self) -> int:
@@ -260,7 +231,7 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         """
         eyes = self.perception
         seen, found = eyes.gaze(*(observed[key] for key in eyes.in_keys))
-        return self.fusion(seen, *(observed[key] for key in self.fusion.body.keys)), found
+        return self.fusion(seen, *(observed[key] for key in self.fusion.proprioception.keys)), found
 
     @property
     def trained(self) -> ProbabilisticTensorDictSequential:
@@ -284,9 +255,9 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
             chunks: [N, K, A] as the policy will emit them; states: [N, S]; commands: [N, A] in force.
         """
         self.head.normalise(chunks, varying(chunks, self.spec.embodiment))
-        for body in (self.fusion.body, self.perception.body):
-            if body is not None:
-                body.normalise(*(states, commands)[: len(body.keys)])
+        parts, query = [self.fusion.proprioception], self.perception.query
+        for part in parts if query is None else [*parts, query.proprioception]:
+            part.normalise(*(states, commands)[: len(part.keys)])
 
     def disagreement(self, one: TensorDictBase, other: TensorDictBase) -> Tensor:
         """By how much the head says something else of observations [B] than of others."""
