@@ -21,6 +21,7 @@ from tests.moving_square import SIZE, episodes_of
 WITH_RAY = ("test_ray_fleet", "test_cluster", "test_judge_service", "test_chaos", "test_stage_workers")
 
 
+@pytest.hookimpl(tryfirst=True)  # pytest-xdist reads the groups in a hook of its own
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files stay together in one of the processes of `pytest -n`, and those that start Rays in the same."""
     for item in items:

@@ -45,7 +45,8 @@ class ServiceConfig:
         batch: clips judged at once at most.
         wait_ms: how long the first clip of a batch waits for others.
         cache: judgements remembered.
-        budget: clips that may be judged, remembered ones not counted; 0 for any number.
+        budget: clips that may be judged since the service started, remembered ones not counted; 0 for any
+            number.
         deadline: seconds a caller waits for an answer.
         retries: times it asks again.
         pause: seconds before the first of these; doubles each time.
@@ -72,6 +73,7 @@ class JudgeServer:
         self.cache: OrderedDict[bytes, tuple[np.ndarray, np.ndarray, int]] = OrderedDict()
         self.waiting: list[tuple[Clip, asyncio.Future[Any]]] = []
         self.counts = {"clips": 0, "judged": 0, "remembered": 0, "batches": 0, "refused": 0}
+        self.taken = 0  # of the budget, by clips that are judged, being judged, or wait
         self.worker: asyncio.Task[None] | None = None
 
     async def describe(self) -> dict[str, Any]:
@@ -111,9 +113,10 @@ class JudgeServer:
             self.counts["remembered"] += 1
             self.cache.move_to_end(key)
             return self.cache[key]
-        if self.options.budget and self.counts["judged"] + len(self.waiting) >= self.options.budget:
+        if self.options.budget and self.taken >= self.options.budget:
             self.counts["refused"] += 1
             return np.zeros(len(frames), np.float32), np.zeros(len(frames), np.float32), Status.ABSTAIN.value
+        self.taken += 1
         future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         self.waiting.append((clip, future))
         if self.worker is None or self.worker.done():
@@ -138,6 +141,7 @@ class JudgeServer:
             try:
                 judgement = await asyncio.get_running_loop().run_in_executor(None, self._judge, clips)
             except Exception as error:
+                self.taken -= len(chosen)
                 for _, future in chosen:
                     future.set_exception(error)
                 continue

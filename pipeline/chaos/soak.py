@@ -128,8 +128,9 @@ class Soak:
 
     def _failure(self, what: str) -> ChaosFailure:
         return ChaosFailure(
-            f"event {self.books.count}, life {self.books.lives}: {what}. It said: ...{self._said()[-1500:]}\n"
-            f"See {self.log}; the same command goes on from there"
+            f"life {self.books.lives} said: ...{self._said()[-1500:]}\n"
+            f"event {self.books.count}, life {self.books.lives}: {what}. See {self.log}; the same command goes"
+            " on from there"
         )
 
     # -- the runs
@@ -231,7 +232,8 @@ class Soak:
         if status == 0:  # it was ending already
             self._ended_well(status)
             return
-        if status != (-number if kind == "SIGKILL" else 128 + number):
+        asked = {-number}  # its very end has nothing left to clean up; shells call both 128 + number
+        if status not in (asked if kind == "SIGKILL" else asked | {128 + number}):
             raise self._failure(f"it ended with {status} after {kind}")
         if kind != "SIGKILL" and "Traceback" in self._said():
             raise self._failure(f"{kind} was answered by a traceback")

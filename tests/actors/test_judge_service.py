@@ -50,6 +50,12 @@ def clips(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor, list[str]]
     return frames, frames[:, 0], [f"push block {k % 2}" for k in range(count)]
 
 
+def arrays(count: int, seed: int) -> tuple[Any, Any, list[str]]:
+    """The same, as they come to the server."""
+    frames, first, texts = clips(count, seed)
+    return frames.numpy(), first.numpy(), texts
+
+
 def test_service_agrees_remembers_and_gathers(cfg: dict[str, Any], weights: str, service: Any) -> None:
     inline, client = build_judge(cfg, Path(weights)).eval(), JudgeClient("judge-test", OPTIONS)
     assert client.hold == inline.hold and torch.equal(client.threshold, inline.threshold)
@@ -85,9 +91,19 @@ def test_a_judge_that_reads_features_is_served_them(tmp_path: Path) -> None:
     assert server.counts["judged"] == 6 and not server.counts["remembered"]
 
 
-def test_spent_budget_abstains(service: Any) -> None:
-    said = JudgeClient("judge-test", OPTIONS).score(*clips(40, 7))
-    assert set(said.status.tolist()) == {Status.OK.value, Status.ABSTAIN.value}
+def test_spent_budget_abstains(cfg: dict[str, Any], weights: str) -> None:
+    server = JudgeServer(cfg, weights, replace(OPTIONS, budget=20), 1)
+
+    async def ask() -> list[Any]:
+        first = asyncio.create_task(server.score(*arrays(12, 7)))
+        while not server.counts["batches"]:  # some are judged, others wait or are being judged
+            await asyncio.sleep(0.001)
+        return [*await asyncio.gather(first, server.score(*arrays(12, 8))), await server.score(*arrays(12, 7))]
+
+    one, other, again = (said[2].tolist() for said in asyncio.run(ask()))
+    ok, abstain = Status.OK.value, Status.ABSTAIN.value
+    assert one == again == [ok] * 12 and sorted(other) == sorted([ok] * 8 + [abstain] * 4)
+    assert server.counts["judged"] == 20 and server.counts["refused"] == 4
 
 
 def test_restarted_service_is_found_again_and_a_lost_one_is_an_error(service: Any) -> None:
