@@ -129,8 +129,8 @@ class Soak:
     def _failure(self, what: str) -> ChaosFailure:
         return ChaosFailure(
             f"life {self.books.lives} said: ...{self._said()[-1500:]}\n"
-            f"event {self.books.count}, life {self.books.lives}: {what}. See {self.log}; the same command goes"
-            " on from there"
+            f"event {self.books.count}, life {self.books.lives}: {what}. See {self.log}; the same command"
+            " goes on from there"
         )
 
     # -- the runs

@@ -98,7 +98,8 @@ def test_spent_budget_abstains(cfg: dict[str, Any], weights: str) -> None:
         first = asyncio.create_task(server.score(*arrays(12, 7)))
         while not server.counts["batches"]:  # some are judged, others wait or are being judged
             await asyncio.sleep(0.001)
-        return [*await asyncio.gather(first, server.score(*arrays(12, 8))), await server.score(*arrays(12, 7))]
+        both = await asyncio.gather(first, server.score(*arrays(12, 8)))
+        return [*both, await server.score(*arrays(12, 7))]
 
     one, other, again = (said[2].tolist() for said in asyncio.run(ask()))
     ok, abstain = Status.OK.value, Status.ABSTAIN.value
