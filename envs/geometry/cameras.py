@@ -43,13 +43,3 @@ def project(points: Tensor, intrinsic: Tensor, c2w: Tensor) -> tuple[Tensor, Ten
     camera = points @ w2c[..., :3, :3].transpose(-1, -2) + w2c[..., None, :3, 3]
     pixels = camera @ intrinsic.transpose(-1, -2)
     return pixels[..., :2] / pixels[..., 2:], camera[..., 2]
-
-
-def on_plane(pixels: Tensor, height: Tensor | float, intrinsic: Tensor, c2w: Tensor) -> Tensor:
-    """World points [..., T, 3] where the rays of pixels [..., T, 2] meet the plane z = height (metres)."""
-    ones = torch.ones_like(pixels[..., :1])
-    local = torch.cat((pixels, ones), -1) @ torch.linalg.inv(intrinsic).transpose(-1, -2)
-    direction = local @ c2w[..., :3, :3].transpose(-1, -2)
-    origin = c2w[..., None, :3, 3]
-    scale = (height - origin[..., 2:]) / direction[..., 2:]
-    return origin + scale * direction

@@ -31,6 +31,12 @@ def pose_transforms(poses: Tensor) -> Tensor:
     return out
 
 
+def fingertips(poses: Tensor, tool_offset: float) -> Tensor:
+    """Places [..., 3] of flange poses [..., 6 or more], `tool_offset` metres ahead along the flange's z."""
+    flange = pose_transforms(poses)
+    return flange[..., :3, 3] + tool_offset * flange[..., :3, 2]
+
+
 def invert(transform: Tensor) -> Tensor:
     """Inverse [..., 4, 4] of rigid transforms [..., 4, 4]."""
     out = torch.zeros_like(transform)

@@ -17,7 +17,7 @@ from envs.encoders import bells
 from envs.episodes.clips import ClipStore
 from envs.geometry.cameras import project
 from envs.geometry.kinematics import Kinematics
-from envs.geometry.rotations import pose_transforms
+from envs.geometry.rotations import fingertips
 from learners.stages.simulator import last_rows, owners
 
 CHUNKS = (1, 2, 4, 8)  # ahead; past an episode's end its last command counts
@@ -53,9 +53,7 @@ class Hands:
         ahead = torch.stack([torch.minimum(rows + count * store.spec.chunk, last) for count in CHUNKS], 1)
         needed, place = ahead.unique(return_inverse=True)
         poses = end_effector_poses(robot, store.arrays["commands"][needed], self.kinematics)
-        turned = pose_transforms(poses)
-        tips = turned[..., :3, 3] + self.tool_offset * turned[..., :3, 2]  # [rows, arms, 3]
-        tips = tips[place].flatten(1, 2)
+        tips = fingertips(poses, self.tool_offset)[place].flatten(1, 2)  # [N, chunks * arms, 3]
         height, width = store.spec.size
         seen = []
         for view in views:

@@ -18,7 +18,7 @@ from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.episodes.formats.lerobot_columns import POSES
 from envs.episodes.privileged import read_privileged
 from envs.geometry.kinematics import Kinematics
-from envs.geometry.rotations import pose_transforms
+from envs.geometry.rotations import fingertips
 
 FLANGES = (
     "flange_poses"  # privileged: [arms, n], x, y, z in metres, then roll, pitch, yaw where a suite has them
@@ -128,5 +128,4 @@ def _tips(poses: Tensor, tool_offset: float) -> Tensor:
     """Fingertips [N, arms, 3] of poses [N, arms, 6], or the places themselves of places [N, arms, 3]."""
     if poses.shape[-1] < 6:
         return poses.float()
-    flange = pose_transforms(poses.float())
-    return flange[..., :3, 3] + tool_offset * flange[..., :3, 2]
+    return fingertips(poses.float(), tool_offset)

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from envs.episodes.clips import ClipStore
 from envs.episodes.privileged import read_privileged
-from envs.geometry.cameras import on_plane, project
+from envs.geometry.cameras import project
 from envs.simulators.replay import Replay
 from pipeline.evaluation.objects.locator import locate
+from pipeline.evaluation.objects.rays import on_plane
 from pipeline.evaluation.quantiles import quantiles
 
 POSES = "object_poses"  # privileged: [O, n], for every object x, y, z in metres and what else a suite knows

@@ -20,6 +20,12 @@ def rays(pixels: Tensor, intrinsic: Tensor, c2w: Tensor) -> tuple[Tensor, Tensor
     return c2w[..., :3, 3].expand_as(direction), direction / direction.norm(dim=-1, keepdim=True)
 
 
+def on_plane(pixels: Tensor, height: Tensor | float, intrinsic: Tensor, c2w: Tensor) -> Tensor:
+    """World points [..., T, 3] where the rays of pixels [..., T, 2] meet the plane z = height (metres)."""
+    origin, direction = rays(pixels, intrinsic.unsqueeze(-3), c2w.unsqueeze(-3))
+    return origin + (height - origin[..., 2:]) / direction[..., 2:] * direction
+
+
 def triangulate(origin: Tensor, direction: Tensor) -> Tensor:
     """Points [..., 3] nearest to the rays [..., V, 3] of cameras, by least squares; NaN in any of a ray
     leaves it out. NaN where fewer than two are left, or all that are left look the same way.

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from envs.geometry.cameras import follow_wrists, on_plane, project
+from envs.geometry.cameras import follow_wrists
 from envs.geometry.rotations import invert, pose_transforms, rpy_to_matrix
 
 
@@ -35,14 +35,3 @@ def test_wrist_cameras_follow_their_flange_and_others_stay() -> None:
     assert torch.allclose(out[1, 0], c2w[0])
     assert torch.allclose(out[1, 1, :3, 3], torch.tensor([0.4, 0.0, 0.0]))
     assert torch.allclose(out[1, 2, :3, 3], torch.tensor([0.1 * np.cos(0.5), 0.1 * np.sin(0.5), 0.0]).float())
-
-
-def test_projection_is_the_inverse_of_on_plane() -> None:
-    intrinsic = torch.tensor([[50.0, 0, 32], [0, 50, 32], [0, 0, 1]])
-    c2w = torch.eye(4)
-    c2w[:3, :3] = torch.tensor([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
-    c2w[:3, 3] = torch.tensor([0.2, 0.0, 1.0])
-    points = torch.tensor([[0.1, 0.2, 0.03], [0.3, -0.1, 0.03]])
-    pixels, depth = project(points, intrinsic, c2w)
-    assert bool((depth > 0).all())
-    assert torch.allclose(on_plane(pixels, 0.03, intrinsic, c2w), points, atol=1e-5)

@@ -12,12 +12,14 @@ import torch
 
 from envs.episodes import Episode, LeRobotWriter
 from envs.episodes.clips import ClipStore
+from envs.geometry.cameras import project
 from envs.physics.pool import TaskPool
 from envs.physics.suite import build_suite
 from envs.simulators.replay import Replay
 from envs.specs import WorldSpec
 from envs.targets import ConfigError
 from pipeline.evaluation.measurement import rollout_error
+from pipeline.evaluation.objects.rays import on_plane
 from tests.embodiments import BIMANUAL_POSES, world_spec
 from tests.envs.physics.sections import task_section
 from tests.moving_square import SIZE, SQUARE, moving_square
@@ -103,3 +105,14 @@ def test_calibrated_suites_are_measured(choice: str, tmp_path: Path) -> None:
     episodes = torch.arange(2)
     result = rollout_error(store, episodes, recorded(store, episodes))
     assert result.keys() >= MEASURED and result["object_px"] == result["locator_px"]
+
+
+def test_projection_is_the_inverse_of_on_plane() -> None:
+    intrinsic = torch.tensor([[50.0, 0, 32], [0, 50, 32], [0, 0, 1]])
+    c2w = torch.eye(4)
+    c2w[:3, :3] = torch.tensor([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
+    c2w[:3, 3] = torch.tensor([0.2, 0.0, 1.0])
+    points = torch.tensor([[0.1, 0.2, 0.03], [0.3, -0.1, 0.03]])
+    pixels, depth = project(points, intrinsic, c2w)
+    assert bool((depth > 0).all())
+    assert torch.allclose(on_plane(pixels, 0.03, intrinsic, c2w), points, atol=1e-5)
