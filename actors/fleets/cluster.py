@@ -238,7 +238,7 @@ def _advice(address: str, error: Exception) -> str:
         # Ray logs InvalidAuthToken and then only says that it could not connect.
         return (
             f"launch.address={address} listens, but does not let us in; most often it refused our token: copy"
-            " ~/.ray/auth_token of the head node to this machine, "
+            " ~/.ray/auth_token of the head node to this machine and set RAY_AUTH_MODE=token, "
             f"or set RAY_AUTH_MODE=disabled everywhere on a network you trust ({type(error).__name__}:"
             f" {said})"
         )
