@@ -97,7 +97,7 @@ def check_world(cfg: Mapping[str, Any]) -> None:
 
 
 def check_state_expert(cfg: Mapping[str, Any]) -> None:
-    """See that the state expert can decode this robot's states, before the simulator that it reads is trained.
+    """See that the state expert can decode this robot's states, before the simulator that it reads learns.
 
     Raises:
         ConfigError: naming the key and the fix.

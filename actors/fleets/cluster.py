@@ -249,7 +249,15 @@ def _compare(nodes: int) -> None:
     """Every node must have our versions: rollouts and weights of another would fail late and darkly."""
     mine = versions()
     probe = ray.remote(versions).options(num_cpus=0, scheduling_strategy="SPREAD")
-    for theirs in ray.get([probe.remote() for _ in range(2 * nodes)], timeout=120):
+    try:
+        answers = ray.get([probe.remote() for _ in range(2 * nodes)], timeout=120)
+    except ray.exceptions.RayError as error:
+        raise ConfigError(
+            f"a node of the cluster starts no workers of ours ({type(error).__name__}:"
+            f" {str(error).strip().splitlines()[-1]}); is worldloop installed there? See"
+            " /tmp/ray/session_latest/logs on it"
+        ) from error
+    for theirs in answers:
         check_versions(mine, theirs)
 
 

@@ -16,8 +16,8 @@ from envs.targets import ConfigError, options
 
 
 def check_launch(launch: Mapping[str, Any]) -> None:
-    """See before any work that the cluster lets us in and can hold the plan; the first stage that needs it may
-    come hours later. Nobody stays connected until then.
+    """See before any work that the cluster lets us in and can hold the plan; the first stage that needs it
+    may come hours later. Nobody stays connected until then.
 
     Raises:
         ConfigError: naming what cannot be reached, or the role that finds no place.

@@ -159,10 +159,10 @@ def submit(words: Words) -> None:
         )
     # mistakes are better found here than there
     runs = load_config([word for word in words[2:] if "=" in word])["runs"]
-    if not Path(runs).is_absolute():
+    if words[1:] and not Path(runs).is_absolute():
         raise ConfigError(
-            f"runs={runs} would lie in the job's working folder, which Ray throws away; name a folder that all"
-            " nodes share, as runs=/shared/runs"
+            f"runs={runs} would lie in the job's working folder, which Ray throws away; name a folder that"
+            " all nodes share, as runs=/shared/runs"
         )
     send(words[0], words[1:])
 
