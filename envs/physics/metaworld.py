@@ -152,7 +152,12 @@ class MetaWorld(TaskSuite):
             self._envs[task] = _open(self._classes[task])
         self._task, self._env = task, self._envs[task]
         self._env.seed(seed)
-        self._sight, _ = self._env.reset()
+        self._env.reset()
+        # It lays things out after it has last worked out where everything is: pictures would show them, and
+        # its observation tell them, where they lay the time before.
+        mujoco.mj_forward(self._env.model, self._env.data)
+        self._env._get_obs()  # becomes the observation before
+        self._sight = self._env._get_obs()
         self.command = np.zeros(4)
         self._reward, self._info = self._env.evaluate_state(self._sight, self.command)
         self.condition.reset()

@@ -110,6 +110,21 @@ def test_an_episode_depends_on_its_seed_alone(task: dict[str, Any], suite: TaskS
     assert not same(first[-1], other[-1])
 
 
+def test_the_first_picture_shows_what_is_there(task: dict[str, Any], suite: TaskSuite) -> None:
+    pictures = []
+    for seed in (1, 2, 1):
+        suite.reset(task["name"], seed)
+        pictures.append(suite.render())
+    assert np.array_equal(pictures[0], pictures[2])  # not where things lay in the episode before
+    there = [suite.segment()]
+    suite.step(suite.observe().command)
+    there.append(suite.segment())
+    main = suite.embodiment.main_view
+    thing, later = (labels[main] == PARTS["object"] for labels in there if labels is not None)
+    if thing.sum() >= 30:  # a few pixels may be hidden, or settle
+        assert (thing & later).sum() > 0.7 * (thing | later).sum()
+
+
 def test_the_expert_succeeds_and_chance_does_not(task: dict[str, Any], suite: TaskSuite) -> None:
     last = [act(suite, task["name"], 900 + seed, 0.0, task["horizon"])[-1] for seed in range(6)]
     assert sum(seen.success for seen in last) >= 5
