@@ -87,8 +87,27 @@ def check_world(cfg: Mapping[str, Any]) -> None:
         judge.check(cfg["judge"])
     except ConfigError as error:
         wrong.append(str(error))
+    if not cfg["finetune"]["data"]:  # else it is the robot of those data that counts
+        try:
+            check_state_expert(cfg)
+        except ConfigError as error:
+            wrong.append(str(error))
     if wrong:
         raise ConfigError("\n".join(wrong))
+
+
+def check_state_expert(cfg: Mapping[str, Any]) -> None:
+    """See that the state expert can decode this robot's states, before the simulator that it reads learns.
+
+    Raises:
+        ConfigError: naming the key and the fix.
+    """
+    section = cfg["simulator"]["state_expert"]
+    kind: Any = target(section, "simulator.state_expert")
+    try:
+        kind.check(section, world_spec(cfg).embodiment)
+    except ValueError as error:
+        raise ConfigError(f"simulator.state_expert: {error}") from error
 
 
 def _recorded_robot(folder: Path) -> Embodiment:

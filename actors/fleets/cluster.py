@@ -161,7 +161,7 @@ def connect(launch: Mapping[str, Any]) -> list[Mapping[str, float]]:
             raise ConfigError(_advice(str(launch["address"]), error)) from error
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     if launch["address"] != "local":
-        _compare(len(nodes))
+        _compare(len(nodes), float(launch["patience"]["start"]))
     return nodes
 
 
@@ -238,18 +238,38 @@ def _advice(address: str, error: Exception) -> str:
         # Ray logs InvalidAuthToken and then only says that it could not connect.
         return (
             f"launch.address={address} listens, but does not let us in; most often it refused our token: copy"
-            " ~/.ray/auth_token of the head node to this machine, "
+            " ~/.ray/auth_token of the head node to this machine and set RAY_AUTH_MODE=token, "
             f"or set RAY_AUTH_MODE=disabled everywhere on a network you trust ({type(error).__name__}:"
             f" {said})"
         )
     return f"launch.address={address}: {type(error).__name__}: {said}; see /tmp/ray/session_latest/logs"
 
 
-def _compare(nodes: int) -> None:
-    """Every node must have our versions: rollouts and weights of another would fail late and darkly."""
+def _compare(nodes: int, patience: float) -> None:
+    """Every node must have our versions: rollouts and weights of another would fail late and darkly.
+
+    Args:
+        patience: seconds that nodes may take to answer.
+
+    Raises:
+        ConfigError: if one differs, or starts no workers of ours.
+    """
     mine = versions()
     probe = ray.remote(versions).options(num_cpus=0, scheduling_strategy="SPREAD")
-    for theirs in ray.get([probe.remote() for _ in range(2 * nodes)], timeout=120):
+    try:
+        answers = ray.get([probe.remote() for _ in range(2 * nodes)], timeout=patience)
+    except ray.exceptions.GetTimeoutError as error:
+        raise ConfigError(
+            f"not all nodes of the cluster answered within launch.patience.start={patience:.0f} s; are they"
+            " busy, or no longer there? `ray status` lists them"
+        ) from error
+    except ray.exceptions.RayError as error:
+        raise ConfigError(
+            f"a node of the cluster starts no workers of ours ({type(error).__name__}:"
+            f" {str(error).strip().splitlines()[-1]}); is worldloop installed there? See"
+            " /tmp/ray/session_latest/logs on it"
+        ) from error
+    for theirs in answers:
         check_versions(mine, theirs)
 
 

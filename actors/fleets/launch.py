@@ -2,13 +2,43 @@
 
 from __future__ import annotations
 
+import os
 import uuid
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
+
+import torch
 
 from actors.fleets.fleet import Fleet, LocalFleet, Patience
 from actors.rollouts.recipe import Recipe, build_host
 from envs.targets import ConfigError, options
+
+
+def check_launch(launch: Mapping[str, Any]) -> None:
+    """See before any work that the cluster lets us in and can hold the plan; the first stage that needs it
+    may come hours later. Nobody stays connected until then.
+
+    Raises:
+        ConfigError: naming what cannot be reached, or the role that finds no place.
+    """
+    if launch["backend"] != "ray":
+        return
+    # Ray takes seconds to import, which a local run need not spend.
+    import ray
+
+    from actors.fleets.cluster import Plan, connect
+
+    if launch["address"] == "local":
+        here = {"CPU": float(launch["cpus"] or os.cpu_count() or 1), "GPU": float(torch.cuda.device_count())}
+        Plan.of(launch).check([here])
+        return
+    connected = ray.is_initialized()
+    try:
+        Plan.of(launch).check(connect(launch))
+    finally:
+        if not connected:
+            ray.shutdown()
 
 
 def build_fleet(recipe: Recipe) -> Fleet:

@@ -15,6 +15,7 @@ mapfile -t nodes < <(scontrol show hostnames "$SLURM_JOB_NODELIST")
 head=${nodes[0]}
 address=$(srun --nodes=1 --ntasks=1 -w "$head" hostname --ip-address | awk '{print $1}')
 port=6379
+export SRUN_CPUS_PER_TASK=$SLURM_CPUS_PER_TASK   # else steps get one CPU, SLURM 22.05 and newer
 
 # The token is made once, in a home that all nodes share, and readable by nobody else.
 export RAY_AUTH_MODE=token RAY_AUTH_TOKEN_PATH="$HOME/.ray/auth_token-$SLURM_JOB_ID"
@@ -24,11 +25,13 @@ trap 'ray stop --force >/dev/null 2>&1 || true; rm -f "$RAY_AUTH_TOKEN_PATH"' EX
 
 srun --nodes=1 --ntasks=1 -w "$head" --overlap \
   ray start --head --node-ip-address="$address" --port=$port --num-cpus="$SLURM_CPUS_PER_TASK" --include-dashboard=false --block &
-sleep 10
+timeout 300 bash -c "until (exec 3<>/dev/tcp/$address/$port) 2>/dev/null; do sleep 1; done"
 for node in "${nodes[@]:1}"; do
   srun --nodes=1 --ntasks=1 -w "$node" --overlap ray start --address="$address:$port" --num-cpus="$SLURM_CPUS_PER_TASK" --block &
 done
-sleep 10
+timeout 300 python -c 'import sys, time, ray
+ray.init(address=sys.argv[1], log_to_driver=False)
+while sum(node["Alive"] for node in ray.nodes()) < int(sys.argv[2]): time.sleep(1)' "$address:$port" "${#nodes[@]}"
 
 # SLURM's TERM two minutes before the end reaches the learner, which writes its checkpoint; submit again to go on.
 srun --nodes=1 --ntasks=1 -w "$head" --overlap python -m pipeline "$@" launch.address="$address:$port" &

@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
+from envs.episodes.episode import EpisodeError
 from envs.ranges import Count, Natural, Share
 from envs.rng import step_generator
 from envs.simulators.base import Simulator
@@ -65,8 +66,15 @@ def train_simulator(
         fresh: whether it has not been trained before; it then takes its units from these episodes first.
 
     Raises:
+        EpisodeError: if no recorded picture follows another, so that there is nothing to continue.
         ValueError: if lora is asked of a simulator without projections to adapt.
     """
+    rows = store.rows(episodes)
+    if not bool((store.arrays["present"][rows] & (rows > store.start[owners(store, rows)])).any()):
+        raise EpisodeError(
+            f"none of the {len(episodes)} episodes has a picture after its first frame, so a simulator has"
+            " nothing to learn from them (GE-Sim 2.0's bundles are such: they say where a rollout begins)"
+        )
     if fresh:
         simulator.normalise(*units(store, episodes))
         order = torch.randperm(len(episodes), generator=step_generator(options.seed, options.steps))

@@ -16,12 +16,14 @@ from pipeline.cli.words import Words, prepared, root_of
 def run(words: Words) -> None:
     """run the whole loop of an experiment; finished stages are reused, interrupted ones resume"""
     cfg, root = prepared(words)
+    from actors.fleets.launch import check_launch
     from pipeline.graph.owner import owning
     from pipeline.loop import build_loop, check_labels
     from pipeline.track import tracking
 
     graph = build_loop(cfg, root)
     check_labels(cfg, graph)
+    check_launch(cfg["launch"])
     print(f"{len(graph.nodes)} stages in {root}; each says how long it will take after its first steps")
     with owning(root, "run"), tracking(cfg, root) as tracker:
         manifests = graph.run(tracker=tracker)
@@ -158,11 +160,13 @@ def finetune(words: Words) -> None:
     finetune.data=[<folder>]
     """
     cfg, root = prepared(words)
+    from actors.fleets.launch import check_launch
     from pipeline.commands.finetune import build_finetune
     from pipeline.graph.owner import owning
     from pipeline.track import tracking
 
     graph = build_finetune(cfg, root)
+    check_launch(cfg["launch"])
     with owning(root, "finetune"), tracking(cfg, root / "finetune") as tracker:
         graph.run(tracker=tracker)
     print(f"weights in {' and '.join(str(graph.folder(name)) for name in graph.nodes)}")
@@ -171,6 +175,7 @@ def finetune(words: Words) -> None:
 def _run_until(name: str, words: Words) -> Path:
     """Run a stage and what it needs; returns its folder."""
     cfg, root = prepared(words)
+    from actors.fleets.launch import check_launch
     from pipeline.graph.owner import owning
     from pipeline.loop import build_loop, check_labels
     from pipeline.track import tracking
@@ -179,6 +184,7 @@ def _run_until(name: str, words: Words) -> Path:
     if name not in graph.nodes:
         raise ConfigError(f"no stage {name}{nearest(name, graph.nodes)}")
     check_labels(cfg, graph, name)
+    check_launch(cfg["launch"])
     with owning(root, f"stage {name}"), tracking(cfg, root) as tracker:
         graph.run(name, tracker)
     return graph.folder(name)

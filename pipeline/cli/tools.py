@@ -84,10 +84,13 @@ def inspect(words: Words) -> None:
     from pipeline.commands.convert import inspect as draw
 
     usage = "say from where to where: worldloop inspect SRC DST [frames=N] [size=[H,W]] [tool_offset=0.15]"
-    paths, cut, own = _source_and_cut(words, usage)
+    paths, cut, own = _source_and_cut(words, usage, ("tool_offset",))
     style = PoseMapStyle()
     if "tool_offset" in own:
-        style = replace(style, tool_offset=float(own["tool_offset"]))
+        try:
+            style = replace(style, tool_offset=float(own["tool_offset"]))
+        except ValueError as error:
+            raise ConfigError(f"tool_offset={own['tool_offset']}: say metres, as in 0.15") from error
     for path in draw(paths[0], paths[1], cut, style):
         print(path)
 
@@ -143,15 +146,24 @@ def verify(words: Words) -> None:
 
 
 def submit(words: Words) -> None:
-    """run a command on a Ray cluster: worldloop submit http://head:8265 rl launch=ray launch.actors=8"""
+    """run a command on a Ray cluster: worldloop submit http://head:8265 rl launch=ray launch.actors=8
+    runs=/shared/runs
+    """
     from pipeline.commands.submit import submit as send
     from pipeline.config import load_config
 
     if not words or not words[0].startswith("http"):
         raise ConfigError(
             "say where: worldloop submit http://head:8265 rl experiment=quickstart launch=ray launch.actors=8"
+            " runs=/shared/runs"
         )
-    load_config([word for word in words[2:] if "=" in word])  # mistakes are better found here than there
+    # mistakes are better found here than there
+    runs = load_config([word for word in words[2:] if "=" in word])["runs"]
+    if words[1:] and not Path(runs).is_absolute():
+        raise ConfigError(
+            f"runs={runs} would lie in the job's working folder, which Ray throws away; name a folder that"
+            " all nodes share, as runs=/shared/runs"
+        )
     send(words[0], words[1:])
 
 
@@ -227,13 +239,15 @@ def completion(words: Words) -> None:
     print(script(words[0], COMMANDS))
 
 
-def _source_and_cut(words: Words, usage: str) -> tuple[list[Path], Any, dict[str, str]]:
-    """Two paths, the Cut that frames= and size= ask for, and all options of convert and inspect."""
+def _source_and_cut(
+    words: Words, usage: str, more: tuple[str, ...] = ()
+) -> tuple[list[Path], Any, dict[str, str]]:
+    """Two paths, the Cut that frames= and size= ask for, and all options: these two and `more`."""
     from envs.episodes.formats.foreign import Cut
 
     paths = [Path(word) for word in words if "=" not in word]
     own = {key: value for key, _, value in (word.partition("=") for word in words if "=" in word)}
-    if len(paths) != 2 or set(own) - {"frames", "size", "tool_offset"}:
+    if len(paths) != 2 or set(own) - {"frames", "size", *more}:
         raise ConfigError(usage)
     try:
         size = tuple(int(n) for n in own.get("size", "").strip("[]").split(",") if n)

@@ -55,7 +55,12 @@ def convert(source: Path, target: Path, cut: Cut) -> int:
             write_json(half, wanted)
         elif (begun := json.loads(half.read_text())) != wanted:
             raise EpisodeError(f"{target} holds half of another conversion, {begun}; choose a new folder")
-        count = _write(source, target, cut)
+        try:
+            count = _write(source, target, cut)
+        except EpisodeError:
+            if set(target.iterdir()) - held_files(target) == {half}:  # nothing yet that could be gone on with
+                remove(half)
+            raise
         remove(half)
         return count
 

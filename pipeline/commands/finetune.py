@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from actors.world_config import check_state_expert
 from envs.targets import ConfigError
 from pipeline.acting import acting
 from pipeline.graph.graph import Graph
@@ -22,7 +23,7 @@ def build_finetune(cfg: Mapping[str, Any], root: Path) -> Graph:
     simulator, its student if distill.steps asks for one, and state.
 
     Raises:
-        ConfigError: if finetune.data names no data sets.
+        ConfigError: if finetune.data names no data sets, or the state expert cannot be their robot's.
     """
     data = [str(Path(folder).resolve()) for folder in cfg["finetune"]["data"]]
     if not data:
@@ -32,6 +33,7 @@ def build_finetune(cfg: Mapping[str, Any], root: Path) -> Graph:
         )
     # The robot is the one of the recordings, whatever bench the config knows.
     recorded = {**cfg, "task": {**cfg["task"], "suite": None, "data": data}}
+    check_state_expert(recorded)
     graph, mark = Graph(acting(recorded), root / "finetune"), fingerprint(data)
     learning = graph.under(recorded)  # with the simulator as it is, not as it is acted in
     warm = ""

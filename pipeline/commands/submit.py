@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from ray.exceptions import AuthenticationError
 from ray.job_submission import JobStatus, JobSubmissionClient
 from tqdm import tqdm
 
@@ -62,10 +63,10 @@ def submit(address: str, words: Sequence[str]) -> str:
             entrypoint=command,
             runtime_env={"working_dir": str(Path(__file__).resolve().parents[2]), "excludes": EXCLUDES},
         )
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except (AuthenticationError, ConnectionError, RuntimeError, ValueError) as error:
         raise ConfigError(
             f"{address} takes no jobs: {str(error).splitlines()[0]}. Is the dashboard on (ray start --head"
-            " --dashboard-host ...), and is ~/.ray/auth_token the head node's?"
+            " --dashboard-host ...), is ~/.ray/auth_token the head node's, and RAY_AUTH_MODE=token set here?"
         ) from error
     tqdm.write(f"job {job}: {command}\nstop it with: ray job stop {job} --address {address}")
     shown = 0

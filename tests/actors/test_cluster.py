@@ -21,12 +21,13 @@ from ray.cluster_utils import Cluster
 
 from actors.factory import build_policy
 from actors.fleets.cluster import _advice, _our_sigterm, check_versions, connect, versions
-from actors.fleets.launch import build_fleet
+from actors.fleets.launch import build_fleet, check_launch
 from actors.fleets.ray_fleet import RayFleet
 from actors.rollouts.host import Job, trained_weights
 from actors.rollouts.recipe import Recipe
 from envs.targets import ConfigError
 from pipeline.chaos.processes import belonging, nothing_left
+from pipeline.cli import tools
 from pipeline.commands.submit import entrypoint
 from pipeline.config import load_config
 
@@ -171,6 +172,17 @@ def test_unreachable_clusters_and_other_versions_are_named() -> None:
     )
 
 
+def test_a_cluster_is_asked_before_any_work() -> None:
+    here = load_config(["experiment=soak", "launch=ray", "launch.cpus=2"])["launch"]
+    check_launch(here)
+    with pytest.raises(ConfigError, match=r"launch\.place\.actors \(process 5 of 8\) needs 0\.5 CPU"):
+        check_launch({**here, "actors": 8})
+    with pytest.raises(ConfigError, match=r"launch\.address=127\.0\.0\.1:1 cannot be reached"):
+        check_launch({**here, "address": "127.0.0.1:1"})
+    assert not ray.is_initialized()
+    check_launch(load_config(["experiment=soak"])["launch"])
+
+
 def test_what_is_submitted_runs_on_the_cluster() -> None:
     assert (
         entrypoint(["rl", "launch=ray", "launch.actors=8"])
@@ -179,3 +191,7 @@ def test_what_is_submitted_runs_on_the_cluster() -> None:
     for words in ([], ["launch=ray"], ["rl", "seed=1"]):
         with pytest.raises(ConfigError):
             entrypoint(words)
+    with pytest.raises(ConfigError, match="runs=runs would lie in the job's working folder"):
+        tools.submit(["http://127.0.0.1:1", "rl", "experiment=soak", "launch=ray"])
+    with pytest.raises(ConfigError, match="takes no jobs"):
+        tools.submit(["http://127.0.0.1:1", "rl", "experiment=soak", "launch=ray", "runs=/runs"])

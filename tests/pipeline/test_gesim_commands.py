@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
 
 from actors.factory import build_simulator, build_state_decoder
+from envs.episodes import EpisodeError, LeRobotWriter
+from envs.episodes.formats.foreign import Cut, read_foreign
 from envs.simulators.dit.shape import DiTShape
 from envs.simulators.samplers import DISTILLED, Distilled
 from envs.targets import ConfigError
@@ -37,14 +41,21 @@ def test_convert_and_inspect(shared: Path, tmp_path: Path, capsys: pytest.Captur
     tools.convert([str(shared / "data/gesim_v2"), str(tmp_path / "out"), "frames=6", "size=[32,48]"])
     tools.inspect([str(tmp_path / "out"), str(tmp_path / "pictures")])
     assert "1 episodes" in capsys.readouterr().out and len(list((tmp_path / "pictures").glob("*.png"))) == 1
-    with pytest.raises(ConfigError, match="worldloop convert SRC DST"):
-        tools.convert(["only-one"])
+    paths = [str(tmp_path / "out"), str(tmp_path / "other")]
+    for wrong in (paths[:1], *([*paths, word] for word in ("size=[32]", "frames=-1", "tool_offset=0.1"))):
+        with pytest.raises(ConfigError, match="worldloop convert SRC DST"):
+            tools.convert(wrong)
+    with pytest.raises(ConfigError, match="tool_offset=far: say metres"):
+        tools.inspect([str(tmp_path / "out"), str(tmp_path / "pictures"), "tool_offset=far"])
 
 
 def test_finetune_a_checkpoint_distil_it_again_and_serve_what_came_of_it(
     shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    tools.convert([str(shared / "data/gesim_v2"), str(tmp_path / "data"), "frames=12", "size=[32,48]"])
+    (bundle,) = read_foreign(shared / "data/gesim_v2", Cut(12, (32, 48)))
+    still = replace(bundle, frames=bundle.frames[[0] * 12], present=np.ones(12, bool))  # it has one picture
+    for name, episode in (("data", still), ("bundle", bundle)):
+        LeRobotWriter(tmp_path / name, episode.embodiment).write([episode])
     checkpoint = write_checkpoint(tmp_path / "released")
     words = [
         *WORDS,
@@ -62,8 +73,13 @@ def test_finetune_a_checkpoint_distil_it_again_and_serve_what_came_of_it(
         "distill.method={critic_updates: 1, critic_lr: 1e-2}",
         "finetune.state.fit.steps=2",
         "finetune.state.fit.batch=2",
-        "simulator.state_expert.checkpoint=null",  # bundles have head and waist joints, the released one not
     ]
+    with pytest.raises(ConfigError, match=r"knows 16 joints.*states of 20.*state_expert\.checkpoint=null"):
+        build_finetune(load_config(words), tmp_path / "none")  # bundles have head and waist joints, too
+    words += ["simulator.state_expert.checkpoint=null"]
+    with pytest.raises(EpisodeError, match="a picture after its first frame"):
+        bare = load_config([*words, f"finetune.data=[{tmp_path / 'bundle'}]"])
+        build_finetune(bare, tmp_path / "bare").run()
     cfg = load_config(words)
     graph = build_finetune(cfg, tmp_path / "runs/default")
     done = graph.run()
@@ -74,6 +90,8 @@ def test_finetune_a_checkpoint_distil_it_again_and_serve_what_came_of_it(
     )
     rows = [json.loads(line) for line in (graph.folder("student") / "metrics.jsonl").open()]
     assert "distill/critic" in rows[0] and "distill/matching" in rows[1]
+    first = json.loads(next((graph.folder("simulator") / "metrics.jsonl").open()))
+    assert first["simulator/loss"] > 0 and first["simulator/grad_norm"] > 0
     simulator = build_simulator(graph.cfg, graph.folder("student") / "weights.safetensors")
     assert simulator.sampler == Distilled(DISTILLED[:2])
     build_state_decoder(graph.cfg, simulator, graph.folder("state") / "weights.safetensors")

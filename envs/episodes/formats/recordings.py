@@ -22,10 +22,19 @@ class Cut:
     Args:
         frames: the first so many, 0 for all.
         size: (height, width) to resize to, () for the source's own; intrinsics are scaled alike.
+
+    Raises:
+        ValueError: if that is no number of frames, or no size.
     """
 
     frames: int = 0
     size: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.frames < 0:
+            raise ValueError(f"frames={self.frames} is below 0")
+        if self.size and (len(self.size) != 2 or min(self.size) < 1):
+            raise ValueError(f"size={list(self.size)} should be [height,width]")
 
     def of(self, episode: Episode) -> Episode:
         """The episode so cut."""

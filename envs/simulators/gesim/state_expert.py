@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+from envs.embodiment import Embodiment
 from envs.simulators.dit.prediction import Velocity
 from envs.simulators.dit.state_network import StateDiT
 from envs.simulators.gesim.checkpoint import JOINTS, CheckpointError, load_state_network
@@ -26,15 +29,14 @@ class GESimStateExpert(FlowStateDecoder):
 
     def __init__(self, simulator: GESimulator, checkpoint: str | None):
         robot = simulator.spec.embodiment
+        self.check({"checkpoint": checkpoint}, robot)
         found = load_state_network(Path(checkpoint)) if checkpoint else None
         width = max(robot.action_dim, robot.state_dim)
-        if found is not None and (found[0].shape.pose_in_channels, robot.action_dim, robot.state_dim) != (
-            (JOINTS,) * 3
-        ):
+        if found is not None and found[0].shape.pose_in_channels != JOINTS:
             raise CheckpointError(
-                f"the state expert of simulator.checkpoint={checkpoint} knows {JOINTS} joints, but"
-                f" {robot.robot} has actions of {robot.action_dim} and states of {robot.state_dim}; train one"
-                " with simulator.state_expert._target_=envs.simulators.state_experts.flow.StateExpert"
+                f"the state expert of simulator.checkpoint={checkpoint} reads"
+                f" {found[0].shape.pose_in_channels} numbers, not the released one's {JOINTS} joints; train"
+                " another with simulator.state_expert.checkpoint=null"
             )
         untrained = replace(simulator.net.shape, pose_in_channels=width, pose_out_channels=robot.state_dim)
         every = simulator.spec.chunk if simulator.parity.thins_history else 1
@@ -52,3 +54,17 @@ class GESimStateExpert(FlowStateDecoder):
                 getattr(self.tokens, f"{name}_mean").copy_(stats[name][0])
                 getattr(self.tokens, f"{name}_std").copy_(stats[name][1])
             self.normalised = True
+
+    @classmethod
+    def check(cls, options: Mapping[str, Any], robot: Embodiment) -> None:
+        """See StateDecoder.check; released weights know one robot.
+
+        Raises:
+            CheckpointError: if they are asked to decode another's states.
+        """
+        if options["checkpoint"] and (robot.action_dim, robot.state_dim) != (JOINTS,) * 2:
+            raise CheckpointError(
+                f"the state expert of simulator.checkpoint={options['checkpoint']} knows {JOINTS} joints, but"
+                f" {robot.robot} has actions of {robot.action_dim} and states of {robot.state_dim}; train one"
+                " of that size with simulator.state_expert.checkpoint=null"
+            )

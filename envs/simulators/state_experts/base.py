@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from envs.embodiment import Embodiment
 from envs.simulators import memory
 from envs.simulators.base import Simulator
 
@@ -25,6 +29,15 @@ class StateDecoder(nn.Module):
     def __init__(self, memory_frames: int):
         super().__init__()
         self.memory_frames = memory_frames
+
+    @classmethod
+    def check(cls, options: Mapping[str, Any], robot: Embodiment) -> None:
+        """See that one of these options (section simulator.state_expert) can decode that robot's states,
+        before hours are spent on the simulator whose features it shall read.
+
+        Raises:
+            ValueError: naming the key and the fix, of a class of Worldloop's or the expert's own.
+        """
 
     def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
         """Take units from data; arguments as of Simulator.normalise."""

@@ -86,6 +86,12 @@ def test_a_conversion_goes_on_where_it_broke_off(shared: Path, tmp_path: Path) -
         assert np.array_equal(one.frames, other.frames) and np.array_equal(one.commands, other.commands)
 
 
+def test_a_conversion_of_nothing_does_not_claim_the_folder(shared: Path, tmp_path: Path) -> None:
+    with pytest.raises(EpisodeError, match="no recording in a known format"):
+        convert(tmp_path / "mistyped", tmp_path / "out", Cut())
+    assert convert(shared / "data/gesim_v2", tmp_path / "out", Cut(frames=2, size=(32, 48))) == 1
+
+
 def test_two_conversions_into_one_folder_are_one_too_many(shared: Path, tmp_path: Path) -> None:
     with (
         owning(tmp_path, "convert there here"),
