@@ -170,6 +170,9 @@ def _start(launch: Mapping[str, Any]) -> None:
         ray.init(address=launch["address"], log_to_driver=True, configure_logging=False)
         return
     reap_after_me()
+    # Ray makes its workers nice, by 15: beside anything else that computes here they would starve. A user's
+    # own choice stands.
+    os.environ.setdefault("RAY_worker_niceness", "0")
     ray.init(
         address="local",
         num_cpus=launch["cpus"] or None,

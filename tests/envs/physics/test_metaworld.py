@@ -10,7 +10,8 @@ import pytest
 
 pytest.importorskip("metaworld", reason="make metaworld installs it")
 
-from envs.physics.metaworld import MetaWorld, instruction_of
+from envs.physics.metaworld.suite import MetaWorld
+from envs.physics.metaworld.words import instruction_of
 from envs.physics.suite import build_suite
 from envs.targets import ConfigError
 from tests.envs.physics.sections import task_section

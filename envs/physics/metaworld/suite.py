@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -16,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.embodiment import ActionKind, Arm, Camera, Embodiment
+from envs.physics.metaworld.noisy_policy import NoisyPolicy
+from envs.physics.metaworld.words import instruction_of
 from envs.physics.render import calibration, offscreen_for
 from envs.physics.suite import (
     Array,
@@ -25,7 +26,6 @@ from envs.physics.suite import (
     SuiteError,
     TaskSuite,
     check_cameras,
-    check_noise_level,
     check_task,
     checked_action,
 )
@@ -48,44 +48,6 @@ CAMERAS = {
 INSTALL = (
     "python -m pip install 'gymnasium==1.4.0' imageio && python -m pip install --no-deps metaworld==3.1.1"
 )
-
-# Names that do not read as thing, verb, manner.
-_INSTRUCTIONS = {
-    "assembly": "put the ring onto the peg",
-    "basketball": "put the ball into the basket",
-    "bin-picking": "move the puck to the other bin",
-    "coffee-button": "press the button of the coffee machine",
-    "coffee-pull": "pull the mug away from the coffee machine",
-    "coffee-push": "push the mug under the coffee machine",
-    "disassemble": "take the ring off the peg",
-    "hammer": "hammer the nail into the wall",
-    "hand-insert": "put the gripper into the hole",
-    "peg-unplug-side": "unplug the peg sideways",
-    "pick-out-of-hole": "pick the puck out of the hole",
-    "pick-place": "pick up the puck and bring it to the goal",
-    "pick-place-wall": "pick up the puck and bring it over the wall to the goal",
-    "push": "push the puck to the goal",
-    "push-back": "push the puck back to the goal",
-    "push-wall": "push the puck around the wall to the goal",
-    "reach": "reach the goal",
-    "reach-wall": "reach the goal over the wall",
-    "shelf-place": "place the block on the shelf",
-    "soccer": "kick the ball into the goal",
-    "stick-pull": "pull the thermos with the stick",
-    "stick-push": "push the thermos with the stick",
-    "sweep": "sweep the puck off the table",
-    "sweep-into": "sweep the puck into the hole",
-}
-_MANNERS = {"topdown": "from above", "wall": "behind the wall", "side": "sideways", "back": "back"}
-
-
-def instruction_of(task: str) -> str:
-    """A task's name as words: 'drawer-open-v3' is 'open the drawer'."""
-    name = task.rsplit("-v", 1)[0]
-    if name in _INSTRUCTIONS:
-        return _INSTRUCTIONS[name]
-    thing, verb, *manner = name.split("-")
-    return " ".join([verb, "the", thing, *(_MANNERS[word] for word in manner)])
 
 
 class MetaWorld(TaskSuite):
@@ -221,61 +183,6 @@ class MetaWorld(TaskSuite):
     def _render(self, size: tuple[int, int], shadows: bool) -> NDArray[np.uint8]:
         offscreen = offscreen_for(self._task, self._env.model, size)
         return offscreen.render(self._env.model, self._env.data, self._views, shadows)
-
-
-class NoisyPolicy:
-    """A scripted policy that is bent towards chance, whatever its task.
-
-    Noise moves where things and goal are believed to be, adds a slowly varying offset to the motion, and
-    interrupts the policy by random way-points about the thing; at 1 nothing else is left.
-
-    Args:
-        policy: full observation [39] -> action [4].
-        sight: () -> the full observation now.
-        noise_level: 0 is the policy itself, 1 pays no heed to the task.
-        rng: of the noise.
-        period: seconds between two calls.
-
-    Raises:
-        ValueError: if the noise level lies outside [0, 1].
-    """
-
-    def __init__(
-        self,
-        policy: Callable[[Array], Array],
-        sight: Callable[[], Array],
-        noise_level: float,
-        rng: np.random.Generator,
-        period: float,
-    ):
-        check_noise_level(noise_level)
-        self.policy, self.sight, self.noise_level, self.rng = policy, sight, noise_level, rng
-        self.keep = 0.8 ** (period / 0.1)
-        self.start = 0.1 * noise_level**2 * period / 0.1  # chance that a way-point interrupts, per action
-        self.frames = max(1, round(1.0 / period))  # of one way-point
-        self.drift = np.zeros(3)
-        self.object_bias, self.goal_bias = rng.normal(0.0, 0.03 * noise_level, (2, 3))
-        self.left, self.waypoint, self.grip = 0, np.zeros(3), 0.0
-
-    def __call__(self) -> Array:
-        """The next action [4] in -1..1."""
-        seen = self.sight()
-        if self.left == 0 and (self.noise_level >= 1.0 or self.rng.random() < self.start):
-            self.left = self.frames
-            self.waypoint = seen[4:7] + self.rng.normal(0.0, 0.1, 3)
-            self.grip = float(self.rng.choice((-1.0, 1.0)))
-        if self.left:
-            self.left -= 1
-            action = np.append(10.0 * (self.waypoint - seen[:3]), self.grip)
-        else:
-            seen[4:7] += self.object_bias
-            seen[36:39] += self.goal_bias
-            action = np.asarray(self.policy(seen), dtype=np.float64)
-        scale = 0.3 * self.noise_level * np.sqrt(1 - self.keep**2)
-        self.drift = self.keep * self.drift + self.rng.normal(0.0, scale, 3)
-        action = np.clip(action, -1.0, 1.0)
-        action[:3] += self.drift
-        return np.clip(action, -1.0, 1.0)
 
 
 def _open(factory: Any) -> Any:
