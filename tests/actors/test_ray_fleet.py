@@ -91,6 +91,10 @@ def test_rollouts_and_learned_weights_are_the_same_bits_for_any_number_of_actors
         assert stats["ledger"]["learned"] == stats["ledger"]["asked"] == 32
 
 
+def test_hosts_get_a_core_as_soon_as_the_learner_does(cluster: None) -> None:
+    assert ray.get(ray.remote(lambda: os.nice(0)).remote()) == os.nice(0)
+
+
 def test_a_killed_host_is_replaced_and_its_job_run_again(cluster: None, recipe: Recipe) -> None:
     wanted = rollout(LocalFleet(build_host(recipe)), recipe)
     fleet = RayFleet(recipe, 2)
