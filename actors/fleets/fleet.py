@@ -87,6 +87,8 @@ class Patience:
         stage: for a whole stage that runs elsewhere.
         rebuilds: times in a row and per host that building may raise before the run stops; being killed
             meanwhile counts a tenth.
+        deaths: hosts that may die of one and the same job, or be replaced because of it, before the run
+            stops.
     """
 
     job: Positive
@@ -94,6 +96,7 @@ class Patience:
     stage: Positive
     retries: Natural
     rebuilds: Natural
+    deaths: Natural
 
 
 class Fleet(Protocol):

@@ -64,6 +64,7 @@ class RayFleet:
         self._queue: deque[Job] = deque()
         self._done: deque[Result] = deque()
         self._tries: dict[int, int] = {}
+        self._deaths: dict[int, int] = {}
         self._newest: tuple[int, Any] = (-1, None)
         self._failed_builds = 0.0
         self._count = 0
@@ -213,7 +214,8 @@ class RayFleet:
                 Result(member.job, member.version, batch, seconds, loaded, forward, size_of(arrays))
             )
             self.finished += 1
-            self._tries.pop(member.job.number, None)
+            for counts in (self._tries, self._deaths):
+                counts.pop(member.job.number, None)
             member.job = None
 
     def _raised(self, member: Member, error: RayTaskError) -> None:
@@ -248,9 +250,21 @@ class RayFleet:
         )
         tqdm.write(f"fleet: host {member.number} died while it {doing}: {_root(error)}; building another")
         self.ledger.deaths += 1
+        if member.job is not None:
+            self._survivable(member.job.number, error)
         place = self._members.index(member)
         self._requeue(member)
         self._members[place] = self._build()
+
+    def _survivable(self, job: int, error: Exception) -> None:
+        """Chance kills a host or two; a job that ends whoever runs it would be run for ever."""
+        deaths = self._deaths[job] = self._deaths.get(job, 0) + 1
+        if deaths > self.patience.deaths:
+            raise FleetError(
+                f"job {job} ended {deaths} hosts (launch.patience.deaths={self.patience.deaths}), the last:"
+                f" {_root(error)}. Hosts that run out of memory want a lower rl.envs or more rl.shards, slow"
+                " ones a longer launch.patience.job"
+            )
 
     def _requeue(self, member: Member) -> None:
         if member.job is not None:
@@ -278,7 +292,7 @@ class RayFleet:
                 " over launch.patience; it is replaced"
             )
             ray.kill(member.actor, no_restart=True)
-            self._died(member, TimeoutError(f"no answer in {limit:.0f} s"))
+            self._died(member, TimeoutError(f"no answer in {limit:g} s"))
 
 
 def _root(error: Exception) -> str:

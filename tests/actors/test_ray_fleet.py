@@ -164,6 +164,17 @@ def test_a_job_that_raises_is_given_up_and_counted(cluster: None, recipe: Recipe
         fleet.close()
 
 
+def test_a_job_that_ends_every_host_stops_the_run(cluster: None, recipe: Recipe) -> None:
+    fleet = RayFleet(recipe, 1, patience=patience(recipe, job=0.01, deaths=1))
+    try:
+        fleet.publish(0, {})
+        fleet.submit(Job(0, tuple(range(4)), 0))
+        with pytest.raises(FleetError, match=r"job 0 ended 2 hosts.*0\.01? s.*launch\.patience\.job"):
+            fleet.take()
+    finally:
+        fleet.close()
+
+
 def test_hosts_that_cannot_be_built_stop_the_run(cluster: None, recipe: Recipe) -> None:
     plain = recipe.plain() | {"data": ("/nowhere",)}
     fleet = RayFleet(Recipe(**plain), 1, patience=patience(recipe, rebuilds=2))
