@@ -52,7 +52,7 @@ lint: setup
 	$(BIN)/mypy
 
 test: lint
-	$(BIN)/python -m pytest -n $(TEST_WORKERS) --dist loadgroup
+	$(BIN)/python -m pytest -n $(TEST_WORKERS) --dist loadfile
 
 quickstart: setup
 	$(BIN)/worldloop run experiment=quickstart seed=$(SEED)

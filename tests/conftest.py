@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 # Before torch is imported: small work that is cut in two waits for itself, most of all beside other work.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -17,16 +18,21 @@ from envs.episodes.clips import ClipStore
 from tests.embodiments import BIMANUAL_POSES, world_spec
 from tests.moving_square import SIZE, episodes_of
 
-# Their Rays would starve each other: workers of Ray are nice, and wait long for a core that others want.
+# Two Rays at once have more processes than there are cores.
 WITH_RAY = ("test_ray_fleet", "test_cluster", "test_judge_service", "test_chaos", "test_stage_workers")
 
 
-@pytest.hookimpl(tryfirst=True)  # pytest-xdist reads the groups in a hook of its own
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Files stay together in one of the processes of `pytest -n`, and those that start Rays in the same."""
-    for item in items:
-        group = "ray" if item.path.stem in WITH_RAY else str(item.path)
-        item.add_marker(pytest.mark.xdist_group(group))
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Files(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.partition("::")[0]
+            return "ray" if Path(file).stem in WITH_RAY else file
+
+    return Files(config, log)
 
 
 @pytest.fixture(scope="session")
