@@ -70,7 +70,9 @@ def train_simulator(
         ValueError: if lora is asked of a simulator without projections to adapt.
     """
     rows = store.rows(episodes)
-    if not bool((store.arrays["present"][rows] & (rows > store.start[owners(store, rows)])).any()):
+    if len(rows) and not bool(
+        (store.arrays["present"][rows] & (rows > store.start[owners(store, rows)])).any()
+    ):
         raise EpisodeError(
             f"none of the {len(episodes)} episodes has a picture after its first frame, so a simulator has"
             " nothing to learn from them (GE-Sim 2.0's bundles are such: they say where a rollout begins)"
