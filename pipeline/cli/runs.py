@@ -117,10 +117,12 @@ def trust(words: Words) -> None:
 def controls(words: Words) -> None:
     """whose gain is it: beside a finished run the loop without RL iterations, RL in physics, filtered BC"""
     cfg, root = prepared(words)
+    from actors.fleets.launch import check_launch
     from pipeline.commands.controls import run_controls, table_text
     from pipeline.graph.owner import owning
     from pipeline.track import tracking
 
+    check_launch(cfg["launch"])
     with owning(root, "controls"), tracking(cfg, root) as tracker:
         table = run_controls(cfg, root, tracker)
     print(f"{table_text(table)}\n{root}/controls.json, {root}/report.html")
@@ -135,11 +137,14 @@ def study(words: Words) -> None:
 
     made = plan_study(words)
     # a mistake in the words is told before any work
+    from actors.fleets.launch import check_launch
     from actors.process import device_of, prepare_process
     from pipeline.graph.owner import owning
     from pipeline.study.run import run_study
 
     device_of(made.cfg)
+    if made.cfg["study"]["minutes"] != 0:  # else the table is written as it stands
+        check_launch(made.cfg["launch"])
     prepare_process(made.cfg["seed"], made.cfg["threads"])
     with owning(made.root, "study"):
         text = run_study(made)
