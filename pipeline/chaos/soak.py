@@ -232,8 +232,10 @@ class Soak:
         if status == 0:  # it was ending already
             self._ended_well(status)
             return
-        asked = {-number}  # its very end has nothing left to clean up; shells call both 128 + number
-        if status not in (asked if kind == "SIGKILL" else asked | {128 + number}):
+        answers = {-number} if kind == "SIGKILL" else {128 + number}
+        if not self._left():  # with all done it has nothing to clean up; shells call both 128 + number
+            answers.add(-number)
+        if status not in answers:
             raise self._failure(f"it ended with {status} after {kind}")
         if kind != "SIGKILL" and "Traceback" in self._said():
             raise self._failure(f"{kind} was answered by a traceback")
