@@ -91,7 +91,7 @@ class Slot:
 
 
 class Worker:
-    """The work of one process; it runs in the caller's process where a pool has one worker.
+    """The work of one process.
 
     Args:
         spec: of the suite and its tasks.
@@ -220,13 +220,15 @@ def serve(pipe: Connection) -> None:
             pipe.send(("config", str(error)))
             return
         except Exception:
-            pipe.send(("error", traceback.format_exc()))
+            pipe.send(("broken", traceback.format_exc()))
             return
         pipe.send(("ok", None))
         while (message := pipe.recv()) is not None:
             name, arguments = message
             try:
                 answer = ("ok", getattr(worker, name)(*arguments))
+            except ConfigError as error:
+                answer = ("config", str(error))
             except Exception:
                 answer = ("error", traceback.format_exc())
             pipe.send(answer)
