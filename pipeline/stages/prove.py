@@ -21,6 +21,7 @@ from pipeline.evaluation import measurement
 from pipeline.evaluation.by_task import (
     by_scene,
     by_task,
+    evenly,
     scenes_of_episodes,
     tasks_of_episodes,
     tasks_of_seeds,
@@ -115,13 +116,15 @@ def _true_success(cfg: Cfg, folder: Path, inputs: Inputs, changes: Mapping[str, 
 @priced
 def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Deterministic success in the last imagined world, of the policies in the roles before and after, from
-    the starts of held-out episodes first.
+    the starts of held-out episodes first, shared out over tasks.
     """
     prepare_process(cfg["seed"], cfg["threads"])
     store = open_store(cfg, inputs)
     held = store.split("held_out")
-    others = torch.arange(len(store))
-    starts = torch.cat((held, others[~torch.isin(others, held)]))[: cfg["evaluate"]["imagined"]]
+    others, wanted = torch.arange(len(store)), cfg["evaluate"]["imagined"]
+    chosen = evenly(cfg, store, held, wanted)
+    more = evenly(cfg, store, others[~torch.isin(others, held)], wanted - len(chosen))
+    starts = torch.cat((chosen, more))
     world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(starts)), starts)
     tasks, scenes = (of(cfg, store, starts) for of in (tasks_of_episodes, scenes_of_episodes))
     out: dict[str, Any] = {}

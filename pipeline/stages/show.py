@@ -24,6 +24,7 @@ from envs.physics.suite import task_names
 from envs.rng import Purpose, episode_seeds
 from envs.simulators.base import Simulator
 from envs.simulators.replay import replay
+from pipeline.evaluation.by_task import evenly
 from pipeline.evaluation.disagreement import compared, curves, worst
 from pipeline.evaluation.judging import judge_both
 from pipeline.evaluation.media import paired_frames, paired_video, write_gif
@@ -129,14 +130,14 @@ def videos(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 @priced
 def replays(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Paired videos without physics: recordings, held-out ones if there are any, and their actions in the
-    simulator; first those in which imagination and truth disagreed most.
+    simulator, shared out over tasks; first those in which imagination and truth disagreed most.
     """
     prepare_process(cfg["seed"], cfg["threads"])
     studio, store = Studio.of(cfg, folder, inputs), open_store(cfg, inputs)
     held = store.split("held_out")
     label, episodes = ("held-out", held) if len(held) else ("learned-from", torch.arange(len(store)))
     made = list(studio.worst(inputs, store))
-    made += studio.paired(store, episodes[: cfg["measure"]["videos"]], label)
+    made += studio.paired(store, evenly(cfg, store, episodes, cfg["measure"]["videos"]), label)
     return studio.keep(made)
 
 
