@@ -16,11 +16,10 @@ from envs.episodes.clips import ClipStore
 from envs.episodes.splits import write_splits
 from envs.manifest import DamagedArtefact, write_manifest
 from envs.rng import Purpose, episode_seeds
-from envs.targets import ConfigError
 from pipeline.config import load_config
 from pipeline.evaluation.by_task import evenly, tasks_of_seeds
 from pipeline.graph.stage import Inputs
-from pipeline.stages.collect import collect, fingerprint, scripted_jobs, split_counts
+from pipeline.stages.collect import collect, scripted_jobs, split_counts
 from pipeline.stages.given import demonstrations
 from tests.embodiments import ARM_DELTAS
 from tests.moving_square import moving_square
@@ -143,13 +142,3 @@ def test_recordings_that_stand_task_by_task_are_shared_out_evenly(tmp_path: Path
         assert demonstrations(*told(order)).tolist() == list(range(7))
     physics = {**cfg, "task": {**cfg["task"], "suite": {"_target_": "any"}}}
     assert demonstrations(physics, store).tolist() == list(range(7))
-
-
-def test_recordings_have_a_fingerprint(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"info\.json is missing"):
-        fingerprint([str(tmp_path)])
-    (tmp_path / "meta").mkdir()
-    (tmp_path / "meta/info.json").write_text("1")
-    first = fingerprint([str(tmp_path)])
-    (tmp_path / "meta/info.json").write_text("2")
-    assert fingerprint([str(tmp_path)]) != first
