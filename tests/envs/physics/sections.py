@@ -48,10 +48,17 @@ class Counting(TaskSuite):
         fault: "raise", or "exit" to end the process, or "" for none.
         at_start: the same, when the suite is made.
         tasks: its names.
+        shows: (height, width) of what it renders, whatever its camera says.
     """
 
-    def __init__(self, fault: str, at_start: str = "", tasks: tuple[str, ...] = ("count",)):
-        self.fault, self.tasks = fault, tasks
+    def __init__(
+        self,
+        fault: str,
+        at_start: str = "",
+        tasks: tuple[str, ...] = ("count",),
+        shows: tuple[int, int] = (4, 4),
+    ):
+        self.fault, self.tasks, self.shows = fault, tasks, shows
         self.embodiment = Embodiment(
             "counter", ("a",), ActionKind.OTHER, False, (), ("n",), (Camera("eye", (4, 4)),), 10.0
         )
@@ -66,7 +73,7 @@ class Counting(TaskSuite):
         self.count += 1
 
     def render(self) -> Any:
-        return np.full((1, 3, 4, 4), int(self.count) % 256, np.uint8)
+        return np.full((1, 3, *self.shows), int(self.count) % 256, np.uint8)
 
     def observe(self) -> Observation:
         return Observation(np.array([self.count]), np.zeros(1), self.task, False, 0.0)
