@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from envs.embodiment import PYTHON
+from envs.episodes.formats.lerobot_info import INFO_KEY
 from envs.manifest import digest_of, hashes, mark_of
 from envs.targets import ConfigError, target
 from pipeline.graph.code_version import code_of, digest
@@ -35,7 +37,8 @@ _END = 1 << 16  # bytes at either end of a video
 
 
 def fingerprint(paths: list[str], key: str = "task.data") -> str:
-    """Changes when recorded data sets do: a hash of their tables, and of each video's size and ends.
+    """Changes when recorded data sets do: a hash of their tables, of each video's size and ends, and of the
+    robot's file that they name.
 
     Args:
         key: of the config, that names them.
@@ -53,6 +56,7 @@ def fingerprint(paths: list[str], key: str = "task.data") -> str:
             )
         root = Path(path).resolve()
         marks.append({one.relative_to(root).as_posix(): _part(one, _stat(one)) for one in _recorded(root)})
+        marks.append({"kinematics": _described(info)})
     return digest(marks)
 
 
@@ -101,6 +105,16 @@ def _file(path: Path, stat: tuple[int, int]) -> str:
 @functools.cache
 def _folder(path: Path, stats: tuple[tuple[int, int], ...]) -> str:
     return digest(hashes(path))
+
+
+def _described(info: Path) -> str:
+    """A mark of the file by which a data set describes its robot, "" if it names none."""
+    try:
+        about = json.loads(info.read_text())["features"]["action"]["info"][INFO_KEY]["kinematics"]
+        model = str(about["model"])
+    except (ValueError, KeyError, TypeError):  # what cannot be understood is told by who reads the data
+        return ""
+    return "" if model.startswith(PYTHON) else _named(model)  # data name no code
 
 
 def _recorded(folder: Path) -> Iterator[Path]:

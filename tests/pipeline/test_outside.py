@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Callable
@@ -81,6 +82,18 @@ def test_of_large_tables_with_pictures_the_numbers_are_read(
     (path,) = (tmp_path / "set/data").rglob("*.parquet")
     path.write_bytes(b"no table")
     assert fingerprint([str(tmp_path / "set")]) != before  # who reads it says that it is damaged
+
+
+def test_the_robots_file_that_recordings_name_is_read(tmp_path: Path) -> None:
+    write_set(tmp_path / "set", SETS["labelled"])
+    info, urdf, found = tmp_path / "set/meta/info.json", tmp_path / "robot.urdf", []
+    about = json.loads(info.read_text())
+    about["features"]["action"]["info"] = {"worldloop": {"kinematics": {"model": str(urdf)}}}
+    info.write_text(json.dumps(about))
+    for content in ("short", "longer"):
+        urdf.write_text(content)
+        found.append(fingerprint([str(tmp_path / "set")]))
+    assert found[0] != found[1]
 
 
 def test_what_is_no_data_set_is_told_by_the_key(tmp_path: Path) -> None:
