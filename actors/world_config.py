@@ -10,7 +10,7 @@ from typing import Any
 
 from envs.conditioning import PoseMapStyle
 from envs.embodiment import Embodiment, EmbodimentError, Robot
-from envs.episodes.formats.lerobot_info import from_info
+from envs.episodes.formats.lerobot_robot import agreed_robot, alike_calibrated
 from envs.geometry.kinematics import Kinematics, KinematicsError
 from envs.physics.suite import SuiteError, build_suite, check_task, task_names
 from envs.specs import Rewards, WorldSpec
@@ -38,6 +38,7 @@ def embodiment_of(cfg: Mapping[str, Any]) -> Embodiment:
     for folder, other in robots[1:]:
         if difference := robot.differs(other):
             raise ConfigError(f"task.data: {first} and {folder} are of different robots: {difference}")
+        robot = alike_calibrated(robot, other)
     return robot
 
 
@@ -115,7 +116,7 @@ def _recorded_robot(folder: Path) -> Embodiment:
     if not path.is_file():
         raise ConfigError(f"task.data: {path} does not exist; name folders of LeRobot v3.0 data sets")
     try:
-        return from_info(json.loads(path.read_text()))
+        return agreed_robot(json.loads(path.read_text()))
     except (EmbodimentError, KeyError, ValueError) as error:
         raise ConfigError(f"task.data: {path}: {error}") from error
 

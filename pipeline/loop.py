@@ -13,11 +13,11 @@ from typing import Any, TypeVar
 
 from envs.episodes.formats.lerobot_columns import SUCCESS
 from envs.episodes.formats.lerobot_files import read_info
-from envs.manifest import digest_of
 from envs.targets import ConfigError, target
 from pipeline.acting import acting
 from pipeline.graph.graph import Graph
 from pipeline.graph.workers import learners_of
+from pipeline.outside import CHECKPOINT, KINEMATICS, STATE_CHECKPOINT, files_at, fingerprint, judge_files
 from pipeline.stages import collect, imitation, keep, pace, prove, rl, show, world
 
 Cfg = Mapping[str, Any]
@@ -114,7 +114,7 @@ def imagined_iterations(cfg: Cfg) -> int:
 
 def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
     data: list[str] = [graph.add("collect", collect.collect)]
-    first = policy = best = graph.add("imitation", imitation.imitation, {"data": data})
+    first = policy = best = add_imitation(graph, cfg, data)
     starts = _extra_starts(graph, cfg) if with_rl else []
     made, known = World(), ""
     for number in range(1, last_round(cfg) + 1):
@@ -163,19 +163,25 @@ def _extra_starts(graph: Graph, cfg: Cfg) -> list[str]:
         for variant in section["variants"]
     ]
     if section["data"]:
-        mark = collect.fingerprint(section["data"], "extra_starts.data")
+        mark = fingerprint(section["data"], "extra_starts.data")
         out.append(graph.add("starts-recorded", collect.recorded_starts, fingerprint=mark))
     return out
 
 
 def _data_loop(graph: Graph, cfg: Cfg) -> None:
-    mark = collect.fingerprint(cfg["task"]["data"])
+    mark = fingerprint(cfg["task"]["data"])
     data = [graph.add("recordings", collect.recordings, fingerprint=mark)]
-    first = graph.add("imitation", imitation.imitation, {"data": data})
+    first = add_imitation(graph, cfg, data)
     made = add_world(graph, cfg, data, World(), 1)
+    graph.add("film", show.film, {"data": data, "simulator": made.simulator})
     starts = _extra_starts(graph, cfg)
     policy = _learn(graph, cfg, data, made, first, 1, starts, deployed=0)
     _conclude(graph, data, made, first, policy, {})
+
+
+def add_imitation(graph: Graph, cfg: Cfg, data: list[str]) -> str:
+    """The stage that clones the first policy."""
+    return graph.add("imitation", imitation.imitation, {"data": data}, **files_at(cfg, KINEMATICS))
 
 
 def add_world(graph: Graph, cfg: Cfg, data: list[str], before: World, number: int) -> World:
@@ -185,36 +191,29 @@ def add_world(graph: Graph, cfg: Cfg, data: list[str], before: World, number: in
     speeds = before.pace
     if cfg["equal_time"]["seconds"] and not speeds:
         speeds = learning.add("pace", pace.pace, {"data": data})
+    released = files_at(cfg, CHECKPOINT, KINEMATICS)
     time = {part: pace.seconds_of(cfg, part, phase) for part in ("tokenizer", "simulator", "state")}
     if not warm and "codec" in cfg["simulator"]:
         roles = {"data": data, "pace": speeds}
-        warm = learning.add("tokenizer", world.tokenizer, roles, **time["tokenizer"])
+        warm = learning.add("tokenizer", world.tokenizer, roles, **time["tokenizer"], **released)
     roles = {"data": data, "warm": warm, "pace": speeds}
     simulator = teacher = learning.add(
-        f"simulator-{number}", world.simulator, roles, phase=phase, **time["simulator"]
+        f"simulator-{number}", world.simulator, roles, phase=phase, **time["simulator"], **released
     )
     if cfg["distill"]["steps"]:
         roles = {"data": data, "simulator": teacher, "warm": before.simulator}
         simulator = learning.add(f"student-{number}", world.student, roles, phase=phase)
     inputs = {"data": data, "simulator": simulator}
     roles = {**inputs, "warm": before.state, "pace": speeds}
-    state = graph.add(f"state-{number}", world.state, roles, phase=phase, **time["state"])
+    files = files_at(cfg, STATE_CHECKPOINT)
+    state = graph.add(f"state-{number}", world.state, roles, phase=phase, **time["state"], **files)
     golden = ""
     if "text_world" in cfg["judge"]:
         roles = {"data": data, "warm": before.text_world}
         golden = graph.add(f"text_world-{number}", world.text_world, roles, phase=phase)
     roles = {**inputs, "warm": before.judge, "text_world": golden}
-    judge = graph.add(f"judge-{number}", world.judge, roles, phase=phase, **_judge_files(cfg))
+    judge = graph.add(f"judge-{number}", world.judge, roles, phase=phase, **judge_files(cfg))
     return World(teacher, simulator, state, judge, golden, speeds)
-
-
-def _judge_files(cfg: Cfg) -> dict[str, Any]:
-    """A setting with the hashes of files that decide what the judge says, if there are any: when one changes,
-    what it judged is out of date.
-    """
-    kind: Any = target(cfg["judge"], "judge")
-    found = {path.name: digest_of(path) for path in kind.files(cfg["judge"])}
-    return {"files": found} if found else {}
 
 
 def _learn(

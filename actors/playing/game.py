@@ -13,7 +13,7 @@ from actors.playing.controls import Controls
 from actors.playing.imagination import Imagined, ImaginedSide
 from envs.embodiment import Embodiment
 from envs.initial_states import InitialStates
-from envs.physics.suite import Array, Observation, TaskSuite, check_task, task_of
+from envs.physics.suite import Array, Observation, TaskSuite, check_task
 from envs.rng import Stream, episode_rng
 
 Starts = Callable[[Observation, NDArray[np.uint8]], InitialStates]
@@ -30,11 +30,12 @@ class Recorded:
 
     Args:
         title: for people.
-        seed: of the episode; physics lays the same one out.
+        task, seed: of the episode; physics lays the same one out.
         actions: float [T, A], without the command in force at the start.
     """
 
     title: str
+    task: str
     seed: int
     actions: NDArray[Any]
 
@@ -139,7 +140,7 @@ class Game:
             if not 0 <= number < len(self.recorded):
                 raise Unplayable(f"recording {number} is not one of {len(self.recorded)}")
             played = self.recorded[number]
-            shown = self.reset(played.seed, task_of(self.tasks, played.seed))
+            shown = self.reset(played.seed, played.task)
             left: Iterator[Array] = iter(played.actions)
             self._driver = lambda: next(left, None)
         else:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import logging
 import os
 import shutil
 from dataclasses import dataclass, replace
@@ -26,12 +27,14 @@ from torch import Tensor
 from envs.conditioning import PoseMapStyle, end_effector_poses, render_pose_map
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.formats.lerobot import LeRobotDataset
+from envs.episodes.formats.lerobot_robot import cameras_without_columns
 from envs.files import new_neighbour, put
 from envs.geometry.cameras import follow_wrists
 from envs.geometry.kinematics import Kinematics
 from envs.manifest import check_part
 from envs.specs import WorldSpec
 
+log = logging.getLogger(__name__)
 _FORM = "5"  # changes when what a cache holds does
 
 
@@ -172,6 +175,12 @@ class _Builder:
     def __init__(self, folder: Path, spec: WorldSpec, style: PoseMapStyle):
         self.spec, self.style = spec, style
         self.data = LeRobotDataset(folder, spec.size, embodiment=spec.embodiment)
+        if lost := cameras_without_columns(self.data.info):
+            log.warning(
+                "%s lacks calibration.c2w or calibration.intrinsic, though its info.json says that cameras %s"
+                " are calibrated; it is read without",
+                *(folder, lost),
+            )
         robot = spec.embodiment.kinematics
         self.kinematics = Kinematics(robot) if robot is not None and spec.embodiment.calibrated else None
         if spec.embodiment.calibrated and not self.data.embodiment.calibrated:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from envs.physics.process import PoolError, WorkerProcess
 from envs.physics.suite import task_names
-from envs.physics.worker import Track, Worker, WorkerSpec
-from envs.targets import to_plain
+from envs.physics.worker import Track, WorkerSpec
+from envs.targets import ConfigError, to_plain
 
 LOST = 0.05  # share of the episodes of a pool that may be given up before it stops
 
@@ -39,7 +39,7 @@ class TaskPool:
         task: a name of its tasks, or several, which are played by turns; see task_of.
         slots: how many episodes run side by side.
         horizon: actions after which an episode is over.
-        workers: processes; 0 means one per core, 1 runs in this process.
+        workers: processes; 0 means one per core.
 
     Raises:
         ConfigError: if there is no such suite or task.
@@ -55,18 +55,22 @@ class TaskPool:
         self.owner = [slot % count for slot in range(slots)]
         self.local = [slot // count for slot in range(slots)]
         self._begun = 0
-        self._inline = Worker(spec, slots) if count == 1 else None
         self._remotes: list[WorkerProcess] = []
-        if count > 1:
-            self._remotes = [WorkerProcess(k, spec, self.owner.count(k)) for k in range(count)]
-            for remote in self._remotes:
-                remote.send("modules")
+        try:
+            for k in range(count):
+                self._remotes.append(WorkerProcess(k, spec, self.owner.count(k), self._check_losses))
+                self._remotes[k].send("modules")
             for remote in self._remotes:
                 remote.answer()
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def lost(self) -> list[int]:
-        """Seeds of the episodes that were given up, because physics crashed in them again and again."""
+        """Seeds of the episodes that were given up: physics crashed, or the suite raised an error, in them
+        again and again.
+        """
         return [seed for remote in self._remotes for seed in remote.lost]
 
     def reset(self, seeds: dict[int, int], record: bool) -> dict[int, dict[str, Any]]:
@@ -109,8 +113,6 @@ class TaskPool:
 
     def _deal(self, name: str, jobs: list[Any], *extra: Any) -> list[Any]:
         """What a method of Worker that takes a list of jobs gives, each job by whoever is free."""
-        if self._inline is not None:
-            return list(getattr(self._inline, name)(jobs, *extra))
         waiting = deque(enumerate(jobs))
         busy: dict[Connection, tuple[WorkerProcess, int]] = {}
         made: dict[int, Any] = {}
@@ -127,9 +129,8 @@ class TaskPool:
             for pipe in wait(list(busy)):
                 assert isinstance(pipe, Connection)
                 remote, number = busy.pop(pipe)
-                for one in remote.answer():
+                for one in self._answer(remote, [other for other, _ in busy.values()]):
                     made[number] = one
-                self._check_losses()
                 give(remote)
         return [made[number] for number in sorted(made)]
 
@@ -142,42 +143,51 @@ class TaskPool:
         return self._ask("modules")
 
     def processes(self) -> list[int]:
-        """Ids of the worker processes; none if the work is done in this one."""
+        """Ids of the worker processes."""
         return [remote.process.pid for remote in self._remotes]
 
     def close(self) -> None:
         """End the workers."""
         for remote in self._remotes:
             remote.close(5.0)
-        self._remotes, self._inline = [], None
+        self._remotes = []
 
     def _ask(self, name: str, *arguments: Any) -> Any:
-        if self._inline is not None:
-            return getattr(self._inline, name)(*arguments)
         self._remotes[0].send(name, *arguments)
         return self._remotes[0].answer()
 
     def _scatter(self, name: str, work: dict[int, Any], *extra: Any) -> dict[int, Any]:
-        if self._inline is not None:
-            return getattr(self._inline, name)(work, *extra)
         shares: dict[int, dict[int, Any]] = {}
         for slot, item in work.items():
             shares.setdefault(self.owner[slot], {})[self.local[slot]] = item
         for index, share in shares.items():
             self._remotes[index].send(name, share, *extra)
-        count = len(self._remotes)
+        count, asked = len(self._remotes), list(shares)
         out = {}
-        for index in shares:
-            for local, value in self._remotes[index].answer().items():
+        for number, index in enumerate(asked):
+            others = [self._remotes[other] for other in asked[number + 1 :]]
+            for local, value in self._answer(self._remotes[index], others).items():
                 out[local * count + index] = value
-        self._check_losses()
         return out
 
-    def _check_losses(self) -> None:
+    def _answer(self, remote: WorkerProcess, others: list[WorkerProcess]) -> Any:
+        """What one of them says; if that is an error, `others` that are still at work are not heard out."""
+        try:
+            return remote.answer()
+        except (PoolError, ConfigError):
+            for other in others:
+                other.give_up()
+            raise
+
+    def _check_losses(self, trouble: str) -> None:
+        """Stop where too many episodes are lost, the last one to `trouble`.
+
+        Raises:
+            PoolError: with their seeds.
+        """
         lost = self.lost
         if len(lost) > LOST * max(self._begun, round(1 / LOST)):
             raise PoolError(
                 f"physics crashed again and again in {len(lost)} of {self._begun} episodes (seeds"
-                f" {lost[:4]}), more than a share of {LOST}: out of memory, a broken GL driver, or a suite"
-                " that crashes"
+                f" {lost[:4]}), more than a share of {LOST}; the last time it {trouble}"
             )

@@ -1,7 +1,8 @@
 """One process that holds task suites, and what it takes to replace it by another that stands where it stood.
 
 A process that dies takes its episodes with it. They run again, one at a time, bit for bit as before; so an
-episode in which physics crashes again and again is found and given up, and the others go on.
+episode in which physics crashes again and again is found and given up, and the others go on. A suite that
+raises an error stands wherever that left it: its process is replaced as well.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import logging
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing import Pipe
 from typing import Any
@@ -26,11 +28,13 @@ Request = tuple[str, tuple[Any, ...]]  # a method of Worker and its arguments
 
 
 class PoolError(RuntimeError):
-    """A physics worker failed; the message holds its own traceback."""
+    """Physics failed; if it was an error of the suite, the message holds its traceback."""
 
 
 class _Died(Exception):
-    """The process at the other end of a pipe is gone."""
+    """The process at the other end of a pipe is gone, or its suite raised an error, whose traceback this
+    holds.
+    """
 
 
 @dataclass
@@ -49,13 +53,15 @@ class WorkerProcess:
         index: of the worker, for messages.
         spec: of suite and task.
         slots: episodes side by side.
+        on_loss: told of every episode that is given up, and what of; it may raise a PoolError.
 
     Attributes:
         lost: seeds of the episodes that were given up.
     """
 
-    def __init__(self, index: int, spec: WorkerSpec, slots: int):
-        self.index, self.spec, self.slots = index, spec, slots
+    def __init__(self, index: int, spec: WorkerSpec, slots: int, on_loss: Callable[[str], None]):
+        self.index, self.spec, self.slots, self._on_loss = index, spec, slots, on_loss
+        self._trouble = ""  # what the last process that was replaced did
         self._episodes: dict[int, _Episode] = {}
         self._request: Request | None = None
         self.lost: list[int] = []
@@ -68,17 +74,17 @@ class WorkerProcess:
             self._write(self._request)
 
     def answer(self) -> Any:
-        """What the last request gave. A process that died is replaced and asked again, episode by episode; of
-        one in which its successors die as well there is no answer, and its seed joins `lost`.
+        """What the last request gave. A process that died or failed is replaced and asked again, episode by
+        episode; of one in which its successors do as well there is no answer, and its seed joins `lost`.
 
         Raises:
-            PoolError: if the method failed, or if processes die before they come to an episode.
+            PoolError: if too many are lost, or if processes die before they come to an episode.
         """
         assert self._request is not None
         try:
             return self._attempt()
-        except _Died:
-            self._replace()
+        except _Died as died:
+            self._replace(died)
         name, (work, *extra) = self._request[0], self._request[1] or (None,)
         if name == "script":
             said = [self._insist((name, ([job], *extra)), job[0]) for job in work]
@@ -96,18 +102,16 @@ class WorkerProcess:
         for _ in range(RETRIES):
             try:
                 return self._attempt()
-            except _Died:
+            except _Died as died:
                 reached = not self._fresh
-                code = self._replace()
+                self._replace(died)
         if not reached or seed is None:
-            raise PoolError(
-                f"physics worker {self.index} died {1 + RETRIES} times in a row (exit code {code}); out of"
-                " memory, a broken GL driver, or a suite that crashes"
-            )
-        log.warning("physics crashed %d times in the episode of seed %d; it is dropped", 1 + RETRIES, seed)
+            raise PoolError(f"{1 + RETRIES} times in a row physics worker {self.index} {self._trouble}")
+        log.warning("physics failed %d times in the episode of seed %d; it is dropped", 1 + RETRIES, seed)
         self.lost.append(seed)
         if slot is not None:
             self._episodes.pop(slot, None)
+        self._on_loss(self._trouble)
         return None
 
     def _attempt(self) -> Any:
@@ -117,12 +121,24 @@ class WorkerProcess:
         self._remember()
         return value
 
-    def _replace(self) -> int | None:
-        """Another process in place of one that died, whose exit code is returned."""
-        code = self.close(0.0)
-        log.warning("physics worker %d died (exit code %s); its episodes run again", self.index, code)
+    def _replace(self, died: _Died) -> None:
+        """Another process in place of one that died or failed; says why, at length the first time."""
+        code, before = self.close(0.0), self._trouble
+        self._trouble = (
+            f"raised an error:\n{died}"
+            if str(died)
+            else f"died (exit code {code}): out of memory, a broken GL driver, or a suite that crashes"
+        )
+        what = "did the same again" if self._trouble == before else self._trouble
+        log.warning("its episodes run again, for physics worker %d %s", self.index, what)
         self._start()
-        return code
+
+    def give_up(self) -> None:
+        """Let the last request be: its answer would be taken for that to the next one. Another process will
+        stand where this one stood before.
+        """
+        self.close(0.0)
+        self._start()
 
     def close(self, patience: float) -> int | None:
         """End the process, by force after `patience` seconds; returns its exit code."""
@@ -180,6 +196,8 @@ class WorkerProcess:
             raise _Died from error
         if status == "config":
             raise ConfigError(value)
+        if status == "broken":
+            raise PoolError(f"physics worker {self.index} cannot start:\n{value}")
         if status == "error":
-            raise PoolError(f"physics worker {self.index} failed:\n{value}")
+            raise _Died(value)
         return value

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.suite import Array, Observation, TaskSuite, build_suite, check_task, task_of
+from envs.physics.suite import Array, Observation, SuiteError, TaskSuite, build_suite, check_task, task_of
 from envs.rng import Stream, episode_rng
 from envs.targets import ConfigError
 
@@ -44,7 +44,7 @@ class Track:
     def add(self, suite: TaskSuite, observed: Observation) -> None:
         """Append things as they stand now."""
         row = {
-            "frames": suite.render(),
+            "frames": rendered(suite),
             "commands": observed.command,
             "states": observed.state,
             "success": observed.success,
@@ -63,6 +63,22 @@ class Track:
     def stack(self) -> dict[str, Array]:
         """`rows` as arrays [T, ...]."""
         return {name: np.stack(values) for name, values in self.rows.items()}
+
+
+def rendered(suite: TaskSuite) -> NDArray[np.uint8]:
+    """The suite's pictures as its embodiment announces them; all that is learned is built for those.
+
+    Raises:
+        SuiteError: if they are not.
+    """
+    shown, cameras = np.asarray(suite.render()), suite.embodiment.cameras
+    due = (len(cameras), 3, *cameras[0].size)
+    if shown.shape != due or shown.dtype != np.uint8:
+        raise SuiteError(
+            f"task.suite: {type(suite).__name__}.render gives {shown.dtype} {list(shown.shape)}, but its"
+            f" embodiment's cameras make it uint8 {list(due)} (views, 3, height, width); correct either"
+        )
+    return shown
 
 
 @dataclass(frozen=True)
@@ -91,7 +107,7 @@ class Slot:
 
 
 class Worker:
-    """The work of one process; it runs in the caller's process where a pool has one worker.
+    """The work of one process.
 
     Args:
         spec: of the suite and its tasks.
@@ -172,11 +188,11 @@ class Worker:
         suite = self.slots[0].suite
         for seed, commands in jobs:
             self._lay_out(suite, seed)
-            labels, pictures = [suite.segment()], [suite.render()]
+            labels, pictures = [suite.segment()], [rendered(suite)]
             for command in commands[1:]:
                 suite.step(command)
                 labels.append(suite.segment())
-            pictures.append(suite.render())
+            pictures.append(rendered(suite))
             known = [one for one in labels if one is not None]
             out.append((np.stack(known) if len(known) == len(labels) else None, np.stack(pictures)))
         return out
@@ -196,7 +212,7 @@ class Worker:
 
     def _answer(self, slot: Slot, observed: Observation) -> dict[str, Any]:
         answer = {
-            "image": slot.suite.render() if slot.track is None else slot.track.rows["frames"][-1],
+            "image": rendered(slot.suite) if slot.track is None else slot.track.rows["frames"][-1],
             "state": observed.state,
             "command": observed.command,
             "success": observed.success,
@@ -220,13 +236,15 @@ def serve(pipe: Connection) -> None:
             pipe.send(("config", str(error)))
             return
         except Exception:
-            pipe.send(("error", traceback.format_exc()))
+            pipe.send(("broken", traceback.format_exc()))
             return
         pipe.send(("ok", None))
         while (message := pipe.recv()) is not None:
             name, arguments = message
             try:
                 answer = ("ok", getattr(worker, name)(*arguments))
+            except ConfigError as error:
+                answer = ("config", str(error))
             except Exception:
                 answer = ("error", traceback.format_exc())
             pipe.send(answer)

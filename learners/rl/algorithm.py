@@ -112,7 +112,9 @@ class Algorithm(Protocol):
     group_size: int
 
     def seeds(self, starts: int, envs: int, generator: torch.Generator) -> list[int]:
-        """Episode seeds of one iteration, more than `envs` where early endings should be refilled."""
+        """Where the episodes of one iteration begin, as numbers of `starts` starts (Starts.seeds makes seeds
+        of them); more than `envs` where early endings should be refilled.
+        """
         ...
 
     def prepare(self, batch: TensorDict) -> tuple[TensorDict, dict[str, float]]:

@@ -21,7 +21,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from actors.policies.contract import action_key, distribution, input_keys, trained_part, with_text
 from envs.ranges import Count, NonNegative, Positive
-from envs.specs import EPISODE, LOG_PROB, WorldSpec
+from envs.specs import LOG_PROB, WorldSpec
 from envs.targets import options
 from learners.rl.algorithm import first_episode, sound, transitions
 
@@ -76,7 +76,7 @@ class GRPO:
             functional=False,
         )
         self.objective.set_keys(action=action_key(self.policy), sample_log_prob=LOG_PROB)
-        self.starts, self.group_size = 1, config.group
+        self.group_size = config.group
 
     def modules(self) -> nn.Module:
         """The policy."""
@@ -87,17 +87,15 @@ class GRPO:
         return [{"params": list(self.policy.parameters()), "lr": lr}]
 
     def seeds(self, starts: int, envs: int, generator: torch.Generator) -> list[int]:
-        """Groups of equal starts; the members' seeds differ by multiples of the number of starts (see
-        WorldEnv).
+        """Groups of equal starts.
 
         Raises:
             ValueError: if rl.envs is not a multiple of algorithm.group.
         """
         if envs % self.config.group:
             raise ValueError(f"rl.envs={envs} must be a multiple of algorithm.group={self.config.group}")
-        self.starts = starts
         order = torch.randint(starts, (envs // self.config.group,), generator=generator)
-        return [int(start) + starts * member for start in order for member in range(self.config.group)]
+        return order.repeat_interleave(self.config.group).tolist()
 
     def prepare(self, batch: TensorDict) -> tuple[TensorDict, dict[str, float]]:
         """Group-relative advantages of the first episode of every slot; what a slot does after that belongs
@@ -125,10 +123,6 @@ class GRPO:
             keep = mine
         keys = dict.fromkeys([*input_keys(self.policy), action_key(self.policy)])
         data = transitions(batch, keep, keys, advantage=advantage.flatten(0, 1).unsqueeze(-1))
-        same = batch[EPISODE][:, 0, 0] % self.starts
-        assert bool((same.unflatten(0, (-1, size)) == same.unflatten(0, (-1, size))[:, :1]).all()), (
-            "a group holds different starts"
-        )
         return data, {
             "groups_dropped": float(alike.float().mean()),
             "advantage_std": float(data["advantage"].std()),

@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -32,6 +31,7 @@ from learners.rl.alarms import Alarms
 from learners.rl.algorithm import Algorithm, RLConfig
 from learners.rl.feed import AsyncFeed, Feed
 from learners.rl.recorded import TrueExperience
+from learners.rl.starts import Starts
 from learners.rl.update import update
 from learners.rl.watch import Watch
 from learners.training.checkpoint import Checkpoints, adam_moments, buffers_of, truncate_log
@@ -45,7 +45,7 @@ def train_rl(
     algorithm: Algorithm,
     config: RLConfig,
     folder: Path,
-    starts: int | Sequence[int],
+    starts: Starts,
     name: str = "rl",
     true: TrueExperience | None = None,
     watch: Watch | None = None,
@@ -55,8 +55,7 @@ def train_rl(
     Args:
         fleet: hosts of config.envs / config.shards episodes each; the policy's trained tensors are published
             to it. Of several workers only the leading one has one.
-        starts: number of start frames in imagination, or their numbers, some more often than others; in
-            physics, the seeds that may be used.
+        starts: where episodes may begin.
         folder: receives checkpoints, metrics.jsonl and learned.jsonl, the jobs that were learned from; a
             checkpoint found there is resumed.
         true: what RLConfig.recorded and RLConfig.anchor speak of.
@@ -102,9 +101,8 @@ def train_rl(
         truncate_log(learned, first)
 
     def seeds(iteration: int) -> list[int]:
-        pool = range(starts) if isinstance(starts, int) else starts
-        drawn = algorithm.seeds(len(pool), config.envs, iteration_generator(config.seed, iteration))
-        return [pool[s % len(pool)] for s in drawn]
+        generator = iteration_generator(config.seed, iteration)
+        return starts.seeds(algorithm.seeds(len(starts.pool), config.envs, generator), iteration)
 
     def sampling(iteration: int, shard: int) -> int:
         return sampling_seed(config.seed, iteration, shard)
@@ -152,6 +150,7 @@ def train_rl(
                 group["lr"] = lr * (1 - iteration / config.iterations)
             batch, supply = from_leader(partial(gather, iteration, trainee(trained_weights, policy)))
             collected = time.perf_counter()
+            starts.check_groups(batch, algorithm.group_size)
             seed = update_seed(config.seed, iteration)
             figures = update(batch, algorithm, trainee, optimiser, config, seed, true)
             updated = time.perf_counter()

@@ -20,6 +20,7 @@ from envs.targets import options
 from learners.rl.algorithm import RLConfig
 from learners.rl.grpo import GRPO
 from learners.rl.loop import train_rl
+from learners.rl.starts import Starts
 from learners.rl.watch import Watch
 from pipeline.config import load_config
 
@@ -84,7 +85,7 @@ def learn(seed: int, limit: int, folder: Path, envs: int = 256) -> tuple[float, 
             GRPO(policy, unseen.spec, **_GRPO),
             config,
             folder,
-            starts=4096,
+            Starts(range(4096)),
             name=f"learning {seed}",
             watch=Watch(1, reached),
         )

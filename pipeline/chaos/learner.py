@@ -21,6 +21,7 @@ from actors.fleets.ray_fleet import RayFleet
 from actors.policies.contract import freeze_perception
 from actors.process import prepare_process
 from learners.rl.loop import train_rl
+from learners.rl.starts import Starts
 from pipeline.commands.demo_world import demo_recipe
 from pipeline.config import load_config
 from pipeline.stages.given import rl_options
@@ -72,7 +73,7 @@ def main() -> None:
         target=plague, args=(fleet, section, 1000 * cfg["seed"] + life, folder / "events.jsonl"), daemon=True
     ).start()
     try:
-        train_rl(fleet, policy, build_algorithm(cfg, policy), settings, folder, starts=16)
+        train_rl(fleet, policy, build_algorithm(cfg, policy), settings, folder, Starts(range(16)))
     finally:
         fleet.close()
         ray.shutdown()

@@ -38,7 +38,7 @@ _WRITES = {"SIGKILL at a write": 2, "disk full": 3}  # at some write of a stage
 _WEIGHTS = {**_SIGNALS, **_WRITES, "corruption": 3}
 # Stages that a life passes before the one it shall be disturbed in; -1: before it comes to any.
 _AHEAD = {-1: 1, 0: 5, 1: 4, 2: 1}
-_ON_RAY, _WITH_WORKERS = 0.15, 0.25  # shares of lives on Ray, and with two physics workers instead of none
+_ON_RAY, _WITH_WORKERS = 0.15, 0.25  # shares of lives on Ray, and with two physics workers instead of one
 _WORKER_KILLED = 0.5  # share of lives that lose a worker, if they have any
 _CORES = 1  # of each life: training sums in another order on another number
 _BETWEEN = "between stages"

@@ -174,7 +174,8 @@ def finetune(words: Words) -> None:
     check_launch(cfg["launch"])
     with owning(root, "finetune"), tracking(cfg, root / "finetune") as tracker:
         graph.run(tracker=tracker)
-    print(f"weights in {' and '.join(str(graph.folder(name)) for name in graph.nodes)}")
+    made = [graph.folder(name) for name in graph.nodes]
+    print(f"weights in {' and '.join(str(one) for one in made if (one / 'weights.safetensors').exists())}")
 
 
 def _run_until(name: str, words: Words) -> Path:

@@ -14,13 +14,13 @@ from actors.world_config import check_state_expert
 from envs.targets import ConfigError
 from pipeline.acting import acting
 from pipeline.graph.graph import Graph
-from pipeline.stages import finetune
-from pipeline.stages.collect import fingerprint
+from pipeline.outside import CHECKPOINT, KINEMATICS, STATE_CHECKPOINT, WEIGHTS, files_at, fingerprint
+from pipeline.stages import finetune, show
 
 
 def build_finetune(cfg: Mapping[str, Any], root: Path) -> Graph:
     """The graph of the stages: the tokenizer of a simulator that has one to train and begins from nothing,
-    simulator, its student if distill.steps asks for one, and state.
+    simulator, its student if distill.steps asks for one, a video of it, and state.
 
     Raises:
         ConfigError: if finetune.data names no data sets, or the state expert cannot be their robot's.
@@ -34,13 +34,16 @@ def build_finetune(cfg: Mapping[str, Any], root: Path) -> Graph:
     # The robot is the one of the recordings, whatever bench the config knows.
     recorded = {**cfg, "task": {**cfg["task"], "suite": None, "data": data}}
     check_state_expert(recorded)
-    graph, mark = Graph(acting(recorded), root / "finetune"), fingerprint(data)
+    graph, mark = Graph(acting(recorded), root / "finetune"), fingerprint(data, "finetune.data")
+    released = files_at(cfg, CHECKPOINT, KINEMATICS, WEIGHTS)
     learning = graph.under(recorded)  # with the simulator as it is, not as it is acted in
     warm = ""
     if "codec" in cfg["simulator"] and not cfg["finetune"]["weights"]:
-        warm = learning.add("tokenizer", finetune.tokenizer, fingerprint=mark)
-    made = learning.add("simulator", finetune.simulator, {"warm": warm}, fingerprint=mark)
+        warm = learning.add("tokenizer", finetune.tokenizer, fingerprint=mark, **released)
+    made = learning.add("simulator", finetune.simulator, {"warm": warm}, fingerprint=mark, **released)
     if cfg["distill"]["steps"]:
         made = learning.add("student", finetune.student, {"simulator": made}, fingerprint=mark)
-    graph.add("state", finetune.state, {"simulator": made}, fingerprint=mark)
+    files = files_at(cfg, STATE_CHECKPOINT)
+    graph.add("film", show.film, {"simulator": made}, fingerprint=mark)
+    graph.add("state", finetune.state, {"simulator": made}, fingerprint=mark, **files)
     return graph

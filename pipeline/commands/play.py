@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from actors.world_config import build_kinematics, embodiment_of, pose_style, wor
 from envs.embodiment import Embodiment
 from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.initial_states import InitialStates
-from envs.physics.suite import Observation, build_suite, task_names
+from envs.physics.suite import Observation, build_suite, task_names, task_of
 from envs.targets import ConfigError
 from pipeline.acting import acting
 from pipeline.loop import build_loop, has_physics
@@ -50,7 +50,7 @@ def build_game(cfg: Cfg, world: Mapping[str, Path], actions: Path | None = None)
             " yet: first `worldloop run` with the same options, or choose a task with a suite"
         )
     names, robot = task_names(cfg["task"]["name"]), embodiment_of(cfg)
-    recorded = _recorded(actions, robot) if actions is not None else []
+    recorded = _recorded(actions, robot, names) if actions is not None else []
     if not has_physics(cfg):
         starts = InitialStates.of(open_clips(cfg, cfg["task"]["data"]))
         return Game(robot, names, None, _imagination(cfg, world, starts), None, recorded)
@@ -75,8 +75,8 @@ def _imagination(cfg: Cfg, world: Mapping[str, Path], starts: InitialStates) -> 
     return ImaginedSide(build_world(cfg, simulator, decoder, build_judge(cfg, world["judge"]), starts, 1))
 
 
-def _recorded(folder: Path, robot: Embodiment) -> list[Recorded]:
-    """The recorded actions of a data set, by episode."""
+def _recorded(folder: Path, robot: Embodiment, names: Sequence[str]) -> list[Recorded]:
+    """The recorded actions of a data set, by episode; `names` are the tasks that its run played by turns."""
     data = LeRobotDataset(folder)
     wanted, found = (
         (one.robot, one.action_names, one.action_kind, one.delta, one.fps) for one in (robot, data.embodiment)
@@ -87,5 +87,5 @@ def _recorded(folder: Path, robot: Embodiment) -> list[Recorded]:
     for number, episode in enumerate(data):
         outcome = {True: "success", False: "failure", None: ""}[episode.succeeded]
         title = f"{number}: seed {episode.seed} {episode.source} {outcome}".strip()
-        out.append(Recorded(title, episode.seed, episode.commands[1:]))
+        out.append(Recorded(title, task_of(names, episode.seed), episode.seed, episode.commands[1:]))
     return out

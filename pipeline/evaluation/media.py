@@ -14,6 +14,7 @@ from torch import Tensor
 
 from envs.episodes.clips import ClipStore
 from envs.episodes.video import write_video
+from envs.files import atomic
 from envs.simulators.replay import Replay
 
 _HEIGHT = 192  # pixels of a view in videos, about
@@ -54,8 +55,8 @@ def paired_video(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) ->
 
 
 def _video(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_video(path, frames, fps, crf=20, browser=True)
+    with atomic(path) as part:  # trackers send whatever mp4 they find
+        write_video(part, frames, fps, crf=20, browser=True)
 
 
 def _even(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -33,7 +33,6 @@ from envs.targets import ConfigError
 from pipeline.evaluation.by_task import by_task, tasks_of_episodes, tasks_of_seeds
 from pipeline.evaluation.media import film
 from pipeline.evaluation.statistics import rate_entry
-from pipeline.graph.code_version import digest
 from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.given import DATASETS, PHYSICS, ROBOT, Cfg
 
@@ -255,24 +254,3 @@ def recordings(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         "labelled": sum(label is not None for label in labels),
         "successes": sum(label is True for label in labels),
     }
-
-
-def fingerprint(paths: list[str], key: str = "task.data") -> str:
-    """Changes when recorded data sets do: a hash of their info.json.
-
-    Args:
-        key: of the config, that names them.
-
-    Raises:
-        ConfigError: for a folder that is no LeRobot v3.0 data set.
-    """
-    texts = []
-    for path in paths:
-        info = Path(path) / "meta" / "info.json"
-        if not info.is_file():
-            raise ConfigError(
-                f"{key}: {info} is missing; name folders of LeRobot v3.0 data sets (`worldloop convert`"
-                " makes them of other recordings)"
-            )
-        texts.append(info.read_text())
-    return digest(texts)

@@ -17,6 +17,7 @@ from envs.specs import ActionMode
 from envs.targets import ConfigError, options
 from learners.rl.algorithm import RLConfig
 from learners.training.fit import FitConfig
+from pipeline.evaluation.by_task import evenly
 from pipeline.graph.stage import Inputs
 
 Cfg = Mapping[str, Any]
@@ -88,7 +89,8 @@ def newest_episodes(store: ClipStore, episodes: Tensor) -> Tensor:
 
 
 def demonstrations(cfg: Cfg, store: ClipStore) -> Tensor:
-    """The episodes that the first policy is cloned from, int64 [N]: of imitation.sources, and not failed.
+    """The episodes that the first policy is cloned from, int64 [N]: of imitation.sources, not failed, and
+    shared out over tasks.
 
     Raises:
         ConfigError: if there are fewer than imitation.demos.
@@ -98,7 +100,7 @@ def demonstrations(cfg: Cfg, store: ClipStore) -> Tensor:
     mine = store.select(list(section["sources"]))
     mine = mine[torch.isin(mine, learnable)]
     good = [n for n in mine.tolist() if store.episodes[n]["success"] is not False]
-    chosen = torch.tensor(good[: section["demos"]], dtype=torch.int64)
+    chosen = evenly(cfg, store, torch.tensor(good, dtype=torch.int64), section["demos"])
     if len(chosen) < section["demos"]:
         sources = sorted({row["source"] for row in store.episodes})
         raise ConfigError(

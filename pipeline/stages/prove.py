@@ -21,12 +21,14 @@ from pipeline.evaluation import measurement
 from pipeline.evaluation.by_task import (
     by_scene,
     by_task,
+    evenly,
     scenes_of_episodes,
     tasks_of_episodes,
     tasks_of_seeds,
 )
 from pipeline.evaluation.disagreement import compared
 from pipeline.evaluation.judging import episode_success, judge_both, judge_frames, judge_table
+from pipeline.evaluation.media import film, paired_frames, paired_video
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import PHYSICS, WORLD, Cfg, load_world, open_store
@@ -40,7 +42,8 @@ _SIDE_BY_SIDE = 64  # imagined episodes
 @priced
 def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """How far imagination and truth lie apart for the policy just deployed: same starts, same stochastic
-    policy.
+    policy. Leaves a video of an imagined episode, and one of a held-out true one above which its actions are
+    imagined.
 
     Settings: number of the round.
     """
@@ -53,6 +56,7 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(mine)), mine)
     seeds = list(range(len(mine)))
     outcome = evaluate(world, policy, seeds, stochastic=True, label="gap", sampling_seed=cfg["seed"])
+    film(folder / "media/imagined.mp4", world.base_env.video(0).numpy(), store.fps)
     tasks, judge = tasks_of_episodes(cfg, store, mine), world.transform[-1].judge
     result = {
         "round": number,
@@ -64,6 +68,7 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     if len(held):
         made = replay(world.base_env.simulator, store, held, bf16=cfg["simulator"]["bf16"])
         scores = judge_frames(judge, made.frames, store, held, made.features)
+        paired_video(folder / "media/held-out.mp4", paired_frames(store, held, made, 0), store.fps)
         result["replayed"] = judge_table(judge, scores, made.valid, store, held)
     return {**result, "judged_by": judge.facts()}
 
@@ -115,19 +120,22 @@ def _true_success(cfg: Cfg, folder: Path, inputs: Inputs, changes: Mapping[str, 
 @priced
 def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Deterministic success in the last imagined world, of the policies in the roles before and after, from
-    the starts of held-out episodes first.
+    the starts of held-out episodes first, shared out over tasks; leaves a video of an episode of each.
     """
     prepare_process(cfg["seed"], cfg["threads"])
     store = open_store(cfg, inputs)
     held = store.split("held_out")
-    others = torch.arange(len(store))
-    starts = torch.cat((held, others[~torch.isin(others, held)]))[: cfg["evaluate"]["imagined"]]
+    others, wanted = torch.arange(len(store)), cfg["evaluate"]["imagined"]
+    chosen = evenly(cfg, store, held, wanted)
+    more = evenly(cfg, store, others[~torch.isin(others, held)], wanted - len(chosen))
+    starts = torch.cat((chosen, more))
     world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(starts)), starts)
     tasks, scenes = (of(cfg, store, starts) for of in (tasks_of_episodes, scenes_of_episodes))
     out: dict[str, Any] = {}
     for label in ("before", "after"):
         policy = build_policy(cfg, inputs.weights(label))
         outcome = evaluate(world, policy, list(range(len(starts))), label=f"imagined {label}")
+        film(folder / f"media/{label}.mp4", world.base_env.video(0).numpy(), store.fps)
         out[label] = {
             **_counted(outcome.success, outcome.counted),
             "tasks": by_task(tasks, _counted, outcome.success, outcome.counted),

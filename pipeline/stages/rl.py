@@ -22,6 +22,7 @@ from learners.rl.algorithm import Algorithm
 from learners.rl.dataset_rollout import dataset_rollout
 from learners.rl.loop import train_rl
 from learners.rl.recorded import RecordedDecisions, TrueExperience
+from learners.rl.starts import Starts
 from learners.stages.imitation import Cloning
 from learners.training.parallel import leads
 from pipeline.graph.artefact import save_weights
@@ -86,8 +87,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     fleet = build_fleet(recipe) if leads() else None
     try:
         begun = len(store) if inside is None else len(decision_points(store, inside)[0])
-        share = cfg["extra_starts"]["share"]
-        starts = shared_out(begun, len(extra), share) if extra else begun
+        starts = starts_of(cfg, begun, len(extra))
         true = TrueExperience(anchor, decisions)
         watch = true_success(cfg, settings, inputs.weights("policy"))
         stats = train_rl(fleet, policy, algorithm, settings, folder, starts, true=true, watch=watch)
@@ -97,6 +97,13 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     save_weights(policy, folder)
     last = {f"last_{key}": value for key, value in stats.pop("last").items()}
     return {**knew, **stats, **last}
+
+
+def starts_of(cfg: Cfg, begun: int, extra: int) -> Starts:
+    """Where imagined episodes begin: at `begun` starts and the `extra` ones that stand after them."""
+    share, shared = cfg["extra_starts"]["share"], cfg["simulator"]["shared_noise"]
+    chosen = shared_out(begun, extra, share) if extra else range(begun)
+    return Starts(chosen, 0 if shared else begun + extra)
 
 
 def _horizon(cfg: Cfg, chunks: int | None, algorithm: Algorithm) -> int:
@@ -158,7 +165,7 @@ def rl_in_physics(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, An
     fleet = build_fleet(recipe)
     try:
         watch = true_success(cfg, settings, inputs.weights("policy"))
-        stats = train_rl(fleet, policy, algorithm, settings, folder, pool, watch=watch)
+        stats = train_rl(fleet, policy, algorithm, settings, folder, Starts(pool), watch=watch)
     finally:
         fleet.close()
     save_weights(policy, folder)

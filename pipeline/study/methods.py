@@ -21,8 +21,16 @@ from envs.targets import ConfigError
 from pipeline.acting import acting
 from pipeline.graph.graph import Graph, Names
 from pipeline.graph.stage import Stage
-from pipeline.loop import World, add_world, build_loop, deployed_episodes, imagined_iterations, last_round
-from pipeline.stages import collect, imitation, prove, rl
+from pipeline.loop import (
+    World,
+    add_imitation,
+    add_world,
+    build_loop,
+    deployed_episodes,
+    imagined_iterations,
+    last_round,
+)
+from pipeline.stages import collect, prove, rl
 from pipeline.stages.variant import fewer_episodes
 
 Cfg = Mapping[str, Any]
@@ -158,7 +166,7 @@ class WorldFrom(Method):
         """See Method.make."""
         graph = Graph(acting(cfg), root / "stages")
         data = graph.add("collect", collect.collect)
-        graph.add("imitation", imitation.imitation, {"data": [data]})
+        add_imitation(graph, cfg, [data])
         if self.share < 1:
             data = graph.add("fewer", fewer_episodes, {"data": data}, share=self.share)
         world = add_world(graph, cfg, [data], World(), 1)

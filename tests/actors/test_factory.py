@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from torch import nn
 
-from actors.factory import build_policy
+from actors.factory import build_policy, open_clips
 from actors.process import device_of, prepare_process
 from actors.world_config import world_spec
 from envs.embodiment import Embodiment
+from envs.episodes import LeRobotWriter
+from envs.episodes.formats.lerobot_columns import C2W, INTRINSIC
 from envs.episodes.formats.lerobot_info import INFO_KEY, to_info
 from envs.targets import ConfigError
 from pipeline.config import composed
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES
+from tests.envs.episodes.lerobot_sets import SETS, write_set
+from tests.moving_square import SIZE, moving_square
 from tests.sections import section
 
 AROUND = {"pose_map": "auto", "ray_map": "auto", "kinematics": None}
@@ -36,6 +44,10 @@ def recorded(robot: Embodiment, folder: Path) -> Path:
             "shape": [*camera.size, 3],
             "names": ["height", "width", "channels"],
         }
+    count = len(robot.cameras) * robot.calibrated
+    for name, numbers in ((C2W, 16), (INTRINSIC, 9)):
+        if count:
+            features[name] = {"shape": [count * numbers], "names": None, "dtype": "float32"}
     (folder / "meta").mkdir(parents=True)
     features["action"]["info"] = {INFO_KEY: to_info(robot)}
     info = {"robot_type": robot.robot, "fps": robot.fps, "features": features}
@@ -85,6 +97,57 @@ def test_robots_that_are_unknown_or_differ_are_named(tmp_path: Path) -> None:
         world_spec(config(tmp_path / "c"))
     with pytest.raises(ConfigError, match="must be auto, true or false"):
         world_spec(config(one, ray_map="perhaps"))
+
+
+def rewritten(root: Path, change: Callable[[dict[str, Any], pa.Table], pa.Table]) -> None:
+    """Change the features and the table of a data set of one file."""
+    info = json.loads((root / "meta/info.json").read_text())
+    (path,) = (root / "data").rglob("*.parquet")
+    pq.write_table(change(info["features"], pq.read_table(path)), path)
+    (root / "meta/info.json").write_text(json.dumps(info))
+
+
+def test_calibration_that_columns_tell_is_used_whoever_recorded_it(tmp_path: Path) -> None:
+    write_set(tmp_path / "set", SETS["labelled"])
+    plain = config(tmp_path / "set", pose_map_style={})
+    assert not world_spec(plain).ray_map
+
+    def calibrate(features: dict[str, Any], table: pa.Table) -> pa.Table:
+        for name, matrix in ((C2W, np.eye(4)), (INTRINSIC, np.diag([40.0, 40.0, 1.0]))):
+            values = np.tile(matrix.astype(np.float32).reshape(-1), (len(table), 1))
+            cells = pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
+            table = table.append_column(name, cells)
+            features[name] = {"dtype": "float32", "shape": [values.shape[1]], "names": None}
+        return table
+
+    rewritten(tmp_path / "set", calibrate)
+    spec = world_spec(plain)
+    assert spec.ray_map and spec.pose_map and spec.embodiment.calibrated
+    store = open_clips(plain, [tmp_path / "set"])
+    assert torch.equal(store.arrays["c2w"], torch.eye(4).expand(len(store.arrays["c2w"]), 1, 4, 4))
+
+
+def test_a_set_whose_calibration_was_removed_is_read_without(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    robot = BIMANUAL_POSES.at(SIZE)
+    for name in ("whole", "stripped"):
+        LeRobotWriter(tmp_path / name, robot).write([moving_square(BIMANUAL_POSES, 0)])
+
+    def strip(features: dict[str, Any], table: pa.Table) -> pa.Table:
+        features.pop(C2W), features.pop(INTRINSIC)
+        return table.drop_columns([C2W, INTRINSIC])
+
+    rewritten(tmp_path / "stripped", strip)  # as LeRobot's tools remove features
+    folders = [tmp_path / "stripped", tmp_path / "whole"]
+    for chosen in (folders[:1], folders, folders[::-1]):
+        cfg = config(*chosen, pose_map_style={})
+        spec, store = world_spec(cfg), open_clips(cfg, chosen)
+        assert not (spec.pose_map or spec.ray_map or "c2w" in store.arrays) and len(store) == len(chosen)
+    assert caplog.text.count("says that cameras ['top', 'left_wrist', 'right_wrist'] are calibrated") == 1
+    assert world_spec(config(folders[1])).pose_map
+    with pytest.raises(ConfigError, match="need calibrated cameras"):
+        world_spec(config(folders[0], pose_map=True))
 
 
 def test_a_gpu_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,6 +24,7 @@ from actors.rollouts.recipe import Recipe, build_host
 from envs.targets import ConfigError, options
 from learners.rl.algorithm import RLConfig
 from learners.rl.loop import train_rl
+from learners.rl.starts import Starts
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,7 @@ def learn(
     smoke = {"iterations": 2, "envs": 16, "shards": 4, "epochs": 1, "minibatch": 32}
     own = {**cfg["rl"], "microbatches": 1, "seed": 0, "freeze_perception": True, **smoke, **changes}
     settings = options(RLConfig, own, "rl")
-    stats = train_rl(fleet, policy, build_algorithm(cfg, policy), settings, folder, starts=8)
+    stats = train_rl(fleet, policy, build_algorithm(cfg, policy), settings, folder, Starts(range(8)))
     return {name: value.clone() for name, value in policy.state_dict().items()}, stats
 
 

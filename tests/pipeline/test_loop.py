@@ -33,7 +33,9 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     tracked = json.loads((run / "wandb.json").read_text())
     assert {*LEARNED, "imitation-perception", "clone-1-perception"} <= tracked["rows"].keys()
     shown = {f"videos/{path.name}" for path in run.glob("stages/videos-*/media/*.mp4")}
-    assert shown and shown <= set(tracked["videos"])
+    during = {f"gap-{number}/{name}.mp4" for number in (1, 2) for name in ("imagined", "held-out")}
+    last = {f"evaluate-imagined/{label}.mp4" for label in ("before", "after")}
+    assert shown and shown | during | last <= set(tracked["videos"])
     assert "data:video/mp4" in (run / "report.html").read_text()
     table = worldloop(tmp_path, "compare", str(run), str(run)).said
     assert "| algorithm; seed | PPO; 0 | PPO; 0 |" in table

@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
+from actors.factory import open_clips
+from envs.episodes import LeRobotWriter
+from envs.episodes.clips import ClipStore
+from envs.episodes.splits import write_splits
 from envs.manifest import DamagedArtefact, write_manifest
 from envs.rng import Purpose, episode_seeds
-from envs.targets import ConfigError
 from pipeline.config import load_config
-from pipeline.evaluation.by_task import tasks_of_seeds
+from pipeline.evaluation.by_task import evenly, tasks_of_seeds
 from pipeline.graph.stage import Inputs
-from pipeline.stages.collect import collect, fingerprint, scripted_jobs, split_counts
+from pipeline.stages.collect import collect, scripted_jobs, split_counts
+from pipeline.stages.given import demonstrations
+from tests.embodiments import ARM_DELTAS
+from tests.moving_square import moving_square
 
 
 def test_splits_add_up_and_none_is_empty() -> None:
@@ -106,11 +115,30 @@ def test_seeds_of_purposes_and_experiments_never_meet() -> None:
     assert evaluation == set(episode_seeds(1, Purpose.EVALUATE, 1000))
 
 
-def test_recordings_have_a_fingerprint(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"info\.json is missing"):
-        fingerprint([str(tmp_path)])
-    (tmp_path / "meta").mkdir()
-    (tmp_path / "meta/info.json").write_text("1")
-    first = fingerprint([str(tmp_path)])
-    (tmp_path / "meta/info.json").write_text("2")
-    assert fingerprint([str(tmp_path)]) != first
+def test_recordings_that_stand_task_by_task_are_shared_out_evenly(tmp_path: Path) -> None:
+    def told(order: str) -> tuple[Any, ClipStore]:
+        made = [
+            replace(moving_square(ARM_DELTAS, seed), instruction=f"do {word}")
+            for seed, word in enumerate(order)
+        ]
+        LeRobotWriter(tmp_path / order, made[0].embodiment).write(made)
+        write_splits(tmp_path / order, {"train": len(order), "held_out": 0, "calibration": 0})
+        cfg = load_config(
+            [
+                *("experiment=smoke", "task=lerobot", f"task.data=[{tmp_path / order}]", "task.size=[32,32]"),
+                *("imitation.demos=7", "imitation.sources=['*']"),
+            ]
+        )
+        return cfg, open_clips(cfg, cfg["task"]["data"])
+
+    cfg, store = told("aaaaaaaabbbbc")
+    chosen = demonstrations(cfg, store)
+    assert chosen.tolist() == [0, 1, 2, 8, 9, 10, 12]
+    everything = torch.arange(len(store))
+    assert evenly(cfg, store, everything, 3).tolist() == [0, 8, 12]
+    assert evenly(cfg, store, everything, 99).tolist() == everything.tolist()
+    assert evenly(cfg, store, everything[:0], 3).tolist() == []
+    for order in ("aaaaaaaaa", "abcabcabcabc"):  # the first ones are that already
+        assert demonstrations(*told(order)).tolist() == list(range(7))
+    physics = {**cfg, "task": {**cfg["task"], "suite": {"_target_": "any"}}}
+    assert demonstrations(physics, store).tolist() == list(range(7))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from envs.episodes.video import read_video
 from pipeline import track
 from pipeline.evaluation.media import paired_video
 from pipeline.graph.graph import Graph
@@ -86,6 +87,23 @@ def test_videos_and_parts_of_a_stage_are_tracked_once(tmp_path: Path) -> None:
         assert state["rows"] == {"videos-part": 3}
         sent = [path for path in tmp_path.rglob("*.mp4") if "wandb" in path.parts]
         assert len(sent) == 2 and all(path.stat().st_size > 0 for path in sent)
+
+
+def test_no_video_is_seen_before_it_is_whole(tmp_path: Path) -> None:
+    seen: list[list[Path]] = []
+
+    class Looking:
+        """A picture that looks for videos when it is encoded."""
+
+        shape = (32, 48, 3)
+
+        def __array__(self, *_: Any, **__: Any) -> np.ndarray:
+            seen.append(sorted(tmp_path.glob("*.mp4")))
+            return np.zeros(self.shape, np.uint8)
+
+    paired_video(tmp_path / "one.mp4", [Looking()] * 3, 10.0)  # type: ignore[list-item]
+    assert len(seen) >= 3 and not any(seen)
+    assert read_video(tmp_path / "one.mp4").shape == (8, 3, 32, 48) and len(list(tmp_path.iterdir())) == 1
 
 
 def test_disabled_imports_nothing(tmp_path: Path) -> None:

@@ -36,10 +36,30 @@ def agreed_robot(info: dict[str, Any], given: Embodiment | None = None) -> Embod
     if other:
         raise EmbodimentError(f"the data are of another robot: {other}")
     cameras = tuple(
-        replace(mine, size=theirs.size, calibrated=mine.calibrated and theirs.calibrated)
-        for mine, theirs in zip(given.cameras, recorded.cameras, strict=True)
+        replace(mine, size=theirs.size)
+        for mine, theirs in zip(alike_calibrated(given, recorded).cameras, recorded.cameras, strict=True)
     )
     return replace(given, cameras=cameras)
+
+
+def alike_calibrated(robot: Embodiment, other: Embodiment) -> Embodiment:
+    """The robot, of whose cameras those are calibrated that are so of the other one, too."""
+    cameras = tuple(
+        replace(mine, calibrated=mine.calibrated and theirs.calibrated)
+        for mine, theirs in zip(robot.cameras, other.cameras, strict=True)
+    )
+    return replace(robot, cameras=cameras)
+
+
+def cameras_without_columns(info: dict[str, Any]) -> list[str]:
+    """Names of the cameras that info.json says are calibrated, if the columns that tell how are gone."""
+    said = from_info(info)
+    known = _known_cameras(said, info["features"])
+    return [
+        mine.name
+        for mine, seen in zip(said.cameras, known.cameras, strict=True)
+        if mine.calibrated and not seen.calibrated
+    ]
 
 
 def _known_cameras(robot: Embodiment, features: dict[str, Any]) -> Embodiment:

@@ -75,7 +75,7 @@ def game(imagined: bool = False) -> Game:
         return start_of(spec, seen, pictures, PoseMapStyle(), None)
 
     side = imagination(suite.embodiment) if imagined else None
-    recorded = [Recorded("0: seed 7", 7, ACTIONS)]
+    recorded = [Recorded("0: seed 7", "reach", 7, ACTIONS)]
     return Game(suite.embodiment, suite.tasks, suite, side, starts if imagined else None, recorded)
 
 

@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from envs.embodiment import ActionKind, Camera, Embodiment
 from envs.physics.suite import Array, Expert, Observation, TaskSuite, task_names
+from envs.physics.tabletop.suite import Tabletop
 from tests.sections import CONFIGS, offered
 
 
@@ -47,10 +48,17 @@ class Counting(TaskSuite):
         fault: "raise", or "exit" to end the process, or "" for none.
         at_start: the same, when the suite is made.
         tasks: its names.
+        shows: (height, width) of what it renders, whatever its camera says.
     """
 
-    def __init__(self, fault: str, at_start: str = "", tasks: tuple[str, ...] = ("count",)):
-        self.fault, self.tasks = fault, tasks
+    def __init__(
+        self,
+        fault: str,
+        at_start: str = "",
+        tasks: tuple[str, ...] = ("count",),
+        shows: tuple[int, int] = (4, 4),
+    ):
+        self.fault, self.tasks, self.shows = fault, tasks, shows
         self.embodiment = Embodiment(
             "counter", ("a",), ActionKind.OTHER, False, (), ("n",), (Camera("eye", (4, 4)),), 10.0
         )
@@ -65,7 +73,7 @@ class Counting(TaskSuite):
         self.count += 1
 
     def render(self) -> Any:
-        return np.full((1, 3, 4, 4), int(self.count) % 256, np.uint8)
+        return np.full((1, 3, *self.shows), int(self.count) % 256, np.uint8)
 
     def observe(self) -> Observation:
         return Observation(np.array([self.count]), np.zeros(1), self.task, False, 0.0)
@@ -75,6 +83,20 @@ class Counting(TaskSuite):
 
     def expert(self, noise_level: float, rng: np.random.Generator) -> Expert:
         return lambda: np.array([noise_level * 2])
+
+
+class Solved(Tabletop):
+    """The table top, whose block is put where it belongs before the first action."""
+
+    def reset(self, task: str, seed: int) -> None:
+        super().reset(task, seed)
+        self.put = False
+
+    def step(self, action: Array) -> None:
+        goal, data = self._bench.goal, self._bench.data
+        if not self.put:
+            data.qpos[goal.joint : goal.joint + 2], self.put = goal.target, True
+        super().step(action)
 
 
 def _misbehave(how: str) -> None:

@@ -18,23 +18,16 @@ PUSH = task_section("push", control_hz=5.0)
 SPEC = WorldSpec(build_suite(PUSH["suite"]).embodiment, (24, 32), 4)
 
 
-def env_of(batch: int, horizon: int, mode: str = "relative", **changes: Any) -> PhysicsEnv:
-    pool = TaskPool(PUSH["suite"], PUSH["name"], batch, horizon, changes.pop("workers", 1))
+def env_of(batch: int, horizon: int, mode: str = "relative", suite: str = "", **changes: Any) -> PhysicsEnv:
+    section = {**PUSH["suite"], "_target_": suite or PUSH["suite"]["_target_"]}
+    pool = TaskPool(section, PUSH["name"], batch, horizon, 1)
     return PhysicsEnv(pool, mode=mode, rewards=Rewards(1.0, 1.0), **{"spec": SPEC, **changes})
 
 
-def on_target(env_or_pool: Any) -> None:
-    """Put the block of slot 0 where it belongs."""
-    pool = env_or_pool.pool if isinstance(env_or_pool, PhysicsEnv) else env_or_pool
-    bench = pool._inline.slots[0].suite._bench
-    bench.data.qpos[bench.goal.joint : bench.goal.joint + 2] = bench.goal.target
-
-
 def test_success_ends_an_episode_with_a_bonus_once() -> None:
-    env = env_of(1, 8, record=True)
+    env = env_of(1, 8, suite="tests.envs.physics.sections.Solved", record=True)
     now = env.reset()
     assert bytes_to_text(now[INSTRUCTION_UTF8]) == env.instructions
-    on_target(env)
     now[CHUNK] = torch.zeros(1, 4, SPEC.action_dim)
     after = env.step(now)["next"]
     assert bool(after[SUCCESS]) and bool(after["terminated"]) and not bool(after["truncated"])

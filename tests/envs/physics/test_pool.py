@@ -69,7 +69,7 @@ def test_scripts_of_a_killed_worker_run_again() -> None:
 
 
 def test_a_worker_that_keeps_dying_is_reported() -> None:
-    with pytest.raises(PoolError, match="died 4 times in a row"):
+    with pytest.raises(PoolError, match=r"4 times in a row physics worker 0 died \(exit code 3\)"):
         pool_of(2, 2, at_start="exit")
 
 
@@ -121,12 +121,46 @@ def test_evaluations_do_not_count_where_physics_crashes() -> None:
     env.close()
 
 
-def test_an_exception_in_a_worker_arrives_with_its_traceback() -> None:
-    pool = pool_of(2, 2, fault="raise")
-    pool.reset({0: 0, 1: 1}, False)
-    with pytest.raises(PoolError, match="on fire"):
-        pool.step({0: np.full((2, 1), 2.0), 1: np.zeros((2, 1))})
+@pytest.mark.parametrize("fault", ["raise", "exit"])
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_of_the_suite_counts_like_a_crash_and_is_told(
+    fault: str, workers: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    pool, still, odd = pool_of(2, workers, fault=fault), np.zeros((2, 1)), np.full((2, 1), 2.0)
+    pool.reset({0: 10, 1: 20}, False)
+    pool.step({0: still, 1: still})
+    assert [seen["state"].tolist() for seen in pool.step({0: odd, 1: still}).values()] == [[24.0]]
+    assert pool.lost == [10]
+    why = "RuntimeError: the bench is on fire" if fault == "raise" else "exit code 3"
+    assert caplog.text.count(why) == 1 and "seed 10; it is dropped" in caplog.text
+    with pytest.raises(PoolError, match=f"(?s)in 2 of 3 episodes.*{why}"):
+        pool.script([(30, 1.0)], 1)
     pool.close()
+
+
+def test_what_others_said_when_one_failed_is_no_answer_to_the_next_request() -> None:
+    pool, still, odd = pool_of(4, 2, fault="raise"), np.zeros((2, 1)), np.full((2, 1), 2.0)
+    pool.reset({slot: 10 * slot for slot in range(4)}, False)
+    with pytest.raises(PoolError, match="on fire"):
+        pool.step({0: odd, 1: still, 2: odd, 3: still})  # too many are lost before worker 1 is heard
+    again = pool.reset({slot: 10 * slot + 5 for slot in range(4)}, False)
+    assert {slot: float(seen["state"][0]) for slot, seen in again.items()} == {0: 5, 1: 15, 2: 25, 3: 35}
+    after = pool.step(dict.fromkeys(range(4), still))
+    assert {slot: float(seen["state"][0]) for slot, seen in after.items()} == {0: 7, 1: 17, 2: 27, 3: 37}
+    with pytest.raises(PoolError, match="on fire"):
+        pool.script([(100, 1.0), *((seed, 0.0) for seed in range(8))], 1)
+    assert [track.seed for track in pool.script([(seed, 0.0) for seed in range(50, 54)], 1)] == [
+        50,
+        51,
+        52,
+        53,
+    ]
+    pool.close()
+
+
+def test_a_suite_that_cannot_be_made_is_told_at_once() -> None:
+    with pytest.raises(PoolError, match=r"(?s)cannot start:.*on fire"):
+        pool_of(2, 2, at_start="raise")
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -135,6 +169,16 @@ def test_what_cannot_be_built_is_a_config_error(workers: int) -> None:
         TaskPool(COUNTING, "cuont", 2, 8, workers)
     with pytest.raises(ConfigError, match=r"task\.suite\._target_=no_such_package\.Suite does not import"):
         TaskPool({"_target_": "no_such_package.Suite"}, "count", 2, 8, workers)
+
+
+def test_pictures_that_are_not_those_of_the_embodiment_are_refused_before_they_are_recorded() -> None:
+    said = r"Counting\.render gives uint8 \[1, 3, 4, 6\], but its embodiment's .* \[1, 3, 4, 4\]"
+    for ask in (lambda pool: pool.script([(0, 0.0)], 1), lambda pool: pool.reset({0: 0}, False)):
+        pool = pool_of(2, 2, shows=[4, 6])
+        with pytest.raises(ConfigError, match=said):
+            ask(pool)
+        assert not pool.lost
+        pool.close()
 
 
 def test_other_classes_are_no_suites() -> None:

@@ -22,6 +22,7 @@ from envs.specs import EPISODE, IMAGE, INSTRUCTION_UTF8, LOG_PROB, SUCCESS, Acti
 from envs.targets import build, options
 from learners.rl.algorithm import Algorithm, RLConfig
 from learners.rl.loop import train_rl
+from learners.rl.starts import Starts
 from learners.rl.watch import Watch
 from tests.embodiments import ARM_DELTAS, observations, world_spec
 from tests.sections import offered, section
@@ -94,7 +95,7 @@ def test_trains_every_policy_and_repeats_itself(name: str, policy_name: str, tmp
         algorithm = algorithm_of(name, policy, env.spec)
         fleet = LocalFleet(Host(env, replica, algorithm.bootstraps))
         folder = tmp_path / str(number)
-        stats = train_rl(fleet, policy, algorithm, settings(), folder, starts=4)
+        stats = train_rl(fleet, policy, algorithm, settings(), folder, Starts(range(4)))
         fleet.close()
         assert stats["ledger"]["learned"] == stats["ledger"]["asked"] == 16
         assert stats["last"]["updates"] > 0
@@ -159,7 +160,7 @@ def test_grpo_compares_within_groups_and_drops_equal_ones() -> None:
     policy = policy_of("chunk_gaussian", spec)
     algorithm = algorithm_of("grpo", policy, spec, group=2, normalise=False, shaped=False)
     seeds = algorithm.seeds(5, 4, torch.Generator().manual_seed(0))
-    assert seeds[0] % 5 == seeds[1] % 5 and seeds[0] != seeds[1]
+    assert seeds[0] == seeds[1] and seeds[2] == seeds[3]
     rewards = [[0.0, 1.0], [0.0, 0.0], [1.0, 1.0], [1.0, 1.0]]
     data, figures = algorithm.prepare(rollout(policy, spec, rewards))
     assert figures["groups_dropped"] == 0.5
@@ -202,7 +203,7 @@ def test_with_frozen_perception_no_picture_is_carried_or_encoded_again(name: str
     encoded: list[int] = []
     policy.perception.register_forward_hook(lambda *_: encoded.append(1))
     algorithm = algorithm_of(name, policy, env.spec)
-    train_rl(LocalFleet(host), policy, algorithm, settings(), tmp_path, starts=4)
+    train_rl(LocalFleet(host), policy, algorithm, settings(), tmp_path, Starts(range(4)))
     assert not encoded
     changed = {key for key, value in policy.named_parameters() if not torch.equal(value, before[key])}
     assert changed and not any(key.startswith("module.0.") for key in changed)
@@ -222,7 +223,7 @@ def test_looking_at_a_policy_changes_nothing_that_it_learns(tmp_path: Path) -> N
         policy, replica = policy_of("chunk_gaussian", env.spec), policy_of("chunk_gaussian", env.spec)
         algorithm = algorithm_of("ppo", policy, env.spec)
         fleet, plan = LocalFleet(Host(env, replica)), settings(iterations=5)
-        train_rl(fleet, policy, algorithm, plan, tmp_path / name, starts=4, watch=watch)
+        train_rl(fleet, policy, algorithm, plan, tmp_path / name, Starts(range(4)), watch=watch)
         rows[name] = rows_of(tmp_path / name)
     assert looked == [1, 3] and len(rows["watched"]) == 4  # enough after the second look
     assert [row.pop("rl/true_success", None) for row in rows["watched"]] == [None, 1.0, None, 3.0]
@@ -237,7 +238,14 @@ def test_end_to_end_pictures_travel_and_the_encoder_learns(tmp_path: Path) -> No
     assert IMAGE in batch.keys(True, True) and INSTRUCTION_UTF8 in batch.keys(True, True)
     assert ("next", *IMAGE) not in batch.keys(True, True)  # critics read features
     before = policy.perception.views.stem.weight.clone()
-    train_rl(LocalFleet(host), policy, algorithm_of("ppo", policy, env.spec), settings(), tmp_path, starts=4)
+    train_rl(
+        LocalFleet(host),
+        policy,
+        algorithm_of("ppo", policy, env.spec),
+        settings(),
+        tmp_path,
+        Starts(range(4)),
+    )
     assert not torch.equal(policy.perception.views.stem.weight, before)
 
 
@@ -281,12 +289,12 @@ def test_episodes_with_nan_are_dropped_and_counted_until_they_are_too_many(
         algorithm = algorithm_of("grpo", policy, env.spec)
         limit = settings(iterations=1, epochs=1, max_dropped=0.4 if dropped == 2 else 0.04)
         if dropped == 2:
-            stats = train_rl(fleet, policy, algorithm, limit, tmp_path / "few", starts=4)
+            stats = train_rl(fleet, policy, algorithm, limit, tmp_path / "few", Starts(range(4)))
             assert stats["ledger"]["dropped"] == {"NaN actions": 2} and stats["ledger"]["learned"] == 6
             assert all(bool(p.isfinite().all()) for p in policy.parameters())
         else:
             with pytest.raises(FleetError, match="NaN"):
-                train_rl(fleet, policy, algorithm, limit, tmp_path / "all", starts=4)
+                train_rl(fleet, policy, algorithm, limit, tmp_path / "all", Starts(range(4)))
 
 
 class Stop(Exception):
@@ -306,7 +314,7 @@ def test_killed_and_resumed_rl_equals_the_uninterrupted(
         algorithm = algorithm_of(name, policy, env.spec)
         fleet = LocalFleet(Host(env, replica, algorithm.bootstraps))
         plan = settings(iterations=3, shards=2, checkpoint_every=1)
-        stats = train_rl(fleet, policy, algorithm, plan, folder, starts=4)
+        stats = train_rl(fleet, policy, algorithm, plan, folder, Starts(range(4)))
         fleet.close()
         assert stats["ledger"]["learned"] == stats["ledger"]["asked"] == 24
         return rows_of(folder), {
@@ -344,5 +352,5 @@ def test_trains_on_a_gpu_in_a_world_on_the_cpu(name: str, policy_name: str, tmp_
     policy, replica = policy_of(policy_name, env.spec).cuda(), policy_of(policy_name, env.spec).cuda()
     algorithm = algorithm_of(name, policy, env.spec)
     fleet = LocalFleet(Host(env, replica, algorithm.bootstraps))
-    stats = train_rl(fleet, policy, algorithm, settings(), tmp_path, starts=4)
+    stats = train_rl(fleet, policy, algorithm, settings(), tmp_path, Starts(range(4)))
     assert stats["ledger"]["learned"] == 16 and stats["last"]["updates"] > 0
