@@ -29,8 +29,9 @@ class Denoising:
     Args:
         sampler: "ddim", or "distilled" for the jumps of a few-step student (see samplers.py).
         steps: of the sampler, per block.
-        stabilisation: time on the schedule, 0..1, that context frames are said to stand at. They are shown as
-            they are: a network that took its own frames for clean would trust their errors.
+        stabilisation: time on the schedule, 0..1, that context frames are said to stand at: a network that
+            took its own frames for clean would trust their errors. They are shown without that noise, and
+            scaled as frames of that level are.
         as_sampled: chance that a clip of training has the levels of sampling (context as above, all newer
             frames at one level) instead of independent ones.
         foreground: extra loss weight of what differs from the picture's median colour.
@@ -50,7 +51,7 @@ class Block:
     """What stays the same at every step of a block.
 
     Args:
-        context: latents [B, c, V, C, h, w] of the frames before it.
+        context: latents [B, c, V, C, h, w] of the frames before it, as those of their level are scaled.
         old: the levels [B, c] at which they are said to stand.
         ahead: what stands beside the block's own frames: channels [B, n, V, C', h, w], and action vectors [B,
             n, size].
@@ -133,6 +134,7 @@ class Blockwise(Simulator):
         past = context.shape[1]
         stable = float(self.schedule.level(torch.tensor(self.denoising.stabilisation)))
         old = torch.full(context.shape[:2], stable, device=context.device)
+        context = (1 - stable) * context  # z = (1 - s) x + s e, whose noise is left out
         _, _, known = self._run(context, old, (beside[0][:, :past], beside[1][:, :past]))
         return Block(context, old, (beside[0][:, past:], beside[1][:, past:]), known)
 

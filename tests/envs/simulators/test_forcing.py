@@ -184,17 +184,20 @@ def test_repeats_and_invalid_frames_teach_nothing() -> None:
     assert not any(taught())
 
 
-def test_a_network_that_repeats_shows_the_newest_frame_again() -> None:
+@pytest.mark.parametrize(("steps", "apart"), [(1, 0.01), (2, 0.5)])
+def test_a_network_that_repeats_shows_the_newest_frame_again(steps: int, apart: float) -> None:
     world = make(context=2)
+    world.denoising = replace(world.denoising, steps=steps)  # of several the first leaves noise behind
     with torch.no_grad():
         for layer in (world.net.out.weight, world.net.out.bias):
             layer.zero_()
-    context = torch.randn(1, 2, 2, 16, 4, 4)
+    context = torch.randn(1, 1, 2, 16, 4, 4).expand(-1, 2, -1, -1, -1, -1)
     beside = torch.zeros(1, 5, 2, 0, 4, 4), torch.zeros(1, 5, world.actions.size)
     with torch.no_grad():
         made, _ = world._block(context, torch.randn(1, 3, 2, 16, 4, 4), beside)
-    gap = (made - context[:, -1:]).abs().mean()
-    assert gap < 0.5 * context.std(), "an untrained network should stand still"
+    # Taken as it is for noisy latents of its level, context would grow by 7% with every block.
+    gap = (made - context[:, -1:]).square().mean().sqrt()
+    assert gap < apart * context.std(), "an untrained network should stand still"
 
 
 def test_what_does_not_fit_is_named() -> None:
