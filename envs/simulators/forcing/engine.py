@@ -26,6 +26,7 @@ from envs.simulators.forcing.prediction import Prediction
 from envs.simulators.forcing.schedule import Sigmoid
 from envs.simulators.foreground import foreground_weight
 from envs.simulators.tokenizers.autoencoder import STRIDE, Autoencoder
+from envs.simulators.tokenizers.detail import restore_detail
 from envs.specs import WorldSpec
 from envs.targets import OptionsOf, build, options
 
@@ -107,16 +108,18 @@ class ForcingSimulator(Blockwise):
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; features are those of the last step, means over each view of each frame."""
         latents, features = self._generate(inputs)
-        return to_bytes(
-            self.codec.decode(latents.flatten(0, 2)).float().unflatten(0, latents.shape[:3])
-        ), features
+        decoded = self.codec.decode(latents.flatten(0, 2)).float().unflatten(0, latents.shape[:3])
+        last = unit(inputs["memory", "frames"][:, -1:])
+        return to_bytes(restore_detail(decoded[:, 1:], decoded[:, :1], last)), features
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is decoded to pixels."""
         return self._generate(inputs)[1]
 
     def _generate(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
-        """Latents [B, K, V, C, h, w] of a chunk and its features [B, K * V * width], block by block."""
+        """Latents [B, 1 + K, V, C, h, w] of the last known frame and of a chunk, and the chunk's features
+        [B, K * V * width], block by block.
+        """
         remembered = {name: rows[:, -self.context :] for name, rows in inputs["memory"].items()}
         frames, chunk = self._whole(remembered, inputs), self.spec.chunk
         latents = self._encode(unit(frames["frames"]))
@@ -128,7 +131,7 @@ class ForcingSimulator(Blockwise):
             made, seen = self._block(latents[:, begin:], ahead, self._beside(frames, window, inputs))
             latents = torch.cat([latents, made], 1)
             features.append(seen)
-        return latents[:, before:], torch.cat(features, 1).flatten(1)
+        return latents[:, before - 1 :], torch.cat(features, 1).flatten(1)
 
     # -- training
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:

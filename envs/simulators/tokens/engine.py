@@ -19,9 +19,10 @@ from envs.conditioning import ActionVector, Pace, render_ray_map
 from envs.ranges import Count
 from envs.rng import noise_generator
 from envs.simulators import memory
-from envs.simulators.base import Simulator
+from envs.simulators.base import Simulator, to_bytes
 from envs.simulators.inputs import own_frames
 from envs.simulators.row_linear import RowLinear
+from envs.simulators.tokenizers.detail import restore_detail
 from envs.simulators.tokenizers.lfq import LookupFreeTokenizer
 from envs.simulators.tokens.decoding import Draws
 from envs.simulators.tokens.transformer import Trunk
@@ -34,7 +35,9 @@ _KEY = "simulator"
 
 @dataclass(frozen=True)
 class Made:
-    """A chunk: tokens int64 [B, K, P, F], features [B, *feature_shape], done float32 [B, K] in 0..1."""
+    """A chunk: tokens int64 [B, 1 + K, P, F] of the last known frame and of its own, features
+    [B, *feature_shape], done float32 [B, K] in 0..1.
+    """
 
     tokens: Tensor
     features: Tensor
@@ -115,8 +118,9 @@ class TokensSimulator(Simulator):
     @torch.no_grad()
     def step(self, state: TensorDict, future: TensorDict) -> tuple[Tensor, Tensor, TensorDict]:
         """See Simulator.step."""
-        made = self.generate(memory.build_inputs(state, self.recall(state, future), future))
-        frames = self.video.decode(made.tokens)
+        inputs = memory.build_inputs(state, self.recall(state, future), future)
+        made = self.generate(inputs)
+        frames = self._frames(made, inputs)
         state = memory.append(state, frames, future)
         state["done"] = made.done
         return frames, made.features, state
@@ -124,7 +128,7 @@ class TokensSimulator(Simulator):
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; all draws come from (seed, chunk_index)."""
         made = self.generate(inputs)
-        return self.video.decode(made.tokens), made.features
+        return self._frames(made, inputs), made.features
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is decoded to pixels."""
@@ -139,7 +143,7 @@ class TokensSimulator(Simulator):
         self.video.net.observe(tokens, told[:, :past], _of(beside, slice(past)), known)
         pairs = zip(inputs["seed"].tolist(), inputs["chunk_index"].tolist(), strict=True)
         draws = Draws([noise_generator(seed, chunk) for seed, chunk in pairs], tokens.device)
-        made, seen = [], []
+        made, seen = [tokens[:, -1]], []
         for frame in range(past, told.shape[1]):
             at = slice(frame, frame + 1)
             made.append(self.video.next_frame(known, told[:, at], _of(beside, at), draws))
@@ -167,6 +171,12 @@ class TokensSimulator(Simulator):
         return self.video.loss(lesson, self._told(inputs), self._beside(inputs), generator)
 
     # -- parts
+    def _frames(self, made: Made, inputs: TensorDict) -> Tensor:
+        """Frames uint8 [B, K, V, 3, H, W] of a chunk, with the detail of the last known one."""
+        decoded = self.video.decode(made.tokens)
+        last = inputs["memory", "frames"][:, -1:].float() / 255
+        return to_bytes(restore_detail(decoded[:, 1:], decoded[:, :1], last))
+
     def _told(self, inputs: TensorDict) -> Tensor:
         """Commands of memory and chunk as tokens [B, T, N, width]: each beside the one before it, so that a
         frame is told the same wherever it stands in a chunk.

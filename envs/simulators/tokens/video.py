@@ -15,7 +15,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from envs.ranges import Count, NonNegative, Share
-from envs.simulators.base import to_bytes
 from envs.simulators.row_linear import RowLinear
 from envs.simulators.tokenizers.lfq import LookupFreeTokenizer
 from envs.simulators.tokens.blocks import Memory
@@ -120,11 +119,11 @@ class TokenVideo(nn.Module):
 
     @torch.no_grad()
     def decode(self, tokens: Tensor) -> Tensor:
-        """Frames uint8 [B, T, V, 3, H, W] of tokens [B, T, P, F]."""
+        """Frames float32 [B, T, V, 3, H, W], about 0..1, of tokens [B, T, P, F]."""
         v = self.vocabulary
         grids = tokens.unflatten(2, (v.views, v.rows, v.columns))
         flat = grids.flatten(0, 2).split(_AT_ONCE)
-        return torch.cat([to_bytes(self.codec.decode(part)) for part in flat]).unflatten(0, grids.shape[:3])
+        return torch.cat([self.codec.decode(part) for part in flat]).unflatten(0, grids.shape[:3])
 
     # -- frames to come
     def next_frame(self, memory: Memory, told: Tensor, beside: Tensor | None, draws: Draws) -> Tensor:

@@ -200,6 +200,19 @@ def test_a_network_that_repeats_shows_the_newest_frame_again(steps: int, apart: 
     assert gap < apart * context.std(), "an untrained network should stand still"
 
 
+def test_what_stands_still_is_as_sharp_as_the_last_frame() -> None:
+    world = make(context=4)
+    world.denoising = replace(world.denoising, steps=1)
+    with torch.no_grad():
+        for layer in (world.net.out.weight, world.net.out.bias):
+            layer.zero_()
+    clips = clip(world.spec, 2, 4)
+    first = first_of(world.spec, clips)
+    frames = world.step(world.reset(first, torch.tensor([1, 2])), future_of(world.spec, clips))[0]
+    # The autoencoder has learned nothing: decoded, the frame would be grey.
+    assert (frames.int() - first["frames"][:, None].int()).abs().max() <= 1
+
+
 def test_what_does_not_fit_is_named() -> None:
     section = {key: value for key, value in section_of("forcing_small").items() if key != "_target_"}
     own = {name: section[name] for name in ("context", "horizon", "net", "codec", "denoising")}

@@ -174,6 +174,16 @@ def test_seeds_draw_and_commands_tell() -> None:
     assert torch.equal(told[0], frames[0]) and not torch.equal(told[1], told[0])
 
 
+def test_where_tokens_stay_the_picture_does() -> None:
+    model = engine(decoding={"temperature": 0.0})
+    torch.nn.init.constant_(model.video.net.head.keep.bias, 1e3)
+    clips = clip(model.spec, 2, model.memory_frames)
+    first = first_of(model.spec, clips)
+    frames = model.step(model.reset(first, torch.tensor([3, 4])), future_of(model.spec, clips))[0]
+    # The tokenizer has learned nothing: decoded, the frame would be noise.
+    assert torch.equal(frames, first["frames"][:, None].expand_as(frames))
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
