@@ -34,7 +34,8 @@ class Denoising:
             scaled as frames of that level are.
         as_sampled: chance that a clip of training has the levels of sampling (context as above, all newer
             frames at one level) instead of independent ones.
-        foreground: extra loss weight of what differs from the picture's median colour.
+        foreground: extra loss weight of where the last known frame differs from its median colour. By what
+            is still to be said itself, things would be drawn wherever they may be.
         schedule: options of Sigmoid.
     """
 
@@ -95,8 +96,8 @@ class Blockwise(Simulator):
         """
         raise NotImplementedError
 
-    def _weight(self, truth: Tensor, valid: Tensor) -> Tensor:
-        """Loss weights [B, T, V, 1, h, w] of true frames [B, T, V, 3, H, W] and valid [B, T]."""
+    def _weight(self, last: Tensor, valid: Tensor) -> Tensor:
+        """Loss weights [B, T, V, 1, h, w] by the last known frame [B, V, 3, H, W], and valid [B, T]."""
         raise NotImplementedError
 
     def _run(
@@ -199,7 +200,8 @@ class Blockwise(Simulator):
         number, inputs = own_frames(self, clip, generator)
         begin = number * self.spec.chunk
         part = slice(begin, begin + min(self.horizon, self.spec.chunk))
-        return inputs, self._weight(unit(clip["future", "frames"][:, part]), clip["future", "valid"][:, part])
+        last = unit(inputs["memory", "frames"][:, -1])
+        return inputs, self._weight(last, clip["future", "valid"][:, part])
 
     def prepare(self, inputs: TensorDict) -> Block:
         """See Stepwise; of the chunk's first block."""

@@ -139,15 +139,16 @@ class ForcingSimulator(Blockwise):
         first = {name: rows[:, 0] for name, rows in clip["memory"].items()}
         frames = self._whole(first, clip)
         truth = unit(frames["frames"])
-        clean = self._encode(truth)
-        level = self._levels(clean.shape[:2], first["index"].shape[1], generator).to(clean.device)
+        clean, past = self._encode(truth), first["index"].shape[1]
+        level = self._levels(clean.shape[:2], past, generator).to(clean.device)
         noise = torch.randn(clean.shape, generator=generator).to(clean.device)
         z = (1 - wide(level)) * clean + wide(level) * noise
         base = self._base(z, level)
         output, _, _ = self._run(z, level, self._beside(frames, slice(None), clip), base)
         error = self.prediction.error(output, (clean, noise), wide(level), base)
         repeats = first["index"].diff(dim=1, prepend=first["index"][:, :1]) == 0  # the first frame as well
-        weight = self._weight(truth, torch.cat([~repeats, clip["future", "valid"].bool()], 1))
+        valid = torch.cat([~repeats, clip["future", "valid"].bool()], 1)
+        weight = self._weight(truth[:, past - 1], valid)
         return (error.square() * weight).sum() / (weight.sum() * clean.shape[3]).clamp(min=1), {}
 
     def _levels(self, shape: torch.Size, past: int, generator: torch.Generator) -> Tensor:
@@ -158,10 +159,10 @@ class ForcingSimulator(Blockwise):
         like[:, :past] = self.denoising.stabilisation
         return self.schedule.level(torch.where(sampled, like, times))
 
-    def _weight(self, truth: Tensor, valid: Tensor) -> Tensor:
-        """Loss weights [B, T, V, 1, h, w] of true frames [B, T, V, 3, H, W] and valid [B, T]."""
-        weight = foreground_weight(truth, self.denoising.foreground) * valid[:, :, None, None, None, None]
-        return F.avg_pool2d(weight.flatten(0, 2), STRIDE).unflatten(0, truth.shape[:3])
+    def _weight(self, last: Tensor, valid: Tensor) -> Tensor:
+        """Loss weights [B, T, V, 1, h, w] by the last known frame [B, V, 3, H, W], and valid [B, T]."""
+        weight = F.avg_pool2d(foreground_weight(last, self.denoising.foreground).flatten(0, 1), STRIDE)
+        return weight.unflatten(0, last.shape[:2])[:, None] * valid[:, :, None, None, None, None]
 
     # -- parts
     def _whole(self, remembered: Mapping[str, Tensor], inputs: TensorDict) -> dict[str, Tensor]:

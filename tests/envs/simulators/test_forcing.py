@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from envs.simulators.forcing.engine import ForcingSimulator
@@ -182,6 +183,26 @@ def test_repeats_and_invalid_frames_teach_nothing() -> None:
     clips["future", "valid"][:] = False
     clips["memory", "index"][:] = 0
     assert not any(taught())
+
+
+def test_what_is_to_be_said_does_not_decide_what_it_weighs() -> None:
+    world = make()
+    clips = clip(world.spec, 2, 4)
+    other = clips.clone()
+    other["future", "frames"] = clips["future", "frames"].flip(-1)
+
+    def weights(data: TensorDict) -> tuple[Tensor, Tensor]:
+        """Of a chunk in steps, and of the loss: twice its second derivative by what is said."""
+        said: list[Tensor] = []
+        hook = world.net.out.register_forward_hook(lambda layer, args, out: said.append(out) or out)
+        loss = world.loss(data, torch.Generator().manual_seed(0))[0]
+        hook.remove()
+        (first,) = torch.autograd.grad(loss, said[-1:], create_graph=True)
+        (second,) = torch.autograd.grad(first.sum(), said[-1:])
+        return world.chunk_of(data, torch.Generator().manual_seed(0))[1], second
+
+    for mine, others in zip(weights(clips), weights(other), strict=True):
+        assert torch.equal(mine, others) and len(mine[mine > 0].unique()) > 1
 
 
 @pytest.mark.parametrize(("steps", "apart"), [(1, 0.01), (2, 0.5)])

@@ -174,6 +174,21 @@ def test_seeds_draw_and_commands_tell() -> None:
     assert torch.equal(told[0], frames[0]) and not torch.equal(told[1], told[0])
 
 
+def test_what_is_asked_does_not_decide_what_it_weighs() -> None:
+    """Or places would seem likelier to change than they are."""
+    model = engine()
+    v = model.video.vocabulary
+    still = torch.zeros(1, 6, v.places, v.factors, dtype=torch.int64)
+    moved = still.clone()
+    moved[:, 3:, 0] = 1  # one place changes in frame 3, and stays
+    weight = model.video._stirred(moved)[0].unflatten(1, (v.views, v.rows, v.columns)) > 0
+    assert weight.shape[0] == 5 and not model.video._stirred(still).any()
+    assert weight.flatten(1).any(1).tolist() == [False, False, False, True, False]  # asked for frames 1 .. 5
+    beside = torch.zeros(v.views, v.rows, v.columns, dtype=torch.bool)
+    beside[0, :2, :2] = True
+    assert torch.equal(weight[3], beside)
+
+
 def test_where_tokens_stay_the_picture_does() -> None:
     model = engine(decoding={"temperature": 0.0})
     torch.nn.init.constant_(model.video.net.head.keep.bias, 1e3)
