@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from envs.simulators.base import WORLD_OPTIONS
+from envs.simulators.tokenizers.autoencoder import STRIDE
 from envs.simulators.tokens.conditioning import AdaLN, Conditioning, CrossAttention
 from envs.simulators.tokens.decoding import Decoding, Draws, MaskGIT, Raster
 from envs.simulators.tokens.engine import TokensSimulator
@@ -211,6 +212,10 @@ def test_where_tokens_stay_the_picture_does() -> None:
 def test_options_that_cannot_work_are_named(changes: dict[str, Any], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         engine(**changes)
+
+
+def test_the_default_sees_as_finely_as_worlds_of_latents() -> None:
+    assert engine("tokens").codec.stride == STRIDE
 
 
 def test_the_full_size_is_built_and_runs_without_memory() -> None:
