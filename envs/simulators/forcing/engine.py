@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.conditioning import Pace, render_ray_map
+from envs.conditioning import Pace, pose_map_cells, pose_map_channels, render_ray_map
 from envs.ranges import Count
 from envs.simulators import memory
 from envs.simulators.base import to_bytes
@@ -57,6 +57,7 @@ class ForcingSimulator(Blockwise):
     """
 
     recent_memory = True
+    told_in_steps = True
     hidden = ("attn", "ff")
 
     def __init__(
@@ -90,7 +91,7 @@ class ForcingSimulator(Blockwise):
         self.actions = build(actions, "simulator.actions", embodiment=spec.embodiment)
         self.pace = Pace(self.actions.size)
         self.codec = Autoencoder(**codec).requires_grad_(False)
-        latents, maps = self.codec.channels, 3 * spec.pose_map + 6 * spec.ray_map
+        latents, maps = self.codec.channels, pose_map_channels(STRIDE) * spec.pose_map + 6 * spec.ray_map
         none = torch.zeros(1, 1, 1, 1, 1, 1)
         seen = latents * (1 if self.prediction.base(none, none) is None else 2)
         self.net = ForcingDiT(trunk, seen + maps, latents, spec.views, self.actions.size)
@@ -197,10 +198,7 @@ class ForcingSimulator(Blockwise):
         latent_hw = tuple(side // STRIDE for side in self.spec.size)
         channels = [torch.zeros(*commands.shape[:2], self.spec.views, 0, *latent_hw, device=commands.device)]
         if self.spec.pose_map:
-            maps = frames["pose_map"][:, window]
-            scaled = maps.flatten(0, 2).float() / 127.5 - 1
-            small = F.interpolate(scaled, size=latent_hw, mode="bilinear", antialias=True)
-            channels.append(small.unflatten(0, maps.shape[:3]))
+            channels.append(pose_map_cells(frames["pose_map"][:, window], STRIDE))
         if self.spec.ray_map:
             c2w = frames["c2w"][:, window].transpose(1, 2)
             rays = render_ray_map(inputs["intrinsic"], c2w, self.spec.size, stride=STRIDE)

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import torch
-import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from envs.conditioning import ActionVector, Pace, render_ray_map
+from envs.conditioning import ActionVector, Pace, pose_map_cells, pose_map_channels, render_ray_map
 from envs.ranges import Count
 from envs.rng import noise_generator
 from envs.simulators import memory
@@ -67,6 +66,7 @@ class TokensSimulator(Simulator):
 
     hidden = ("blocks",)
     recent_memory = True
+    told_in_steps = True
 
     def __init__(
         self,
@@ -93,7 +93,7 @@ class TokensSimulator(Simulator):
             RowLinear(width, self.video.told_tokens * width),
         )
         self.pace = Pace(self.video.told_tokens * width)
-        self.pose_embed = RowLinear(3 * (stride // 2) ** 2, width) if spec.pose_map else None
+        self.pose_embed = RowLinear(pose_map_channels(stride), width) if spec.pose_map else None
         self.ray_embed = RowLinear(6, width) if spec.ray_map else None
         self.feature_shape = ((spec.chunk + spec.views) * width,)
 
@@ -193,9 +193,8 @@ class TokensSimulator(Simulator):
         parts = []
         if self.pose_embed is not None:
             maps = torch.cat([inputs["memory", "pose_map"], inputs["future", "pose_map"]], 1)
-            small = F.avg_pool2d(maps.flatten(0, 2).float() / 127.5 - 1, 2)
-            cells = F.pixel_unshuffle(small, self.codec.stride // 2).flatten(2).mT
-            parts.append(self.pose_embed(cells.unflatten(0, maps.shape[:3]).flatten(2, 3)))
+            cells = pose_map_cells(maps, self.codec.stride).flatten(4).mT
+            parts.append(self.pose_embed(cells.flatten(2, 3)))
         if self.ray_embed is not None:
             c2w = torch.cat([inputs["memory", "c2w"], inputs["future", "c2w"]], 1).transpose(1, 2)
             rays = render_ray_map(inputs["intrinsic"], c2w, self.spec.size, stride=self.codec.stride)

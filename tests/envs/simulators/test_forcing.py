@@ -221,6 +221,18 @@ def test_a_network_that_repeats_shows_the_newest_frame_again(steps: int, apart: 
     assert gap < apart * context.std(), "an untrained network should stand still"
 
 
+def test_pose_maps_stand_beside_latents_with_their_detail() -> None:
+    world = build_engine("forcing_small", replace(world_spec(BIMANUAL_POSES, chunk=4), ray_map=False))[0]
+    assert isinstance(world, ForcingSimulator)
+    clips = clip(world.spec, 1, 4)
+    maps = clips["future", "pose_map"]
+    frames = {"commands": clips["future", "commands"], "pose_map": maps}
+    beside = world._beside(frames, slice(0, 4), clips)[0]
+    half = maps.float().flatten(0, 2).unfold(2, 2, 2).unfold(3, 2, 2).mean((-1, -2)) / 127.5 - 1
+    assert beside.shape[3] == half[0].numel() // (4 * 4)
+    assert torch.allclose(beside.std(), half.std())  # nothing is averaged away but pairs of pixels
+
+
 def test_what_stands_still_is_as_sharp_as_the_last_frame() -> None:
     world = make(context=4)
     world.denoising = replace(world.denoising, steps=1)
