@@ -25,6 +25,7 @@ from envs.simulators.forcing.network import ForcingDiT, Known, Trunk
 from envs.simulators.forcing.prediction import Prediction
 from envs.simulators.forcing.schedule import Sigmoid
 from envs.simulators.foreground import foreground_weight
+from envs.simulators.inputs import own_frames
 from envs.simulators.tokenizers.autoencoder import STRIDE, Autoencoder
 from envs.simulators.tokenizers.detail import restore_detail
 from envs.specs import WorldSpec
@@ -136,20 +137,24 @@ class ForcingSimulator(Blockwise):
 
     # -- training
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of every frame that has one before it; memory and all chunks of the clip are one window."""
-        first = {name: rows[:, 0] for name, rows in clip["memory"].items()}
-        frames = self._whole(first, clip)
-        truth = unit(frames["frames"])
-        clean, past = self._encode(truth), first["index"].shape[1]
+        """Loss of every frame of memory and of one chunk, any of the clip's, that has one before it; the
+        frames of the chunks before that are the model's own, and are only seen.
+        """
+        number, inputs = own_frames(self, clip, generator)
+        part = slice(number * self.spec.chunk, (number + 1) * self.spec.chunk)
+        index, frames = clip["memory", "index"][:, number], self._whole(inputs["memory"], inputs)
+        seen = unit(torch.cat([frames["frames"], clip["future", "frames"][:, part]], 1))
+        clean, past = self._encode(seen), index.shape[1]
         level = self._levels(clean.shape[:2], past, generator).to(clean.device)
         noise = torch.randn(clean.shape, generator=generator).to(clean.device)
         z = (1 - wide(level)) * clean + wide(level) * noise
         base = self._base(z, level)
-        output, _, _ = self._run(z, level, self._beside(frames, slice(None), clip), base)
+        output, _, _ = self._run(z, level, self._beside(frames, slice(None), inputs), base)
         error = self.prediction.error(output, (clean, noise), wide(level), base)
-        repeats = first["index"].diff(dim=1, prepend=first["index"][:, :1]) == 0  # the first frame as well
-        valid = torch.cat([~repeats, clip["future", "valid"].bool()], 1)
-        weight = self._weight(truth[:, past - 1], valid)
+        # a frame that repeats the one before it is the first of all
+        true = (index.diff(dim=1, prepend=index[:, :1]) > 0) & (index <= clip["begin"][:, None])
+        valid = torch.cat([true, clip["future", "valid"][:, part].bool()], 1)
+        weight = self._weight(seen[:, past - 1], valid)
         return (error.square() * weight).sum() / (weight.sum() * clean.shape[3]).clamp(min=1), {}
 
     def _levels(self, shape: torch.Size, past: int, generator: torch.Generator) -> Tensor:
