@@ -25,7 +25,7 @@ from envs.simulators.forcing.network import ForcingDiT, Known, Trunk
 from envs.simulators.forcing.prediction import Prediction
 from envs.simulators.forcing.schedule import Sigmoid
 from envs.simulators.foreground import foreground_weight
-from envs.simulators.inputs import own_frames
+from envs.simulators.inputs import own_frames, taught_memory
 from envs.simulators.tokenizers.autoencoder import STRIDE, Autoencoder
 from envs.simulators.tokenizers.detail import restore_detail
 from envs.specs import WorldSpec
@@ -142,18 +142,16 @@ class ForcingSimulator(Blockwise):
         """
         number, inputs = own_frames(self, clip, generator)
         part = slice(number * self.spec.chunk, (number + 1) * self.spec.chunk)
-        index, frames = clip["memory", "index"][:, number], self._whole(inputs["memory"], inputs)
+        frames = self._whole(inputs["memory"], inputs)
         seen = unit(torch.cat([frames["frames"], clip["future", "frames"][:, part]], 1))
-        clean, past = self._encode(seen), index.shape[1]
+        clean, past = self._encode(seen), frames["frames"].shape[1]
         level = self._levels(clean.shape[:2], past, generator).to(clean.device)
         noise = torch.randn(clean.shape, generator=generator).to(clean.device)
         z = (1 - wide(level)) * clean + wide(level) * noise
         base = self._base(z, level)
         output, _, _ = self._run(z, level, self._beside(frames, slice(None), inputs), base)
         error = self.prediction.error(output, (clean, noise), wide(level), base)
-        # a frame that repeats the one before it is the first of all
-        true = (index.diff(dim=1, prepend=index[:, :1]) > 0) & (index <= clip["begin"][:, None])
-        valid = torch.cat([true, clip["future", "valid"][:, part].bool()], 1)
+        valid = torch.cat([taught_memory(clip, number), clip["future", "valid"][:, part].bool()], 1)
         weight = self._weight(seen[:, past - 1], valid)
         return (error.square() * weight).sum() / (weight.sum() * clean.shape[3]).clamp(min=1), {}
 

@@ -19,7 +19,7 @@ from envs.ranges import Count
 from envs.rng import noise_generator
 from envs.simulators import memory
 from envs.simulators.base import Simulator, to_bytes
-from envs.simulators.inputs import own_frames
+from envs.simulators.inputs import own_frames, taught_memory
 from envs.simulators.row_linear import RowLinear
 from envs.simulators.tokenizers.detail import restore_detail
 from envs.simulators.tokenizers.lfq import LookupFreeTokenizer
@@ -157,15 +157,13 @@ class TokensSimulator(Simulator):
         """
         number, inputs = own_frames(self, clip, generator)
         part = slice(number * self.spec.chunk, (number + 1) * self.spec.chunk)
-        index = clip["memory", "index"][:, number]
+        true = taught_memory(clip, number)
         truth, valid, success = (clip["future", name][:, part] for name in ("frames", "valid", "success"))
         frames = torch.cat((inputs["memory", "frames"], truth), 1)
-        # Where there are fewer frames than memory holds the first repeats, which no command led to.
-        true = (index[:, 1:] > index[:, :-1]) & (index[:, 1:] <= clip["begin"][:, None])
-        unknown = torch.full(index.shape, torch.nan, device=index.device)
+        unknown = torch.full(true.shape, torch.nan, device=true.device)
         lesson = Lesson(
             tokens=self.video.encode(frames),
-            counted=torch.cat((true, valid), 1),
+            counted=torch.cat((true[:, 1:], valid), 1),
             success=torch.cat((unknown, torch.where(valid, success, torch.nan)), 1),
         )
         return self.video.loss(lesson, self._told(inputs), self._beside(inputs), generator)

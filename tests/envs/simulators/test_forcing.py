@@ -178,6 +178,9 @@ def test_repeats_and_invalid_frames_teach_nothing() -> None:
     clips = clip(world.spec, 2, 4)
     clips["memory", "index"] = torch.tensor([0, 0, 1, 2]).expand(2, 1, 4).contiguous()
     assert taught(world, clips) == [False, False, *[True] * 6]
+    clips["memory", "present"][..., 2] = False  # nobody photographed it
+    assert taught(world, clips) == [False, False, False, *[True] * 5]
+    clips["memory", "present"][..., 2] = True
     clips["future", "valid"][:, -1] = False
     assert taught(world, clips) == [False, False, *[True] * 5, False]
     clips["future", "valid"][:] = False

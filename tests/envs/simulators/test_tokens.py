@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from envs.simulators.base import WORLD_OPTIONS
 from envs.simulators.tokenizers.autoencoder import STRIDE
@@ -173,6 +174,20 @@ def test_seeds_draw_and_commands_tell() -> None:
     future["commands"][1] += 3.0
     told = model.step(model.reset(first, torch.tensor([3, 3])), future)[0]
     assert torch.equal(told[0], frames[0]) and not torch.equal(told[1], told[0])
+
+
+def test_frames_without_a_picture_are_never_asked_for() -> None:
+    model = engine()
+    clips = clip(model.spec, 2, model.memory_frames)
+
+    def loss(data: TensorDict) -> torch.Tensor:
+        return model.loss(data, torch.Generator().manual_seed(0))[0]
+
+    whole = loss(clips)
+    clips["memory", "present"] = torch.zeros_like(clips["memory", "present"])
+    less = loss(clips)
+    clips["memory", "index"] = torch.zeros_like(clips["memory", "index"])  # as if all were repeats
+    assert not torch.equal(less, whole) and torch.equal(loss(clips), less)
 
 
 def test_what_is_asked_does_not_decide_what_it_weighs() -> None:
