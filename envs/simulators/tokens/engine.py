@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from envs.conditioning import ActionVector, Pace, pose_map_cells, pose_map_channels, render_ray_map
 from envs.ranges import Count
 from envs.rng import noise_generator
-from envs.simulators import memory
 from envs.simulators.base import Simulator, to_bytes
 from envs.simulators.inputs import own_frames, taught_memory
 from envs.simulators.row_linear import RowLinear
@@ -34,13 +33,12 @@ _KEY = "simulator"
 
 @dataclass(frozen=True)
 class Made:
-    """A chunk: tokens int64 [B, 1 + K, P, F] of the last known frame and of its own, features
-    [B, *feature_shape], done float32 [B, K] in 0..1.
+    """A chunk: tokens int64 [B, 1 + K, P, F] of the last known frame and of its own, and features
+    [B, *feature_shape].
     """
 
     tokens: Tensor
     features: Tensor
-    done: Tensor
 
 
 class TokensSimulator(Simulator):
@@ -56,8 +54,9 @@ class TokensSimulator(Simulator):
             them.
         codec, net, conditioning, decoding, training: see TokenVideo.
 
-    A session's state also holds `done`, float32 [B, K]: whether the task is done in the frames of the last
-    chunk, in 0..1, as the world itself says; 0 before there is one.
+    Features also tell whether the task is done, by recorded success: a head that learns beside the tokens
+    reads the mean over each frame's places. Judges that read features have it; what it says itself decides
+    nothing.
 
     Raises:
         ValueError: if sizes do not fit.
@@ -107,24 +106,6 @@ class TokensSimulator(Simulator):
         self.action_vector.normalise(commands, moves)
 
     # -- contract
-    def resume(
-        self, past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1, stride: int = 1
-    ) -> TensorDict:
-        """See Simulator.resume."""
-        state = super().resume(past, length, seed, capacity, stride)
-        state["done"] = torch.zeros(len(state), self.spec.chunk, device=state["length"].device)
-        return state
-
-    @torch.no_grad()
-    def step(self, state: TensorDict, future: TensorDict) -> tuple[Tensor, Tensor, TensorDict]:
-        """See Simulator.step."""
-        inputs = memory.build_inputs(state, self.recall(state, future), future)
-        made = self.generate(inputs)
-        frames = self._frames(made, inputs)
-        state = memory.append(state, frames, future)
-        state["done"] = made.done
-        return frames, made.features, state
-
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; all draws come from (seed, chunk_index)."""
         made = self.generate(inputs)
@@ -149,7 +130,7 @@ class TokensSimulator(Simulator):
             made.append(self.video.next_frame(known, told[:, at], _of(beside, at), draws))
             seen.append(self.video.net.observe(made[-1][:, None], told[:, at], _of(beside, at), known))
         features = torch.cat(seen, 1).float()
-        return Made(torch.stack(made, 1), self._pooled(features), self.video.done(features))
+        return Made(torch.stack(made, 1), self._pooled(features))
 
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of all frames of memory and of one chunk, any of the clip's, each from those before it; the
