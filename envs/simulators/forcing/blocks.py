@@ -199,7 +199,7 @@ class Blockwise(Simulator):
         """See Stepwise; weights [B, n, V, 1, h, w] are those of `loss`."""
         number, inputs = own_frames(self, clip, generator)
         begin = number * self.spec.chunk
-        part = slice(begin, begin + min(self.horizon, self.spec.chunk))
+        part = slice(begin, begin + self.horizon)
         last = unit(inputs["memory", "frames"][:, -1])
         return inputs, self._weight(last, clip["future", "valid"][:, part])
 
@@ -208,7 +208,7 @@ class Blockwise(Simulator):
         remembered = {name: rows[:, -self.context :] for name, rows in inputs["memory"].items()}
         frames = self._whole(remembered, inputs)
         latents = self._encode(unit(frames["frames"]))
-        window = slice(0, latents.shape[1] + min(self.horizon, self.spec.chunk))
+        window = slice(0, latents.shape[1] + self.horizon)
         return self._read(latents, self._beside(frames, window, inputs))
 
     def noise(self, inputs: TensorDict, given: Block) -> Tensor:

@@ -42,7 +42,7 @@ class ForcingSimulator(Blockwise):
         window: frames of a training clip of one chunk, more than a chunk has.
         context: newest frames that a block is generated from, c; before there are so many, the first repeats,
             as for a robot that stood still.
-        horizon: frames generated at once, h, at most.
+        horizon: frames generated at once, h, at most a chunk's.
         net: options of Trunk.
         codec: options of Autoencoder.
         denoising: options of Denoising.
@@ -50,7 +50,8 @@ class ForcingSimulator(Blockwise):
         actions: how it is told of actions, a class such as ActionVector.
 
     Attributes:
-        context, horizon: may be set to other numbers at any time; no weight depends on them.
+        context, horizon: may be set to other numbers at any time, within what is said above; no weight
+            depends on them.
 
     Raises:
         ValueError: if sizes do not fit.
@@ -77,6 +78,11 @@ class ForcingSimulator(Blockwise):
             raise ValueError(
                 f"simulator.window={window} must be more than task.chunk={spec.chunk}: a chunk goes on from"
                 " at least one frame"
+            )
+        if horizon > spec.chunk:
+            raise ValueError(
+                f"simulator.horizon={horizon} must be at most task.chunk={spec.chunk}: a block is generated"
+                " under its actions, and a chunk has no more of them; lower it, or raise task.chunk"
             )
         super().__init__(spec, window - spec.chunk)
         trunk = options(Trunk, net, "simulator.net")
