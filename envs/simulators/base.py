@@ -117,6 +117,12 @@ class Simulator(nn.Module):
         """Only the features of `predict`, for training the state expert."""
         return self.predict(inputs)[1]
 
+    def coded(self, frames: Tensor) -> Tensor | None:
+        """Frames uint8 [B, T, V, 3, H, W] as its autoencoder keeps each of them: how sharp it can be where it
+        knows everything. None of engines that have none.
+        """
+        return None
+
     def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
         """Take units from data before the first training; here there are none to take.
 

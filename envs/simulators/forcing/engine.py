@@ -116,13 +116,18 @@ class ForcingSimulator(Blockwise):
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; features are those of the last step, means over each view of each frame."""
         latents, features = self._generate(inputs)
-        decoded = self.codec.decode(latents.flatten(0, 2)).float().unflatten(0, latents.shape[:3])
+        decoded = self._decode(latents)
         last = unit(inputs["memory", "frames"][:, -1:])
         return to_bytes(restore_detail(decoded[:, 1:], decoded[:, :1], last)), features
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is decoded to pixels."""
         return self._generate(inputs)[1]
+
+    @torch.no_grad()
+    def coded(self, frames: Tensor) -> Tensor:
+        """See Simulator.coded."""
+        return to_bytes(self._decode(self._encode(unit(frames))))
 
     def _generate(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """Latents [B, 1 + K, V, C, h, w] of the last known frame and of a chunk, and the chunk's features
@@ -191,6 +196,10 @@ class ForcingSimulator(Blockwise):
         with torch.no_grad():
             flat = torch.cat([self.codec.encode(piece) for piece in frames.flatten(0, 2).split(_ENCODED)])
         return flat.float().unflatten(0, frames.shape[:3])
+
+    def _decode(self, latents: Tensor) -> Tensor:
+        """Frames float [B, T, V, 3, H, W] of latents [B, T, V, C, h, w]."""
+        return self.codec.decode(latents.flatten(0, 2)).float().unflatten(0, latents.shape[:3])
 
     def _beside(
         self, frames: Mapping[str, Tensor], window: slice, inputs: TensorDict

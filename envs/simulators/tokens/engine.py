@@ -115,6 +115,10 @@ class TokensSimulator(Simulator):
         """See Simulator.features; nothing is decoded to pixels."""
         return self.generate(inputs).features
 
+    def coded(self, frames: Tensor) -> Tensor:
+        """See Simulator.coded."""
+        return to_bytes(self.video.decode(self.video.encode(frames)))
+
     @torch.no_grad()
     def generate(self, inputs: TensorDict) -> Made:
         """The chunk after some inputs of `predict`, as tokens."""
