@@ -18,7 +18,7 @@ from pipeline.evaluation.fidelity.end_effector import EndEffectorRuler, end_effe
 from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.fidelity.frames import by_frame, frame_errors, summary
 from pipeline.evaluation.fidelity.frechet import Moments, frechet
-from pipeline.evaluation.objects.error import object_error
+from pipeline.evaluation.objects.error import object_offsets, object_summary
 
 _SIDE_BY_SIDE = 16  # episodes, whose frames are held at once
 
@@ -61,7 +61,7 @@ class OpenLoop:
                 for moments, video in zip(sides[extractor.name], (made.frames, true), strict=True):
                     for pictures in _samples(video, made.valid, extractor.clips, self.clip):
                         moments.add(pictures)
-            out.objects.append(object_error(self.store, self.episodes[some], made, true))
+            out.objects.append(object_offsets(self.store, self.episodes[some], made, true))
             if isinstance(self.hands, EndEffectorRuler):
                 out.hands.append(self.hands.measure(self.store, self.episodes[some], made, true))
         enough = {name: pair for name, pair in sides.items() if min(one.count for one in pair) > 1}
@@ -77,7 +77,7 @@ class Measured:
         errors: float32 [N, T, V] by name, see frames.frame_errors.
         valid: bool [N, T].
         frechet: see frechet.frechet, one for each extractor that had samples enough.
-        objects: see objects.error.object_error, of each part.
+        objects: see objects.error.object_offsets, of each part.
         hands: see end_effector.EndEffectorRuler.measure, of each part; end_effector: what they come to.
     """
 
@@ -85,7 +85,7 @@ class Measured:
         self.errors: dict[str, Tensor] = {}
         self.valid = torch.zeros(0, 0, dtype=torch.bool)
         self.frechet: list[dict[str, Any]] = []
-        self.objects: list[dict[str, Any]] = []
+        self.objects: list[dict[str, Tensor]] = []
         self.hands: list[dict[str, Tensor]] = []
         self.end_effector: dict[str, Any] = {}
 
@@ -105,7 +105,7 @@ class Measured:
             view: {name: values[..., k : k + 1] for name, values in self.errors.items()}
             for k, view in enumerate(views)
         }
-        known = [part for part in self.objects if part]
+        objects = object_summary(self.objects)
         return {
             "episodes": len(self.valid),
             "overall": summary(self.errors, self.valid),
@@ -116,8 +116,8 @@ class Measured:
                 for name, which in groups.items()
             },
             "frechet": self.frechet,
-            "object_cm": _mean([part["object_cm"]["median"] for part in known if "object_cm" in part]),
-            "object_lost": _mean([part["object_lost"] for part in known if "object_lost" in part]),
+            "object_cm": _median(objects.get("object_cm")),
+            "object_lost": objects.get("object_lost"),
             "end_effector": self.end_effector,
         }
 
@@ -147,9 +147,9 @@ def _longer(values: Tensor, frames: int) -> Tensor:
     return torch.cat((values, more), 1)
 
 
-def _mean(values: list[float]) -> float | None:
-    known = [value for value in values if value == value]
-    return sum(known) / len(known) if known else None
+def _median(found: Mapping[str, float] | None) -> float | None:
+    """That of quantiles; None where nothing was found."""
+    return None if found is None or found["median"] != found["median"] else found["median"]
 
 
 def held_still(store: ClipStore, episodes: Tensor, distance: PerceptualDistance) -> dict[str, Any]:
