@@ -87,7 +87,8 @@ def build_extractors(section: Mapping[str, Any]) -> list[Extractor]:
     """The extractors of a section fidelity, of frames and of clips.
 
     Raises:
-        ConfigError: for weights of another architecture, or an extractor of the other kind.
+        ConfigError: for weights of another architecture, an extractor of the other kind, or one whose clips
+            are longer than fidelity.clip.
     """
     out = []
     for key, clips in (("frames_extractor", False), ("clips_extractor", True)):
@@ -96,6 +97,11 @@ def build_extractors(section: Mapping[str, Any]) -> list[Extractor]:
             raise ConfigError(
                 f"fidelity.{key}._target_={section[key]['_target_']} should be an Extractor of"
                 f" {'clips' if clips else 'single frames'} (pipeline/evaluation/fidelity/extractors.py)"
+            )
+        if clips and section["clip"] < extractor.shortest:
+            raise ConfigError(
+                f"fidelity.clip={section['clip']}: {extractor.name} takes clips of {extractor.shortest}"
+                " frames or more; raise fidelity.clip, or choose another fidelity.clips_extractor"
             )
         out.append(extractor)
     return out
