@@ -25,6 +25,7 @@ from envs.files import atomic
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import PoolError, TaskPool
 from envs.physics.worker import Track
+from envs.specs import IMAGE
 from pipeline.evaluation.value.candidates import Candidate
 from pipeline.graph.code_version import digest
 
@@ -84,13 +85,36 @@ class Physics:
         make = self._scripted if candidate.expert is not None else self._acted
         return self.kept.get(f"true-{candidate.name}", identity, lambda: make(candidate, seeds))
 
-    def _acted(self, candidate: Candidate, seeds: list[int]) -> Tensors:
-        width = min(self.cfg["evaluate"]["envs"], len(seeds))
+    def strangeness(self, seeds: list[int], first: Tensor, where: Mapping[str, Any]) -> Tensor:
+        """Mean absolute difference in grey levels, float32 [N, N], of recorded first frames uint8
+        [N, V, 3, H, W] and of the pictures with which the episodes of N seeds begin.
+
+        Args:
+            where: what tells the recordings from others.
+        """
+        identity = {"physics": self.identity, **where, "seeds": seeds}
+        return self.kept.get("starts", identity, lambda: self._compared(seeds, first))["off"]
+
+    def _compared(self, seeds: list[int], first: Tensor) -> Tensors:
+        env, seen = self._physics(len(seeds)), []
+        for begin in range(0, len(seeds), env.batch_size[0]):
+            part = seeds[begin : begin + env.batch_size[0]]
+            env.schedule([*part, *[part[-1]] * (env.batch_size[0] - len(part))])
+            seen.append(env.reset()[IMAGE][: len(part)])
+        begun = torch.cat(seen).float()
+        return {"off": torch.stack([(row.float() - begun).abs().flatten(1).mean(1) for row in first])}
+
+    def _physics(self, seeds: int) -> PhysicsEnv:
+        width = min(self.cfg["evaluate"]["envs"], seeds)
         if self._env is None or self._env.batch_size[0] != width:
             self._close_env()
             self._env = build_physics(self.cfg, width)
+        return self._env
+
+    def _acted(self, candidate: Candidate, seeds: list[int]) -> Tensors:
+        env = self._physics(len(seeds))
         policy, stochastic = candidate.build(self.cfg, self.spread), self.cfg["policy_value"]["stochastic"]
-        outcome = evaluate(self._env, policy, seeds, stochastic, f"true {candidate.name}")
+        outcome = evaluate(env, policy, seeds, stochastic, f"true {candidate.name}")
         _check_all(
             candidate, seeds, [seed for seed, told in zip(seeds, outcome.counted, strict=True) if told]
         )
