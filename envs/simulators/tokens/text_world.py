@@ -99,12 +99,12 @@ class TextWorld(nn.Module):
         return self.video.codec
 
     def check(self, instructions: Sequence[str]) -> None:
-        """Refuse instructions that the text encoder would cut.
+        """Refuse instructions that would be cut.
 
         Raises:
-            ValueError: naming the text and the fix.
+            ConfigError: naming the text and the fix.
         """
-        self.reader.words.check(sorted(set(instructions)))
+        self.reader.check(sorted(set(instructions)))
 
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """Training loss of clips of successful episodes, and figures to log.
