@@ -26,6 +26,7 @@ from envs.targets import ConfigError, build, target
 from learners.stages.distill.stage import check_pair, train_student
 from learners.stages.simulator import SimulatorFitConfig
 from learners.training.fit import FitConfig
+from learners.training.optimisers import optimiser_state
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
 from tests.learners.models import section_of, simulator_of
 from tests.moving_square import SIZE
@@ -162,6 +163,19 @@ def test_a_killed_distillation_goes_on_bit_for_bit(
     assert all(torch.equal(value, whole[name]) for name, value in resumed.items())
     rows = [json.loads(line) for line in (tmp_path / "cut/metrics.jsonl").open()]
     assert [row["step"] for row in rows] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_muon_moves_the_hidden_layers_that_the_engine_names(method: str, tiny_store: Stores) -> None:
+    teacher, student = pair("forcing_small", tiny_store(BIMANUAL_POSES).spec)
+    options = FitConfig(1, 2, 1e-3, bf16=False, optimiser="muon")
+    made = build(
+        section(f"distiller/{method}"), "distill.method", teacher=teacher, student=student, config=options
+    )
+    trained = {name: p for name, p in made.named_parameters() if p.requires_grad}
+    state = optimiser_state(made.optimise(trained, 1e-3, 0.0), trained)
+    matrices = {name for name, held in state.items() if "momentum_buffer" in held}
+    assert matrices and all(set(student.hidden) & set(name.split(".")) for name in matrices)
 
 
 def test_teacher_and_student_must_belong_together(tiny_store: Stores) -> None:
