@@ -79,6 +79,17 @@ class GoldenGoalJudge(GoalJudge):
         if words := options["text_world"].get("words"):
             build(words, "judge.text_world.words")
 
+    @classmethod
+    def remedy(cls, options: Mapping[str, Any]) -> str:
+        """See Judge.remedy."""
+        ending, fallback = options["text_world"].get("ending", {}), options["fallback"]
+        said = ", ".join(f"judge.text_world.ending.{key}={value}" for key, value in ending.items())
+        return (
+            f"its text world does not say in the goals it imagines that the task is done ({said}), and"
+            f" judge.fallback={fallback}: train it longer (text_world_fit), change these, or set"
+            f" judge.fallback={Fallback.LAST_FRAME.value} or {Fallback.PROGRESS_ONLY.value}"
+        )
+
     def goals(self, first: Tensor, instruction: list[str]) -> Goals:
         """See GoalJudge.goals; imagines those that are not remembered."""
         keys = [_digest(*pair) for pair in zip(first, instruction, strict=True)]
