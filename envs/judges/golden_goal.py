@@ -138,11 +138,13 @@ class GoldenGoalJudge(GoalJudge):
         return success, status
 
     def facts(self) -> dict[str, Any]:
-        """See Judge.facts: also by what success is told, how many goals were imagined here, and in how
-        many of them the text world never said done.
+        """See Judge.facts: also by what success is told, how many goals were imagined here, in how many of
+        them the text world never said done, and above what they end.
         """
         told = "done" if hasattr(self.text_world, "done") else "likeness"
-        counted = {"goals": self.imagined, "goals_unfinished": self.unfinished}
+        ending = getattr(self.text_world, "threshold", None)
+        ending = None if ending is None else float(ending)
+        counted = {"goals": self.imagined, "goals_unfinished": self.unfinished, "ending_threshold": ending}
         return {**super().facts(), "success_by": told, "fallback": self.fallback.value, **counted}
 
     def train(self, mode: bool = True) -> GoldenGoalJudge:

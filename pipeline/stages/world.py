@@ -24,7 +24,7 @@ from learners.stages.generated import generated_frames, recorded_features
 from learners.stages.judge import calibrate, judge_recordings, train_judge
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
-from learners.stages.text_world import train_text_world
+from learners.stages.text_world import calibrate_ending, train_text_world
 from learners.stages.tokenizer import train_tokenizer
 from pipeline.acting import acting
 from pipeline.evaluation.judging import episode_success, labelled
@@ -153,7 +153,7 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 @stage(reads=(*ROBOT, "threads", "judge.text_world", "text_world_fit", "microbatches"), place=Place.LEARNERS)
 def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The text world of a judge that asks for one, with its tokenizer, going on from the role `warm` if there
-    is one.
+    is one; the threshold that ends its trajectories on recorded video that neither it nor judges learn from.
 
     Settings: phase, first or refresh.
     """
@@ -167,8 +167,9 @@ def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         *(model, store, store.split("train"), section["stride"], fit, folder),
         tokenizer=tokenizer if phase == "first" else None,
     )
+    calibrated = calibrate_ending(model, store, store.split("calibration"), section["stride"])
     save_weights(model, folder)
-    return stats
+    return {**stats, "ending_threshold": float(model.threshold), "ending_calibrated": calibrated}
 
 
 @stage(reads=(*WORLD, "judge_fit.{phase}", "rl.starts", "rl.chunks", "microbatches"), place=Place.LEARNERS)
