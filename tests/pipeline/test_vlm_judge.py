@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from envs.embodiment import Embodiment
@@ -103,6 +105,11 @@ def test_the_study_says_who_is_right_by_what_was_shown_and_what_it_cost(
     assert all(row[6] == "100.0%" for row in cells) and "prompt tokens 1800, " in rows[0]
     shown = {len(asked.pictures) for asked in server.seen}  # fewer than there are where the square rests
     assert max(shown) == 13 and {2, 4} <= shown
+    picture = tmp_path / "goal.png"
+    assert cv2.imwrite(str(picture), np.zeros((32, 32, 3), np.uint8))
+    cfg = load_config([words[0], words[1], words[2], "judge=goal_image", f"judge.picture={picture}"])
+    said = judge_study(cfg, tmp_path / "run", Selection.of({}))
+    assert said.splitlines()[-1].startswith("Judged by metric: NLPD") and "free" in said
     server.answer = lambda asked: "I cannot say."
     assert "calls" not in judge_study(cfg, tmp_path / "run", selection)  # all is remembered
     other = load_config(

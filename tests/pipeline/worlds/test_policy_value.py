@@ -18,6 +18,7 @@ from envs.embodiment import Embodiment
 from envs.targets import ConfigError
 from pipeline.commands.worlds.policy_value import policy_value
 from pipeline.config import load_config
+from pipeline.evaluation.value.page import judge_lines
 from pipeline.evaluation.value.trials import scripted_outcomes
 from tests.embodiments import ARM_DELTAS
 from tests.worlds import scripted_set, untrained_world
@@ -59,6 +60,15 @@ def test_values_beside_true_ones_and_nothing_is_tried_twice(tmp_path: Path) -> N
     table = result["agreement"]["micro"]
     assert sum(table[name] for name in ("tp", "fp", "fn", "tn")) == 24
     assert any("open loop" in note for note in result["notes"])
+    assert result["judged_by"] == {} and result["judge_cost"] == {}  # a learned judge is free
+    asked = {
+        "judged_by": {"metric": "NLPD", "goals_unfinished": 1},
+        "judge_cost": {"calls": 2.0, "cost": 0.5},
+    }
+    assert judge_lines(asked) == [
+        "Judged by metric: NLPD, goals unfinished: 1.",
+        "Asking the judge: calls 2, cost 0.5.",
+    ]
     page = (root / "policy-value.html").read_text()
     assert page.count("<title>") == 5 and "expert 0, push: 100 -&gt; " in page
     assert not re.findall(r'(?:src|href)=(?!"#)', page)
