@@ -70,6 +70,33 @@ def test_worlds_stand_side_by_side_after_equal_time(root: Path) -> None:
     assert run_study(study) == text and {path: path.stat().st_mtime_ns for path in made} == made
 
 
+STUDENTS = (
+    *(
+        "study=students",
+        "study.rows=[teacher,one]",
+        "simulator=dit_small",
+        "tokenizer_fit={steps: 2, batch: 4}",
+    ),
+    *("distill.first.fit={steps: 5, batch: 2}", "distill.method.critic_updates=1", "fidelity.episodes=2"),
+    *("task.horizon=8", "rounds.deploy=[8]", "rounds.splits.held_out=0.25", "rounds.clone=0"),
+    *(
+        row("teacher", "simulator.denoising.steps=2"),
+        row("one", "simulator.denoising.steps=2", "distill.steps=1"),
+    ),
+)
+
+
+def test_students_gain_by_the_same_rl_as_their_teacher(root: Path) -> None:
+    assert "not run" not in run_study(planned(root, STUDENTS))
+    cells = [entry["cells"] for entry in table_of(root)["rows"]]
+    assert all({"gain", "gap", "verdicts", "speed", "rollout"} <= set(each) for each in cells)
+    teacher, student = (entry.made.graph for entry in planned(root, STUDENTS).rows)
+    shared = ("collect", "imitation", "tokenizer", "simulator-1")
+    assert all(teacher.key(name) == student.key(name) for name in shared)
+    assert teacher.key("rl-1") != student.key("rl-1")
+    assert student.nodes["rl-1"].settings == teacher.nodes["rl-1"].settings
+
+
 ROBOSCAPE = (
     *("study=roboscape", "task=tabletop", "task.horizon=32", "task.suite.cameras=[head]"),
     *("judge=golden_goal", "simulator=tokens_small", "study.places=[two_tasks]"),
