@@ -70,6 +70,24 @@ def test_worlds_stand_side_by_side_after_equal_time(root: Path) -> None:
     assert run_study(study) == text and {path: path.stat().st_mtime_ns for path in made} == made
 
 
+TOKENS = (
+    *("study=tokens", "study.rows=[adaln,raster]", "study.places=[]", "simulator=tokens_small"),
+    *("equal_time={seconds: 1, measured: 2}", "fidelity.episodes=2", "task.horizon=8"),
+)
+
+
+def test_worlds_of_tokens_differ_in_what_their_rows_say(root: Path) -> None:
+    assert "not run" not in run_study(planned(root, TOKENS))
+    assert {"training", "rollout", "speed", "verdicts"} <= set(table_of(root)["rows"][0]["cells"])
+    every = "study.rows=[cross,adaln,maskgit2,maskgit8,raster]"
+    rows = {entry.name: entry.made.graph for entry in planned(root, [*TOKENS, every]).rows}
+    sections = {name: graph.cfg["simulator"] for name, graph in rows.items()}
+    told = {name: section["conditioning"]["_target_"].split(".")[-1] for name, section in sections.items()}
+    assert told == {name: "AdaLN" if name == "adaln" else "CrossAttention" for name in rows}
+    assert "steps" not in sections["raster"]["decoding"]
+    assert [sections[name]["decoding"]["steps"] for name in ("maskgit2", "maskgit8")] == [2, 8]
+
+
 STUDENTS = (
     *(
         "study=students",
