@@ -136,7 +136,7 @@ class TextWorld(nn.Module):
         ended = torch.zeros(len(first), dtype=torch.bool, device=device)
         tokens: list[Tensor] = []
         done: list[Tensor] = []
-        while len(tokens) < self.ending.max_frames and not ended.all():
+        while True:
             new = self.video.next_frame(known, told, None, draws)
             said = self.video.done(self.video.net.observe(new[:, None], told, None, known).float())[:, 0]
             if tokens:  # those that have ended rest
@@ -145,6 +145,8 @@ class TextWorld(nn.Module):
             tokens.append(new)
             done.append(said)
             ended = ended | (said > self.threshold)
+            if len(tokens) == self.ending.max_frames or ended.all():
+                break
         every = torch.stack(done, 1)
         over = every > self.threshold
         goal = torch.where(ended, over.long().argmax(1), over.shape[1] - 1)
