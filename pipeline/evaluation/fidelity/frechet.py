@@ -23,7 +23,11 @@ class Moments:
 
     def add(self, pictures: Tensor) -> None:
         """Take in pictures or clips, as the extractor takes them."""
-        features = self.extractor(pictures).double()
+        self.take(self.extractor(pictures))
+
+    def take(self, features: Tensor) -> None:
+        """Take in what the extractor said, float32 [N, D]."""
+        features = features.double()
         self.count += len(features)
         self._sum = self._sum + features.sum(0)
         self._outer = self._outer + features.T @ features

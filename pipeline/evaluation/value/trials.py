@@ -21,7 +21,7 @@ from torchrl.envs import TransformedEnv
 from actors.factory import build_physics, build_pool
 from actors.policies.recorded import Commands, RecordedActions
 from actors.rollouts.evaluate import Outcome, evaluate
-from envs.files import atomic
+from envs.files import atomic, write_text
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import PoolError, TaskPool
 from envs.physics.worker import Track
@@ -30,6 +30,7 @@ from pipeline.evaluation.value.candidates import Candidate
 from pipeline.graph.code_version import digest
 
 Tensors = dict[str, Tensor]
+_ODD = r"[^\w.+-]+"  # in names of files
 
 
 class Kept:
@@ -45,8 +46,7 @@ class Kept:
     def get(self, name: str, identity: Mapping[str, Any], make: Callable[[], Tensors]) -> Tensors:
         """What `make` gave for this identity, now or at some earlier time."""
         key = digest(json.dumps(identity, sort_keys=True, default=str))
-        readable = re.sub(r"[^\w.+-]+", "_", name)
-        path = self.folder / f"{readable}-{key}.safetensors"
+        path = self.folder / f"{re.sub(_ODD, '_', name)}-{key}.safetensors"
         if path.exists():
             self.reused += 1
             return load_file(path)
@@ -54,6 +54,14 @@ class Kept:
         with atomic(path) as part:
             save_file({field: value.contiguous() for field, value in made.items()}, part)
         return made
+
+    def figures(self, name: str, identity: Mapping[str, Any], make: Callable[[], dict[str, Any]]) -> Any:
+        """The same of what JSON holds."""
+        key = digest(json.dumps(identity, sort_keys=True, default=str))
+        path = self.folder / f"{re.sub(_ODD, '_', name)}-{key}.json"
+        if not path.exists():
+            write_text(path, json.dumps(make()))
+        return json.loads(path.read_text())
 
 
 @dataclass
