@@ -121,6 +121,13 @@ class Judge(nn.Module):
         """
 
     @classmethod
+    def remedy(cls, options: Mapping[str, Any]) -> str:
+        """What to change, and why, where a judge of these options gives no judgement on episode after
+        episode; names keys.
+        """
+        return "choose another judge (judge=...)"
+
+    @classmethod
     def files(cls, options: Mapping[str, Any]) -> tuple[Path, ...]:
         """Files whose contents decide judgements, by options that name one: when they change, what was made
         with the judge is out of date.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -31,6 +32,14 @@ class FittedJudge(Judge):
     def __init__(self, hold: int, margin: float, discount: float):
         super().__init__(hold)
         self.margin, self.discount = margin, discount
+
+    @classmethod
+    def remedy(cls, options: Mapping[str, Any]) -> str:
+        """See Judge.remedy."""
+        return (
+            f"it abstains within judge.margin={options['margin']} of its threshold: lower that, or teach it"
+            " longer or on more episodes (judge_fit)"
+        )
 
     def loss(self, data: TensorDict, share: float) -> tuple[Tensor, dict[str, Any]]:
         """Class-balanced cross-entropy of success plus cross-entropy of progress; see Judge.loss."""

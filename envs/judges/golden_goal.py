@@ -79,6 +79,17 @@ class GoldenGoalJudge(GoalJudge):
         if words := options["text_world"].get("words"):
             build(words, "judge.text_world.words")
 
+    @classmethod
+    def remedy(cls, options: Mapping[str, Any]) -> str:
+        """See Judge.remedy."""
+        ending, fallback = options["text_world"].get("ending", {}), options["fallback"]
+        said = ", ".join(f"judge.text_world.ending.{key}={value}" for key, value in ending.items())
+        return (
+            f"its text world does not say in the goals it imagines that the task is done ({said}), and"
+            f" judge.fallback={fallback}: train it longer (text_world_fit), change these, or set"
+            f" judge.fallback={Fallback.LAST_FRAME.value} or {Fallback.PROGRESS_ONLY.value}"
+        )
+
     def goals(self, first: Tensor, instruction: list[str]) -> Goals:
         """See GoalJudge.goals; imagines those that are not remembered."""
         keys = [_digest(*pair) for pair in zip(first, instruction, strict=True)]
@@ -127,11 +138,13 @@ class GoldenGoalJudge(GoalJudge):
         return success, status
 
     def facts(self) -> dict[str, Any]:
-        """See Judge.facts: also by what success is told, how many goals were imagined here, and in how
-        many of them the text world never said done.
+        """See Judge.facts: also by what success is told, how many goals were imagined here, in how many of
+        them the text world never said done, and above what they end.
         """
         told = "done" if hasattr(self.text_world, "done") else "likeness"
-        counted = {"goals": self.imagined, "goals_unfinished": self.unfinished}
+        ending = getattr(self.text_world, "threshold", None)
+        ending = None if ending is None else float(ending)
+        counted = {"goals": self.imagined, "goals_unfinished": self.unfinished, "ending_threshold": ending}
         return {**super().facts(), "success_by": told, "fallback": self.fallback.value, **counted}
 
     def train(self, mode: bool = True) -> GoldenGoalJudge:

@@ -38,6 +38,13 @@ from learners.training.checkpoint import Checkpoints, adam_moments, buffers_of, 
 from learners.training.interrupt import deferred_signals, leave
 from learners.training.parallel import Trainee, from_leader, leads
 
+# Why episodes spoil: by the ledger's reason the figure that counts them, and what happened.
+_SPOILED = {
+    "judge": ("dropped_by_judge", "a judge that gave no judgement"),
+    "NaN actions": ("dropped_nan", "a policy that says NaN"),
+    "physics": ("dropped_by_physics", "physics that crashes"),
+}
+
 
 def train_rl(
     fleet: Fleet | None,
@@ -158,16 +165,11 @@ def train_rl(
             spent["update"] += updated - collected
             done = batch["next", "done"]
             episodes += int(done.sum() + (~done[:, -1]).sum())
-            ledger.settle(
-                len(batch),
-                {
-                    "judge": int(figures["dropped_by_judge"]),
-                    "NaN actions": int(figures["dropped_nan"]),
-                    "physics": int(figures["dropped_by_physics"]),
-                },
-            )
+            spoiled = {reason: int(figures[key]) for reason, (key, _) in _SPOILED.items()}
+            ledger.settle(len(batch), spoiled)
             if feed is not None:
-                feed.check_losses("judges that gave no verdict, a policy that says NaN, physics that crashes")
+                causes = [what for reason, (_, what) in _SPOILED.items() if spoiled[reason]]
+                feed.check_losses(" and ".join(causes) or "none now")
             figures |= supply | {"time/rollout": collected - began, "time/update": updated - collected}
             figures["time/learning"] = sum(spent.values())
             enough = False

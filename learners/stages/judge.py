@@ -5,10 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from scipy.optimize import minimize
-from scipy.special import expit
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -19,6 +16,7 @@ from envs.specs import Status
 from envs.targets import ConfigError
 from learners.stages.pictures import augment
 from learners.stages.simulator import owners
+from learners.stages.threshold import as_likely_as_not
 from learners.training.fit import FitConfig, fit
 
 _SHIFT = (
@@ -210,9 +208,7 @@ def calibrate(judge: Judge, success: Tensor, succeeded: Tensor) -> bool:
 
     On recorded video, that is: on generated video the threshold would also make up for what the simulator
     gets wrong, and a judge made lenient for a pessimistic simulator is what a policy learns to exploit. And
-    on video that it has not learned from, of which it is too sure. The likelihood is logistic in the logit of
-    an episode's score (Platt 1999, with his targets, which keep it finite where scores part the outcomes): it
-    uses all episodes, where a threshold of best accuracy jumps with a few of them.
+    on video that it has not learned from, of which it is too sure.
 
     Args:
         success: frame probabilities [N, T] of recorded episodes that it did not learn from, 0 where they are
@@ -224,23 +220,7 @@ def calibrate(judge: Judge, success: Tensor, succeeded: Tensor) -> bool:
         rise with success.
     """
     known = torch.isfinite(success).all(1)
-    success, succeeded = success[known], succeeded[known]
-    hits = float(succeeded.sum())
-    if hits in (0.0, float(len(succeeded))):
-        return False
-    score = torch.logit(judge.confidence(success.double()).clamp(0.01, 0.99)).numpy()
-    targets = (
-        torch.where(succeeded, (hits + 1) / (hits + 2), 1 / (len(succeeded) - hits + 2)).double().numpy()
-    )
-
-    def misfit(line: Any) -> tuple[float, Any]:
-        logit = line[0] * score + line[1]
-        value = (np.logaddexp(0, logit) - targets * logit).mean()
-        gap = expit(logit) - targets
-        return float(value), [(gap * score).mean(), gap.mean()]
-
-    slope, offset = minimize(misfit, [1.0, 0.0], jac=True).x
-    if slope <= 0:
-        return False
-    judge.threshold.fill_(float(expit(-offset / slope).clip(0.02, 0.98)))
-    return True
+    found = as_likely_as_not(judge.confidence(success[known].double()), succeeded[known])
+    if found is not None:
+        judge.threshold.fill_(found)
+    return found is not None

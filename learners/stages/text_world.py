@@ -14,6 +14,7 @@ from envs.episodes.clips import ClipStore
 from envs.ranges import Count
 from envs.simulators.tokens.text_world import TextWorld
 from envs.targets import ConfigError
+from learners.stages.threshold import as_likely_as_not
 from learners.stages.tokenizer import train_tokenizer
 from learners.training.fit import FitConfig, fit
 
@@ -96,3 +97,38 @@ def train_text_world(
 
     stats = fit("text_world", world, batch, world.loss, options, folder)
     return {**stats, **about, "successes": len(good)}
+
+
+def calibrate_ending(
+    world: TextWorld, store: ClipStore, episodes: Tensor, stride: Count, batch: int = 32
+) -> bool:
+    """Set the threshold by which golden trajectories end where a frame is as likely done as not, on recorded
+    video of successes and failures that it has not learned from, of which it is too sure.
+
+    Args:
+        episodes: int64 [N]; those that nobody labelled tell nothing.
+        stride: see SuccessfulClips; it looks at them as it imagines.
+
+    Returns:
+        Whether it was set; it stays where no frame shows success, or all do, or what it says does not rise
+        with it.
+    """
+    if not len(episodes):
+        return False
+    last = store.length[episodes][:, None] - 1
+    ahead = stride * torch.arange(1, -(-int(last.max()) // stride) + 1)  # up to the last frame of each
+    rows = store.start[episodes][:, None] + torch.minimum(ahead, last)
+    done = store.success(episodes, rows)
+    known = (ahead - stride < last) & store.arrays["present"][rows] & torch.isfinite(done)
+    if not known.any():
+        return False
+    said = []
+    for some in torch.arange(len(episodes)).split(batch):
+        first = store.start[episodes[some]][:, None]
+        frames = store.frames(torch.cat((first, rows[some]), 1))
+        texts = [store.instructions[number] for number in episodes[some].tolist()]
+        said.append(world.done_along(frames, texts)[:, 1:])
+    found = as_likely_as_not(torch.cat(said)[known].double(), done[known] > 0)
+    if found is not None:
+        world.threshold.fill_(found)
+    return found is not None

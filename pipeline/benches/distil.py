@@ -1,7 +1,8 @@
 """worldloop bench distil: what each number of function evaluations a chunk costs and buys, of a teacher and
-of the students that two methods make of it.
+of the students that two methods make of it, and which of them come where a student should.
 
-Every part is a stage of a graph of its own, so the bench goes on where it was stopped.
+Every part is a stage of a graph of its own, so the bench goes on where it was stopped. What RL gains in each
+is `worldloop study study=students`.
 """
 
 from __future__ import annotations
@@ -14,23 +15,29 @@ from typing import Any
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure as ssim
 
-from actors.factory import build_simulator, build_state_decoder
+from actors.factory import build_judge, build_simulator, build_state_decoder
 from actors.process import prepare_process
 from envs.episodes.clips import ClipStore
 from envs.files import write_text
+from envs.simulators.base import Simulator
 from envs.simulators.replay import Replay, replay
 from envs.targets import ConfigError, target
 from pipeline.acting import acting
 from pipeline.cli.words import root_of
+from pipeline.evaluation.judging import judge_frames, judge_table, labelled
 from pipeline.evaluation.measurement import rollout_error, speed
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.loop import has_physics
 from pipeline.stages import collect, world
-from pipeline.stages.given import TASK, Cfg, open_store
+from pipeline.stages.given import WORLD, Cfg, open_store
 
 TEACHER, STUDENT = (15, 8, 4, 2, 1), (4, 2, 1)
-_EPISODES = 8  # held-out ones that are measured
+# Where a student should come: so many evaluations at most, times the teacher's frames a second, and dB lost
+# over a rollout; and imagined success no further from the truth.
+_EVALUATIONS, _FASTER, _LOST_DB = 4, 4.0, 0.5
+_EPISODES = 8  # held-out ones whose pictures are measured
+_JUDGED = 32  # held-out ones that are judged
 _TRAJECTORY = {"_target_": "learners.stages.distill.trajectory.TrajectoryRegression"}
 _FIGURES = {
     "frames/s at 1": "{speed_1:.0f}",
@@ -40,6 +47,8 @@ _FIGURES = {
     "PSNR of {frames} frames": "{rollout_psnr:.2f}",
     "SSIM ": "{rollout_ssim:.3f}",
     "state error": "{state:.3f}",
+    "judge: TP / FP / FN / TN": "{judge_tp:.0f} / {judge_fp:.0f} / {judge_fn:.0f} / {judge_tn:.0f}",
+    "imagined less true success": "{judge_gap:+.1f}",
 }
 
 
@@ -59,7 +68,33 @@ def distil(cfg: dict[str, Any]) -> dict[str, dict[str, Any]]:
     print(f"| | {' | '.join(_FIGURES).format(frames=frames)} |\n|{' --- |' * (1 + len(_FIGURES))}")
     for title, figures in found.items():
         print(f"| {title} | {' | '.join(form.format(**figures) for form in _FIGURES.values())} |")
+    print("\n".join(reached(found)))
     return found
+
+
+def reached(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """A line for each student: whether it comes where it should beside the teacher of the most evaluations,
+    and by how much.
+    """
+    (first, teacher), *_ = found.items()
+    lines = []
+    for title, row in found.items():
+        if row["evaluations"] == 0:
+            continue
+        faster = [row[f"speed_{n}"] / teacher[f"speed_{n}"] for n in (1, 32)]
+        lost = teacher["rollout_psnr"] - row["rollout_psnr"]
+        missed = [
+            *([f"{row['evaluations']} evaluations"] if row["evaluations"] > _EVALUATIONS else []),
+            *(["frames/s"] if min(faster) < _FASTER else []),
+            *(["PSNR"] if lost > _LOST_DB else []),
+            *(["gap to truth"] if abs(row["judge_gap"]) > abs(teacher["judge_gap"]) else []),
+        ]
+        lines.append(
+            f"{title}: {'missed by ' + ', '.join(missed) if missed else 'met'} ({faster[0]:.1f} and"
+            f" {faster[1]:.1f} times the frames/s of {first} at 1 and 32, {lost:.2f} dB lost over a rollout,"
+            f" imagined less true success {row['judge_gap']:+.1f} and {teacher['judge_gap']:+.1f} points)"
+        )
+    return lines
 
 
 def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, str]]:
@@ -80,15 +115,27 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
     warm = graph.add("tokenizer", world.tokenizer, {"data": data}) if "codec" in cfg["simulator"] else ""
     teacher = graph.add("simulator", world.simulator, {"data": data, "warm": warm}, phase="first")
     rows = {}
+    asks: Any = target(cfg["judge"], "judge")
+    golden = graph.add("text_world", world.text_world, {"data": data}, phase="first") if _golden(cfg) else ""
 
-    def measured(title: str, name: str, simulator: str, section: Mapping[str, Any]) -> None:
+    def judged(own: Graph, name: str, simulator: str) -> str:
+        """The judge of a simulator; one that sees pictures alone is the same for all."""
+        if not asks.reads_features:
+            own, name, simulator = graph, "all", teacher
+        if f"judge-{name}" in own.nodes:
+            return f"judge-{name}"
+        roles = {"data": data, "simulator": simulator, "text_world": golden}
+        return own.add(f"judge-{name}", world.judge, roles, phase="first")
+
+    def measured(title: str, name: str, simulator: str, section: Mapping[str, Any], evaluations: int) -> None:
         own, roles = graph.under({**cfg, "simulator": section}), {"data": data, "simulator": simulator}
         state = own.add(f"state-{name}", world.state, roles, phase="first")
-        rows[title] = own.add(f"measure-{name}", measure, {**roles, "state": state})
+        roles |= {"state": state, "judge": judged(own, name, simulator)}
+        rows[title] = own.add(f"measure-{name}", measure, roles, evaluations=evaluations)
 
     for steps in TEACHER:
         section = engine.stepped_section(cfg["simulator"], steps)  # type: ignore[attr-defined]
-        measured(f"teacher, {steps}", f"teacher-{steps}", teacher, section)
+        measured(f"teacher, {steps}", f"teacher-{steps}", teacher, section, 0)
     for method in (cfg["distill"]["method"], _TRAJECTORY):
         name = str(method["_target_"]).rpartition(".")[2]
         given = {**cfg, "distill": {**cfg["distill"], "method": method}}
@@ -96,13 +143,21 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
         student = graph.under(given).add(f"student-{name}", world.student, roles, phase="first")
         for steps in (n for n in STUDENT if n <= most):
             few = acting({**given, "distill": {**given["distill"], "steps": steps}})
-            measured(f"{name}, {steps}", f"{name}-{steps}", student, few["simulator"])
+            measured(f"{name}, {steps}", f"{name}-{steps}", student, few["simulator"], steps)
     return graph, rows
 
 
-@stage(reads=("seed", "threads", *TASK, "simulator", "measure.speed_chunks"), place=Place.EVALUATOR)
+def _golden(cfg: Mapping[str, Any]) -> bool:
+    return "text_world" in cfg["judge"]
+
+
+@stage(reads=(*WORLD, "measure.speed_chunks"), place=Place.EVALUATOR)
 def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """Speed, and errors of held-out episodes: chunk by chunk from true frames, and rolled out as a whole."""
+    """Speed, and errors of held-out episodes: chunk by chunk from true frames, and rolled out as a whole;
+    verdicts of the judge on the latter.
+
+    Settings: evaluations of a student, 0 of the teacher.
+    """
     prepare_process(cfg["seed"], cfg["threads"])
     simulator = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
@@ -110,12 +165,28 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     held = store.split("held_out")[:_EPISODES]
     chunks, whole = (replay(simulator, store, held, decoder, bf16=bf16, alone=n) for n in (1, None))
     return {
+        "evaluations": inputs.settings["evaluations"],
+        **_verdicts(cfg, inputs, simulator, store),
         "frames": whole.frames.shape[1],
         **{f"chunk_{name}": value for name, value in _pictures(store, chunks).items()},
         **{f"rollout_{name}": value for name, value in _pictures(store, whole).items()},
         "state": rollout_error(store, held, whole)["state"]["median"],
         **{f"speed_{n}": speed(simulator, store, n, cfg["measure"]["speed_chunks"]) for n in (1, 32)},
     }
+
+
+def _verdicts(cfg: Cfg, inputs: Inputs, simulator: Simulator, store: ClipStore) -> dict[str, float]:
+    """Confusion of the judge's verdicts on generated video with recorded success, and imagined less true
+    success in points, of the episodes that it could judge; NaN if there are none.
+    """
+    held, bf16 = labelled(store, store.split("held_out"))[:_JUDGED], cfg["simulator"]["bf16"]
+    made, judge = replay(simulator, store, held, bf16=bf16), build_judge(cfg, inputs.weights("judge"))
+    scores = judge_frames(judge.eval(), made.frames, store, held, made.features)
+    found = judge_table(judge, scores, made.valid, store, held)
+    count = {name: float(found.get(name, 0)) for name in ("tp", "fp", "fn", "tn")}
+    judged = sum(count.values())
+    gap = 100 * (count["fp"] - count["fn"]) / judged if judged else float("nan")
+    return {**{f"judge_{name}": value for name, value in count.items()}, "judge_gap": gap}
 
 
 def _pictures(store: ClipStore, made: Replay) -> dict[str, float]:

@@ -1,9 +1,9 @@
 """worldloop bench gesim: seconds a chunk of a GE-Sim world with random weights, where they go, and what the
 silicon would allow.
 
-On a GPU it is the 2B configuration at 3 x 384 x 512 and 25 frames; elsewhere the same code at a small size,
-and for the 2B one its floor: floating-point operations and bytes, counted on the network itself without
-computing it.
+On a GPU (launch.device) it is the 2B configuration at 3 x 384 x 512 and 25 frames; elsewhere the same code at
+a small size, and for the 2B one its floor: floating-point operations and bytes, counted on the network itself
+without computing it.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
+from actors.process import device_of
 from envs.embodiment import ActionKind, Arm, Camera, Embodiment, Robot
 from envs.precision import mixed_precision
 from envs.rng import constant_generator, seed_process
@@ -103,7 +104,7 @@ class Watch:
 
     def _now(self) -> float:
         if self.device.type == "cuda":
-            torch.cuda.synchronize()
+            torch.cuda.synchronize(self.device)
         return time.perf_counter()
 
     def wrap(self, owner: Any, method: str, name: str) -> Callable[[], None]:
@@ -132,9 +133,12 @@ class Watch:
 
 def gesim(cfg: Mapping[str, Any]) -> None:
     """Seconds a chunk and frames per second at batch 1, 2, 4, 8, memory, parts, and variants, each as a ratio
-    to the plain run.
+    to the plain run; on launch.device.
+
+    Raises:
+        ConfigError: if launch.device asks for a GPU that is not there.
     """
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = device_of(cfg)
     big = device.type == "cuda"
     seed_process(0)
     spec, sizes = (FULL, ({}, {})) if big else (SMALL, (SMALL_NET, SMALL_VAE))
@@ -142,7 +146,7 @@ def gesim(cfg: Mapping[str, Any]) -> None:
     if big:
         world.to(torch.bfloat16)
     count = sum(p.numel() for p in world.net.parameters())
-    chip = torch.cuda.get_device_name() if big else "CPU"
+    chip = torch.cuda.get_device_name(device) if big else "CPU"
     size = f"{spec.views} x {spec.size[0]} x {spec.size[1]}"
     print(f"{count / 1e6:.0f}M parameters, {size}, {spec.chunk} frames, {chip}")
     watch = Watch(device)
@@ -150,12 +154,12 @@ def gesim(cfg: Mapping[str, Any]) -> None:
     plain = 0.0
     for batch in (1, 2, 4, 8):
         if big:
-            torch.cuda.reset_peak_memory_stats()
+            torch.cuda.reset_peak_memory_stats(device)
         state, future = _inputs(world, batch, device)
         with mixed_precision(device, True):
             seconds = watch.measure(partial(_step, world, state, future), repeats)
         memory = (
-            torch.cuda.max_memory_allocated() / 2**30
+            torch.cuda.max_memory_allocated(device) / 2**30
             if big
             else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
         )
@@ -167,7 +171,7 @@ def gesim(cfg: Mapping[str, Any]) -> None:
         )
     _parts(world, device, watch)
     _variants(world, device, watch, plain, repeats)
-    floor(FULL, _MEMORY)
+    floor(FULL, _MEMORY, chip)
 
 
 def _step(world: GESimulator, state: TensorDict, future: TensorDict) -> None:

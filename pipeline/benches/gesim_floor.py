@@ -16,7 +16,8 @@ from envs.specs import WorldSpec
 
 # Dense bf16 FLOP/s and bytes/s of what the goal is set for (NVIDIA's data sheets).
 CHIPS = {"H100": (989e12, 3.35e12), "H200": (989e12, 4.8e12)}
-GOAL = 1.15  # s a chunk at batch 1 on one H200
+GOAL, _GOAL_CHIP = 1.15, "H200"  # s a chunk at batch 1 on one of these
+COMMAND = "worldloop bench gesim launch.device=cuda"
 
 
 def count_flops(
@@ -63,9 +64,12 @@ def count_flops(
     }
 
 
-def floor(spec: WorldSpec, memory: int) -> None:
-    """Operations and bytes of the 2B configuration, and the seconds below which no dense bf16 run of it can
-    go.
+def floor(spec: WorldSpec, memory: int, chip: str) -> None:
+    """Operations and bytes of the 2B configuration, the seconds below which no dense bf16 run of it can go,
+    and whether the goal was measured just now.
+
+    Args:
+        chip: what the bench ran on.
     """
     net = DiTShape()
     flops = count_flops(spec, memory, net, 4, {})
@@ -77,9 +81,17 @@ def floor(spec: WorldSpec, memory: int) -> None:
         + ", ".join(f"{name} {value / 1e12:.1f}" for name, value in flops.items())
         + f"), {4 * weights / 1e9:.0f} GB of weights read"
     )
-    for chip, (speed, bandwidth) in CHIPS.items():
+    for name, (speed, bandwidth) in CHIPS.items():
         print(
-            f"  {chip}: at least {total / speed:.2f} s of arithmetic in dense bf16,"
+            f"  {name}: at least {total / speed:.2f} s of arithmetic in dense bf16,"
             f" {4 * weights / bandwidth * 1e3:.0f} ms of reading weights;"
             f" {100 * total / speed / GOAL:.0f}% of its peak would meet {GOAL} s"
         )
+    print(goal_line(spec, chip))
+
+
+def goal_line(spec: WorldSpec, chip: str) -> str:
+    """The goal, whether a bench on this chip measured it, and by which command it is."""
+    size = f"{spec.chunk} frames x {spec.views} views at {spec.size[0]} x {spec.size[1]}"
+    found = "measured above" if _GOAL_CHIP in chip else f"unmeasured, for this is {chip}"
+    return f"goal, {size} in {GOAL} s on one {_GOAL_CHIP}: {found}; {COMMAND}"

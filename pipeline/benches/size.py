@@ -1,4 +1,5 @@
-"""worldloop bench size simulator=NAME: what an engine takes, counted on shapes alone, without computing it.
+"""worldloop bench size simulator=NAME [judge=golden_goal_full]: what an engine, and a judge's text world,
+take, counted on shapes alone, without computing it.
 
 Parameters, floating-point operations of one training step and of one generated chunk, and memory. Works for
 sizes that no machine at hand could hold: tensors lie on torch's meta device, which knows shapes and no
@@ -13,7 +14,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -21,7 +22,8 @@ from actors.world_config import world_spec
 from envs.rng import step_generator
 from envs.simulators.base import WORLD_OPTIONS, Simulator
 from envs.simulators.inputs import build_inputs
-from envs.specs import WorldSpec
+from envs.simulators.tokens.text_world import TextWorld
+from envs.specs import WorldSpec, text_to_bytes
 from envs.targets import ConfigError, build
 
 _FLOAT = 4  # bytes: weights are kept in float32
@@ -82,26 +84,63 @@ def size_of(section: Mapping[str, Any], spec: WorldSpec) -> Size:
         ConfigError: if the engine asks for numbers that shapes do not tell.
     """
     own = {name: value for name, value in section.items() if name not in WORLD_OPTIONS}
+
+    def works(world: Simulator) -> Works:
+        clip, generator = _clip(spec, world.memory_frames), step_generator(0, 0)
+        inputs = build_inputs(spec, clip, 0, generator=generator)
+        return lambda: world.predict(inputs), lambda: world.loss(clip, generator)[0]
+
+    return _size(own, "simulator", spec, works)
+
+
+def text_world_size(section: Mapping[str, Any], spec: WorldSpec) -> Size:
+    """Count a text world; what it generates is the first frame towards a goal.
+
+    Args:
+        section: judge.text_world of a config.
+
+    Raises:
+        ConfigError: see size_of.
+    """
+
+    def works(world: TextWorld) -> Works:
+        frames = torch.zeros(1, world.window, spec.views, 3, *spec.size, dtype=torch.uint8, device="meta")
+        known = torch.ones(1, world.window, device="meta")
+        text = text_to_bytes(["text"])  # read, so it has numbers
+        clip = TensorDict({"frames": frames, "valid": known.bool(), "success": known, "text": text}, [1])
+        seed = torch.zeros(1, dtype=torch.int64)
+        return (
+            lambda: world.imagine(frames[:, 0], ["text"], seed),
+            lambda: world.loss(clip, step_generator(0, 0))[0],
+        )
+
+    return _size(section, "judge.text_world", spec, works)
+
+
+Works = tuple[Callable[[], Any], Callable[[], Tensor]]  # generate, and the loss of one sample
+
+
+def _size(section: Mapping[str, Any], key: str, spec: WorldSpec, works: Callable[[Any], Works]) -> Size:
+    """Count what a section builds."""
     try:
         with torch.device("meta"):
-            world: Simulator = build(own, "simulator", spec=spec)
+            world: nn.Module = build(section, key, spec=spec)
         parameters = list(world.parameters())
         trained = sum(p.numel() for p in parameters if p.requires_grad)
-        clip = _clip(spec, world.memory_frames)
-        generator = step_generator(0, 0)
-        generating = _counted(lambda: world.eval().predict(build_inputs(spec, clip, 0, generator=generator)))
-        kept = _Kept(parameters)
+        generate, lose = works(world.eval())
+        generating, kept = _counted(generate), _Kept(parameters)
+        world.train()
 
         def learn() -> None:
             with torch.enable_grad(), torch.autograd.graph.saved_tensors_hooks(kept.keep, lambda x: x):
-                loss = world.train().loss(clip, generator)[0]
+                loss = lose()
             if loss.requires_grad:
                 loss.backward()
 
         training = _counted(learn)
     except (NotImplementedError, RuntimeError, TypeError, AttributeError) as error:
         raise ConfigError(
-            f"simulator ({section['_target_']}) cannot be counted on shapes alone, for something in it asks"
+            f"{key} ({section['_target_']}) cannot be counted on shapes alone, for something in it asks"
             f" for numbers: {type(error).__name__}: {str(error).partition(chr(10))[0]}"
         ) from error
     total = sum(p.numel() for p in parameters)
@@ -162,17 +201,26 @@ def _clip(spec: WorldSpec, remembered: int) -> TensorDict:
 
 
 def size(cfg: Mapping[str, Any]) -> None:
-    """Print what the engine of the section simulator takes, for the robot and size of the section task."""
-    spec, batch = world_spec(cfg), int(cfg["simulator_fit"]["first"]["fit"]["batch"])
-    found = size_of(cfg["simulator"], spec)
+    """Print what the engine of the section simulator takes, for the robot and size of the section task, and
+    what the text world of the section judge does, if it has one.
+    """
+    spec = world_spec(cfg)
+    found, batch = size_of(cfg["simulator"], spec), int(cfg["simulator_fit"]["first"]["fit"]["batch"])
+    name = str(cfg["simulator"]["_target_"]).rpartition(".")[2]
+    print(_said(name, f"chunks of {spec.chunk}", "one chunk", spec, found, batch))
+    if text_world := cfg["judge"].get("text_world"):
+        found, batch = text_world_size(text_world, spec), int(cfg["text_world_fit"]["first"]["batch"])
+        print(_said("TextWorld", f"clips of {text_world['window']}", "one frame", spec, found, batch))
+
+
+def _said(name: str, what: str, made: str, spec: WorldSpec, found: Size, batch: int) -> str:
     weights, state = (_FLOAT * n / 1e9 for n in (found.trained + found.frozen, _STATE * found.trained))
     kept = found.activations / 1e9
-    name = str(cfg["simulator"]["_target_"]).rpartition(".")[2]
-    print(
-        f"{name}: {spec.views} x {spec.size[0]} x {spec.size[1]}, chunks of {spec.chunk},"
+    return (
+        f"{name}: {spec.views} x {spec.size[0]} x {spec.size[1]}, {what},"
         f" {found.trained / 1e6:.1f} M parameters that learn and {found.frozen / 1e6:.1f} M that do not\n"
         f"one training step at batch {batch}: {batch * found.training / 1e12:.3g} TFLOP\n"
-        f"one chunk at batch 1: {found.generating / 1e12:.3g} TFLOP\n"
+        f"{made} at batch 1: {found.generating / 1e12:.3g} TFLOP\n"
         f"memory in float32: weights {weights:.3g} GB; gradients, AdamW's moments and the moving average"
         f" {state:.3g} GB; activations about {kept:.3g} GB a sample, {batch * kept:.3g} GB a step"
     )

@@ -26,6 +26,7 @@ COMMANDS: dict[str, Callable[[Words], None]] = {
             worlds.policy_value,
             worlds.fidelity,
             worlds.ewmbench,
+            worlds.summary,
             worlds.sweep,
             worlds.rewards,
             worlds.gridworld,

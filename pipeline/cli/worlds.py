@@ -47,6 +47,20 @@ def ewmbench(words: Words) -> None:
     print(f"{root}/ewmbench.html, {root}/ewmbench.json")
 
 
+def summary(words: Words) -> None:
+    """one page of a simulator, of what fidelity, ewmbench and policy-value measured: worldloop summary
+    experiment=... [name=<run>]
+    """
+    from pipeline.cli.words import root_of
+    from pipeline.config import load_config
+
+    root = root_of(load_config(words))
+    from pipeline.commands.worlds.summary import summary as joined
+
+    print(joined(root))
+    print(f"{root}/summary.html")
+
+
 def sweep(words: Words) -> None:
     """move one number of the action at a time and draw what is imagined: worldloop sweep experiment=...
     [sweep.episode=0] [sweep.levels=[-2,2]]

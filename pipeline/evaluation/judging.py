@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -110,3 +111,14 @@ def judge_both(
         judge_frames(judge, store.frames(made.rows), store, episodes, known),
         judge_frames(judge, made.frames, store, episodes, made.features),
     )
+
+
+def facts_text(facts: Mapping[str, Any]) -> str:
+    """Judge.facts in a line; "" if there are none."""
+    return ", ".join(f"{name.replace('_', ' ')}: {value}" for name, value in facts.items())
+
+
+def cost_text(cost: Mapping[str, float]) -> str:
+    """What a judge was asked for and paid, in a line."""
+    said = (f"{name.replace('_', ' ')} {value:.6g}" for name, value in cost.items() if value)
+    return ", ".join(said) or ("all remembered" if cost else "free")

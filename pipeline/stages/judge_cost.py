@@ -1,11 +1,12 @@
-"""What a stage asked its judge for and paid, as part of its result."""
+"""What a stage, or a command, asked its judge for and paid, as part of its result."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from functools import wraps
+from collections.abc import Callable, Mapping
+from functools import partial, wraps
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 from envs.files import write_json
@@ -13,6 +14,7 @@ from envs.targets import target
 from pipeline.graph.stage import Inputs, Result
 from pipeline.graph.view import ConfigView
 
+COST = "judge_cost.json"  # beside what a command keeps
 _BEFORE = ".judge_cost.json"  # what had been spent when the stage was begun, however often it was resumed
 
 Run = Callable[[ConfigView, Path, Inputs], Result]
@@ -38,3 +40,33 @@ def priced(run: Run) -> Run:
         return {**result, "judge_cost": {name: after[name] - before[name] for name in after}}
 
     return with_cost
+
+
+class Spending:
+    """What a command that goes on where it was stopped asks the judge of a section for, in all its lives.
+
+    Args:
+        section: judge.
+        path: file that holds what its lives before have spent.
+    """
+
+    def __init__(self, section: Mapping[str, Any], path: Path):
+        kind: Any = target(section, "judge")
+        self._spent = partial(kind.spent, section)
+        self._path, self._before = path, json.loads(path.read_text()) if path.exists() else {}
+        self._began: dict[str, float] = self._spent()
+
+    @property
+    def total(self) -> dict[str, float]:
+        """So far, by name; {} of a judge that is free."""
+        now = self._spent()
+        return {name: self._before.get(name, 0.0) + now[name] - self._began.get(name, 0.0) for name in now}
+
+    def __enter__(self) -> Spending:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if total := self.total:
+            write_json(self._path, total)

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from actors.factory import build_algorithm, build_policy, open_clips
+from actors.fleets.fleet import Fleet, FleetError
 from actors.fleets.launch import build_fleet
 from actors.policies.contract import action_key, freeze_perception
 from actors.process import prepare_process
@@ -17,7 +18,7 @@ from envs.episodes.clips import ClipStore
 from envs.initial_states import decision_points, shared_out
 from envs.rng import Purpose, episode_seeds
 from envs.specs import CHUNK
-from envs.targets import ConfigError
+from envs.targets import ConfigError, target
 from learners.rl.algorithm import Algorithm
 from learners.rl.dataset_rollout import dataset_rollout
 from learners.rl.loop import train_rl
@@ -54,6 +55,9 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
     Settings: number of the round, iterations; deployed, the round whose true successes anchor the policy (0:
     demonstrations alone).
+
+    Raises:
+        FleetError: if too many episodes are lost; also what to change, where the judge lost most of them.
     """
     number, deployed = inputs.settings["number"], inputs.settings["deployed"]
     prepare_process(cfg["seed"], cfg["threads"])
@@ -91,6 +95,8 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         true = TrueExperience(anchor, decisions)
         watch = true_success(cfg, settings, inputs.weights("policy"))
         stats = train_rl(fleet, policy, algorithm, settings, folder, starts, true=true, watch=watch)
+    except FleetError as error:
+        raise FleetError(f"{error}{what_the_judge_needs(cfg, fleet)}") from error
     finally:
         if fleet is not None:
             fleet.close()
@@ -104,6 +110,14 @@ def starts_of(cfg: Cfg, begun: int, extra: int) -> Starts:
     share, shared = cfg["extra_starts"]["share"], cfg["simulator"]["shared_noise"]
     chosen = shared_out(begun, extra, share) if extra else range(begun)
     return Starts(chosen, 0 if shared else begun + extra)
+
+
+def what_the_judge_needs(cfg: Cfg, fleet: Fleet | None) -> str:
+    """What to change in a judge that lost most of the episodes that were lost; "" where it did not."""
+    if fleet is None or 2 * fleet.ledger.dropped.get("judge", 0) <= fleet.ledger.lost:
+        return ""
+    kind: Any = target(cfg["judge"], "judge")
+    return f". {kind.__name__}: {kind.remedy(cfg['judge'])}"
 
 
 def _horizon(cfg: Cfg, chunks: int | None, algorithm: Algorithm) -> int:

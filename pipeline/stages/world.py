@@ -24,7 +24,7 @@ from learners.stages.generated import generated_frames, recorded_features
 from learners.stages.judge import calibrate, judge_recordings, train_judge
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
-from learners.stages.text_world import train_text_world
+from learners.stages.text_world import calibrate_ending, train_text_world
 from learners.stages.tokenizer import train_tokenizer
 from pipeline.acting import acting
 from pipeline.evaluation.judging import episode_success, labelled
@@ -153,7 +153,7 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 @stage(reads=(*ROBOT, "threads", "judge.text_world", "text_world_fit", "microbatches"), place=Place.LEARNERS)
 def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The text world of a judge that asks for one, with its tokenizer, going on from the role `warm` if there
-    is one.
+    is one; the threshold that ends its trajectories on recorded video that neither it nor judges learn from.
 
     Settings: phase, first or refresh.
     """
@@ -167,8 +167,9 @@ def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         *(model, store, store.split("train"), section["stride"], fit, folder),
         tokenizer=tokenizer if phase == "first" else None,
     )
+    calibrated = calibrate_ending(model, store, store.split("calibration"), section["stride"])
     save_weights(model, folder)
-    return stats
+    return {**stats, "ending_threshold": float(model.threshold), "ending_calibrated": calibrated}
 
 
 @stage(reads=(*WORLD, "judge_fit.{phase}", "rl.starts", "rl.chunks", "microbatches"), place=Place.LEARNERS)
@@ -203,7 +204,7 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         fit = fit_options(cfg, section["fit"], f"judge_fit.{phase}.fit")
         stats = dict(train_judge(model, store, train, fit, folder, generated, recorded))
         stats["generated_frames"] = len(generated)
-    _calibrate(model, store, world, bf16)
+    _calibrate(cfg, model, store, world, bf16)
     save_weights(model, folder)
     return {**stats, "threshold": float(model.threshold), **model.facts()}
 
@@ -219,9 +220,12 @@ def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor)
     return torch.cat([near, generated_frames(world, store, episodes[1::2], bf16)])
 
 
-def _calibrate(model: Judge, store: ClipStore, world: Simulator, bf16: bool) -> None:
+def _calibrate(cfg: Cfg, model: Judge, store: ClipStore, world: Simulator, bf16: bool) -> None:
     """Set the judge's threshold on the calibration split, where its scores tell success; a judge that says
     (judge.votes.calibrate=false) that its answers need none is not asked.
+
+    Raises:
+        ConfigError: if it gives no judgement on any episode there.
     """
     if not model.calibrates:
         return
@@ -231,6 +235,15 @@ def _calibrate(model: Judge, store: ClipStore, world: Simulator, bf16: bool) -> 
     features = features_of_episodes(world, store, unseen, bf16) if model.reads_features else None
     score = judge_recordings(model, store, unseen, features)
     succeeded = episode_success(store, unseen)
+    blank = int((~torch.isfinite(score).all(1)).sum())
+    if blank:
+        why = (
+            f"judge={cfg['judge']['_target_']} gives no judgement on {blank} of {len(unseen)} recorded"
+            f" calibration episodes; {type(model).remedy(cfg['judge'])}"
+        )
+        if blank == len(unseen):  # nor would it on generated ones, which RL would drop one after the other
+            raise ConfigError(why)
+        tqdm.write(why)
     if not calibrate(model, score, succeeded):
         tqdm.write(
             f"judge: {int(succeeded.sum())} of {len(succeeded)} calibration episodes succeeded, and its"

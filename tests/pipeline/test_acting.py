@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import pytest
+
+from envs.simulators.dit.engine import DiTSimulator
+from envs.targets import ConfigError
 from pipeline.acting import acting
 from pipeline.config import load_config
 from pipeline.loop import build_loop
@@ -15,6 +21,20 @@ def test_without_steps_the_simulator_itself_is_acted_in(tmp_path: Path) -> None:
     cfg = load_config(WORDS)
     assert acting(cfg) is cfg
     assert not [name for name in build_loop(cfg, tmp_path).nodes if name.startswith("student")]
+
+
+class Careless(DiTSimulator):
+    """An engine whose students would remember less than their teachers."""
+
+    @classmethod
+    def student_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
+        return {**super().student_section(section, steps), "memory_frames": 1}
+
+
+def test_students_that_are_conditioned_otherwise_are_refused_before_any_work() -> None:
+    words = [*WORDS, "distill.steps=1", f"simulator._target_={__name__}.Careless"]
+    with pytest.raises(ConfigError, match=r"differently: simulator\.memory_frames: \d and 1; student"):
+        load_config(words)
 
 
 def test_a_student_stands_between_the_simulator_and_all_that_act_in_it(tmp_path: Path) -> None:

@@ -12,11 +12,12 @@ from torch.utils.flop_counter import FlopCounterMode
 from envs.embodiment import ActionKind, Camera, Embodiment
 from envs.specs import WorldSpec
 from envs.targets import ConfigError
-from pipeline.benches.size import size, size_of
+from pipeline.benches.size import size, size_of, text_world_size
 from pipeline.config import load_config
-from tests.embodiments import BIMANUAL_POSES, world_spec
-from tests.envs.simulators.clips import clip, first_of, future_of
+from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
+from tests.envs.simulators.clips import clip, first_of, future_of, moving_square
 from tests.envs.simulators.test_engines import ROBOTS, build_engine, section_of
+from tests.envs.simulators.test_text_world import TEXTS, section, world
 
 # One camera and seven numbers: what WPE's robots share.
 ARM = Embodiment(
@@ -47,21 +48,31 @@ def test_forcing_full_has_the_published_size_and_shapes() -> None:
 def test_what_is_counted_without_numbers_is_what_is_computed_with_them(name: str) -> None:
     spec = world_spec(ROBOTS[BIMANUAL_POSES.robot], chunk=5)
     found = size_of(section_of(name), spec)
-    world, _ = build_engine(name, spec)
-    assert found.trained == sum(p.numel() for p in world.parameters() if p.requires_grad)
-    clips = clip(spec, 1, world.memory_frames)
-    state = world.reset(first_of(spec, clips), torch.tensor([1]))
+    engine, _ = build_engine(name, spec)
+    assert found.trained == sum(p.numel() for p in engine.parameters() if p.requires_grad)
+    clips = clip(spec, 1, engine.memory_frames)
+    state = engine.reset(first_of(spec, clips), torch.tensor([1]))
     with FlopCounterMode(display=False) as counter:
-        world.step(state, future_of(spec, clips))
+        engine.step(state, future_of(spec, clips))
     assert found.generating == pytest.approx(counter.get_total_flops(), rel=0.1)
     assert found.training > 2 * found.generating / 10 and found.activations > 0
 
 
+def test_a_text_world_is_counted_as_it_computes() -> None:
+    spec, options = world_spec(ARM_DELTAS), section(ending={"max_frames": 1})
+    found, made = text_world_size(options, spec), world(ending={"max_frames": 1})
+    assert found.trained == sum(p.numel() for p in made.parameters() if p.requires_grad)
+    with FlopCounterMode(display=False) as counter:
+        made.imagine(moving_square(spec, torch.tensor([0.2])), TEXTS[:1], torch.zeros(1, dtype=torch.int64))
+    assert found.generating == pytest.approx(counter.get_total_flops(), rel=0.1)
+    assert found.training > found.generating and found.activations > 0
+
+
 def test_an_engine_that_asks_for_numbers_is_named() -> None:
-    section: dict[str, Any] = section_of("forcing_small")
-    section["actions"] = {"_target_": "envs.conditioning.ActionText"}
+    own: dict[str, Any] = section_of("forcing_small")
+    own["actions"] = {"_target_": "envs.conditioning.ActionText"}
     with pytest.raises(ConfigError, match=r"ForcingSimulator\) cannot be counted on shapes alone"):
-        size_of(section, replace(WorldSpec(ARM, (256, 256), 4), size=(64, 64)))
+        size_of(own, replace(WorldSpec(ARM, (256, 256), 4), size=(64, 64)))
 
 
 def test_the_bench_prints_what_an_engine_takes(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from envs.targets import ConfigError
 from pipeline.benches import distil as students
-from pipeline.benches.distil import distil
+from pipeline.benches.distil import distil, reached
 from pipeline.benches.strides import strides
 from pipeline.config import load_config
 
@@ -38,7 +38,19 @@ def test_students_and_teacher_stand_in_one_table(
     assert json.loads((tmp_path / "bench/distil.json").read_text()) == found
     said = capsys.readouterr().out
     assert said.count("\n| ") == 2 + len(titles)
+    for row in found.values():
+        assert sum(row[f"judge_{name}"] for name in ("tp", "fp", "fn", "tn")) > 0
+    assert said.count("TrajectoryRegression, 1: m") == 1 and "teacher, 2: m" not in said
     assert distil(cfg) == found and "is finished, reused" in capsys.readouterr().out
+
+
+def test_a_student_meets_all_that_it_should_or_it_is_said_what_it_missed() -> None:
+    teacher = {"evaluations": 0, "speed_1": 10.0, "speed_32": 20.0, "rollout_psnr": 25.0, "judge_gap": -4.0}
+    good = {"evaluations": 4, "speed_1": 41.0, "speed_32": 80.0, "rollout_psnr": 24.5, "judge_gap": 4.0}
+    bad = {"evaluations": 8, "speed_1": 41.0, "speed_32": 79.0, "rollout_psnr": 24.4, "judge_gap": 4.1}
+    met, missed = reached({"teacher, 15": teacher, "DMD2, 4": good, "DMD2, 8": bad})
+    assert met.startswith("DMD2, 4: met (4.1 and 4.0 times the frames/s of teacher, 15 at 1 and 32, 0.50 dB")
+    assert missed.startswith("DMD2, 8: missed by 8 evaluations, frames/s, PSNR, gap to truth (")
 
 
 def test_strides_reach_as_many_times_further(tmp_path: Path) -> None:

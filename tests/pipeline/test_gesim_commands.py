@@ -17,8 +17,8 @@ from envs.episodes.formats.foreign import Cut, read_foreign
 from envs.simulators.dit.shape import DiTShape
 from envs.simulators.samplers import DISTILLED, Distilled
 from envs.targets import ConfigError
-from pipeline.benches.gesim import FULL
-from pipeline.benches.gesim_floor import count_flops
+from pipeline.benches.gesim import FULL, gesim
+from pipeline.benches.gesim_floor import count_flops, goal_line
 from pipeline.cli import tools
 from pipeline.commands.finetune import build_finetune
 from pipeline.commands.serving import build_session_host
@@ -108,6 +108,19 @@ def test_finetune_a_checkpoint_distil_it_again_and_serve_what_came_of_it(
         build_session_host(cfg, tmp_path / "nowhere", serve_config())
     with pytest.raises(ConfigError, match=r"finetune\.data"):
         build_finetune(load_config(WORDS), tmp_path / "none").run()
+
+
+def test_what_no_gpu_has_shown_is_called_unmeasured() -> None:
+    goal = "goal, 25 frames x 3 views at 384 x 512 in 1.15 s on one H200: "
+    command = "; worldloop bench gesim launch.device=cuda"
+    assert goal_line(FULL, "CPU") == f"{goal}unmeasured, for this is CPU{command}"
+    assert goal_line(FULL, "NVIDIA H200") == f"{goal}measured above{command}"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_asked_for_and_not_there_is_told() -> None:
+    with pytest.raises(ConfigError, match=r"launch\.device=cuda, but this machine has no CUDA device"):
+        gesim(load_config([*WORDS, "launch.device=cuda"]))
 
 
 def test_the_floor_counts_what_the_network_does() -> None:

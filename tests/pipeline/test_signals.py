@@ -107,7 +107,7 @@ LASTS = {
 SHORT = ("inspect", "verify", "sweep", "judge")  # may have ended before they are asked to, or be about to
 SERVERS = ("serve", "play")  # this is how they end
 # answer from what is there, or hand over to a cluster
-AT_ONCE = {"convert", "stages", "compare", "submit", "tasks", "config", "doctor", "completion"}
+AT_ONCE = {"convert", "stages", "summary", "compare", "submit", "tasks", "config", "doctor", "completion"}
 
 
 def test_every_command_is_tried() -> None:

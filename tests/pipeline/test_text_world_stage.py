@@ -5,17 +5,22 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import pytest
 import torch
 
 from actors.factory import build_text_world
+from actors.fleets.fleet import EpisodeLedger
 from envs.embodiment import Embodiment
+from envs.targets import ConfigError
 from pipeline.config import load_config
 from pipeline.graph.stage import Inputs
 from pipeline.loop import build_loop
 from pipeline.stages import world
 from pipeline.stages.given import DATASETS
+from pipeline.stages.rl import what_the_judge_needs
 from tests.embodiments import ARM_DELTAS
 from tests.envs.simulators.test_text_world import section
 
@@ -36,6 +41,24 @@ def test_the_graph_has_it_where_the_judge_asks_for_one(tmp_path: Path) -> None:
     assert roles["text_world-2"]["warm"] == ["text_world-1"]
     # the judge's weights hold it from then on
     assert [name for name in roles if "text_world" in roles[name]] == ["judge-1", "judge-2"]
+
+
+def test_a_text_world_that_never_says_done_is_told_with_what_to_change(
+    tiny_data: Callable[[Embodiment], Path], tmp_path: Path
+) -> None:
+    words = ("judge=golden_goal", "task=lerobot", f"task.data=[{tiny_data(ARM_DELTAS)}]", "task.size=[32,32]")
+    cfg = config(*words, "task.chunk=4", "task.horizon=8", "launch.device=cpu")
+    cfg["judge"]["text_world"] = section(ending={"threshold": 1.0})  # nothing is more certain than that
+    (tmp_path / DATASETS).write_text(json.dumps([str(tiny_data(ARM_DELTAS))]))
+    settings = {"phase": "first"}
+    view = world.judge.view("judge-1", cfg, settings)
+    said = r"no judgement on (\d+) of \1 .*ending\.threshold=1\.0, .*fallback=drop: .*=last_frame or progress"
+    with pytest.raises(ConfigError, match=said):
+        world.judge.run(view, tmp_path, Inputs({"data": tmp_path}, settings))
+    fleet = SimpleNamespace(ledger=EpisodeLedger(dropped={"judge": 3, "physics": 2}))
+    assert "judge.fallback=drop: train it longer" in what_the_judge_needs(cfg, fleet)  # type: ignore[arg-type]
+    fleet.ledger.drop("physics", 1)
+    assert not what_the_judge_needs(cfg, fleet)  # type: ignore[arg-type]
 
 
 def test_it_trains_and_goes_on_from_what_it_left(

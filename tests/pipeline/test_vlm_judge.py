@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from envs.embodiment import Embodiment
@@ -74,6 +76,15 @@ def test_its_stage_asks_nobody_unless_the_threshold_is_to_be_set(
     assert cost["cost"] > 0 and cost["cost"] == pytest.approx(cost["prompt_tokens"] * 10e-6)
 
 
+def test_a_judge_that_can_judge_nothing_is_told_before_rl_drops_every_episode(
+    words: list[str], server: ChatServer, tmp_path: Path
+) -> None:
+    server.answer = lambda asked: "I cannot say."
+    cfg = load_config([*words, "judge.votes.calibrate=true", "judge.asking.stop_after=100000"])
+    with pytest.raises(ConfigError, match=r"no judgement on 8 of 8 .*judge\.prompt=done asks.*judge_cost"):
+        run_stage(cfg, tmp_path / "set")
+
+
 def test_the_study_says_who_is_right_by_what_was_shown_and_what_it_cost(
     words: list[str], server: ChatServer, tmp_path: Path
 ) -> None:
@@ -94,9 +105,16 @@ def test_the_study_says_who_is_right_by_what_was_shown_and_what_it_cost(
     assert all(row[6] == "100.0%" for row in cells) and "prompt tokens 1800, " in rows[0]
     shown = {len(asked.pictures) for asked in server.seen}  # fewer than there are where the square rests
     assert max(shown) == 13 and {2, 4} <= shown
+    picture = tmp_path / "goal.png"
+    assert cv2.imwrite(str(picture), np.zeros((32, 32, 3), np.uint8))
+    cfg = load_config([words[0], words[1], words[2], "judge=goal_image", f"judge.picture={picture}"])
+    said = judge_study(cfg, tmp_path / "run", Selection.of({}))
+    assert said.splitlines()[-1].startswith("Judged by metric: NLPD") and "free" in said
     server.answer = lambda asked: "I cannot say."
     assert "calls" not in judge_study(cfg, tmp_path / "run", selection)  # all is remembered
-    other = load_config([*words, "judge.pictures.span=clip", "judge.chat.max_tokens=7"])
+    other = load_config(
+        [*words, "judge.pictures.span=clip", "judge.chat.max_tokens=7", "judge.asking.stop_after=100"]
+    )
     last = judge_study(other, tmp_path / "run", selection).splitlines()[-1]
     assert last.split()[2:9] == ["0", "0", "0", "0", "0.0%", "6", "0"]
 

@@ -48,13 +48,14 @@ class Tally:
     unusable: int = 0
     unanswered: int = 0
 
-    def add(self, reply: Reply | None) -> None:
-        """Count an answer; None if there is none."""
+    def add(self, reply: Reply | None) -> bool:
+        """Count an answer, None if there is none; whether it says yes or no."""
         said = None if reply is None else parse(reply.text)
         self.unanswered += reply is None
         self.unusable += reply is not None and said is None
         self.yes += said is True
         self.no += said is False
+        return said is not None
 
     @property
     def asked(self) -> int:

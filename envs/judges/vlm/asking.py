@@ -19,6 +19,8 @@ from envs.judges.vlm.ledger import Budget, ledger_of
 from envs.ranges import Count, Natural, NonNegative, Positive
 from envs.targets import ConfigError
 
+_SHOWN = 120  # last letters of an answer in a message
+
 
 @dataclass(frozen=True)
 class Asking:
@@ -31,8 +33,8 @@ class Asking:
         retries: tries after the first.
         pause_s: seconds before the second try; doubles with each.
         longest_pause_s: longest pause, and longest time that a server may ask to be left alone.
-        stop_after: questions in a row without any answer after which the run stops, instead of dropping all
-            episodes.
+        stop_after: questions in a row without any answer, or with answers that nobody can use, after which
+            the run stops, instead of dropping all episodes.
     """
 
     cache: str
@@ -62,7 +64,7 @@ class Asker:
         self._greeted = False
         self._over: JudgeError | ConfigError | None = None  # why nobody is asked any more
         self._quiet_until = 0.0  # seconds of the monotonic clock: one refusal slows down all questions
-        self._failures = 0
+        self._failures = self._unusable = 0
         self._under_way: dict[str, asyncio.Task[Reply | None]] = {}
 
     async def ask(self, question: Question, vote: int) -> Reply | None:
@@ -139,6 +141,27 @@ class Asker:
             self._quiet_until = max(self._quiet_until, time.monotonic() + error.wait)
             await asyncio.sleep(min(options.longest_pause_s, options.pause_s * 2**attempt))
             attempt += 1
+
+    def heard(self, usable: bool, text: str, asked_by: str) -> None:
+        """Count an answer that its asker could use, or could not.
+
+        Args:
+            asked_by: the key that says how to answer, and its value.
+
+        Raises:
+            JudgeError: where too many in a row were of no use; remembered ones count, too.
+        """
+        self._unusable = 0 if usable else self._unusable + 1
+        if self._unusable >= self.options.stop_after:
+            self.ledger.write()
+            end = text.strip()[-_SHOWN:]
+            self._over = JudgeError(
+                f"{self._unusable} answers in a row say nothing usable (judge.asking.stop_after="
+                f"{self.options.stop_after}): they must end as {asked_by} asks, and the last ends with"
+                f" {end!r}. Choose another prompt or another model (judge.chat), or raise"
+                " judge.chat.max_tokens where answers are cut off"
+            )
+            raise self._over
 
     def _failed(self, error: Unanswered) -> None:
         self.ledger.write()

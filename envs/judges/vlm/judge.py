@@ -88,6 +88,7 @@ class VLMJudge(Judge):
         self.pictures = options_of(Pictures, pictures, "judge.pictures")
         self.votes = options_of(Votes, votes, "judge.votes")
         self.calibrates = self.votes.calibrate
+        self._asks = prompt
         self.prompt = Prompt(prompt, [spec.embodiment.views[view] for view in self.views])
         limits = options_of(Budget, budget, "judge.budget")
         self.asker = Asker(build(chat, "judge.chat"), options_of(Asking, asking, "judge.asking"), limits)
@@ -97,6 +98,15 @@ class VLMJudge(Judge):
         """See Judge.check: the key, the model's name or folder, and the prompt are there."""
         build(options["chat"], "judge.chat")
         Prompt(options["prompt"], ())
+
+    @classmethod
+    def remedy(cls, options: Mapping[str, Any]) -> str:
+        """See Judge.remedy."""
+        return (
+            f"more than half of judge.votes.count={options['votes']['count']} answers must end with the same"
+            f" of two lines, as judge.prompt={options['prompt']} asks them to; choose another prompt or model"
+            " (judge.chat), and see in judge_cost how many answers were unusable and how many did not come"
+        )
 
     @classmethod
     def files(cls, options: Mapping[str, Any]) -> tuple[Path, ...]:
@@ -162,7 +172,9 @@ class VLMJudge(Judge):
         while more := tally.count - tally.asked if self.calibrates else tally.missing:
             votes = range(tally.asked, tally.asked + more)
             for reply in await _all([self.asker.ask(question, vote) for vote in votes]):
-                tally.add(reply)
+                usable = tally.add(reply)
+                if reply is not None:
+                    self.asker.heard(usable, reply.text, f"judge.prompt={self._asks}")
         self.asker.ledger.add("unusable", tally.unusable)
         return tally
 

@@ -48,7 +48,7 @@ class Ending:
     """When a golden trajectory ends.
 
     Args:
-        threshold: of done, above which the task is.
+        threshold: of done, above which the task is; calibration sets it later (stages/text_world.py).
         max_frames: imagined, at most.
     """
 
@@ -73,6 +73,7 @@ class TextWorld(nn.Module):
     """
 
     hidden = ("blocks",)
+    threshold: Tensor
 
     def __init__(
         self,
@@ -90,6 +91,7 @@ class TextWorld(nn.Module):
         if window < 2:
             raise ValueError(f"{_KEY}.window={window} must be at least 2: a frame and one before it")
         self.window, self.ending = window, options(Ending, ending, f"{_KEY}.ending")
+        self.register_buffer("threshold", torch.tensor(self.ending.threshold))
         self.video = TokenVideo(spec, window, codec, net, conditioning, decoding, training, _KEY)
         encoder: WordEncoder = build(words, f"{_KEY}.words")
         self.reader = WordReader(encoder, self.video.trunk.width, self.video.told_tokens)
@@ -100,12 +102,12 @@ class TextWorld(nn.Module):
         return self.video.codec
 
     def check(self, instructions: Sequence[str]) -> None:
-        """Refuse instructions that the text encoder would cut.
+        """Refuse instructions that would be cut.
 
         Raises:
-            ValueError: naming the text and the fix.
+            ConfigError: naming the text and the fix.
         """
-        self.reader.words.check(sorted(set(instructions)))
+        self.reader.check(sorted(set(instructions)))
 
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """Training loss of clips of successful episodes, and figures to log.
@@ -135,7 +137,7 @@ class TextWorld(nn.Module):
         ended = torch.zeros(len(first), dtype=torch.bool, device=device)
         tokens: list[Tensor] = []
         done: list[Tensor] = []
-        while len(tokens) < self.ending.max_frames and not ended.all():
+        while True:
             new = self.video.next_frame(known, told, None, draws)
             said = self.video.done(self.video.net.observe(new[:, None], told, None, known).float())[:, 0]
             if tokens:  # those that have ended rest
@@ -143,12 +145,24 @@ class TextWorld(nn.Module):
                 said = torch.where(ended, done[-1], said)
             tokens.append(new)
             done.append(said)
-            ended = ended | (said > self.ending.threshold)
+            ended = ended | (said > self.threshold)
+            if len(tokens) == self.ending.max_frames or ended.all():
+                break
         every = torch.stack(done, 1)
-        over = every > self.ending.threshold
+        over = every > self.threshold
         goal = torch.where(ended, over.long().argmax(1), over.shape[1] - 1)
         frames = to_bytes(self.video.decode(torch.stack(tokens, 1)))
         return GoldenTrajectory(*(part.to(first.device) for part in (frames, every, goal, ended)))
+
+    @torch.no_grad()
+    def done_along(self, frames: Tensor, instruction: Sequence[str]) -> Tensor:
+        """What `imagine` would say of frames uint8 [B, T, V, 3, H, W] if it had made them: whether the task
+        is done, float32 [B, T], by each frame and those before it in the window.
+        """
+        told, known = self.reader(instruction), self.video.net.memory()
+        tokens = self.video.encode(frames.to(told.device))
+        said = [self.video.net.observe(one, told, None, known) for one in tokens.split(1, 1)]
+        return torch.cat([self.video.done(seen.float()) for seen in said], 1).to(frames.device)
 
     @torch.no_grad()
     def done(self, frames: Tensor, instruction: Sequence[str]) -> Tensor:

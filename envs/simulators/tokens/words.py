@@ -19,7 +19,7 @@ _SHOWN = 60  # letters of a text in a message
 
 
 class WordEncoder(Protocol):
-    """A frozen text encoder; a config names its class.
+    """A frozen text encoder; a config names its class. It is given no text of more than TEXT_BYTES.
 
     Attributes:
         tokens: of every text.
@@ -50,18 +50,10 @@ class HashedWords:
             self._encoder = TextEncoder(1)  # of which only what is fixed is used
 
     def check(self, texts: Sequence[str]) -> None:
-        """See WordEncoder."""
-        for text in texts:
-            if len(text.encode()) > TEXT_BYTES:
-                raise ConfigError(
-                    f"the instruction {text[:_SHOWN]!r}... has {len(text.encode())} bytes, and this encoder"
-                    f" takes {TEXT_BYTES}; shorten it, or use"
-                    " text_world.words._target_=envs.simulators.tokens.words.T5Words"
-                )
+        """See WordEncoder; it reads every byte."""
 
     def encode(self, texts: Sequence[str], device: torch.device) -> Tensor:
         """See WordEncoder."""
-        self.check(texts)
         return self._encoder.features(text_to_bytes(texts))[:, None].to(device)
 
 
@@ -108,7 +100,6 @@ class T5Words:
     @torch.no_grad()
     def encode(self, texts: Sequence[str], device: torch.device) -> Tensor:
         """See WordEncoder."""
-        self.check(texts)
         self._model.to(device)
         out = torch.zeros(len(texts), self.tokens, self.size, device=device)
         for row, text in zip(out, texts, strict=True):  # alone, so that no batch changes its last bits
@@ -136,8 +127,24 @@ class WordReader(nn.Module):
         """Where its weights are."""
         return next(self.parameters()).device
 
+    def check(self, texts: Sequence[str]) -> None:
+        """Refuse texts that would be cut: by the encoder, or by those who carry them, for a text world that
+        learns from clips reads what a rollout's judge reads.
+
+        Raises:
+            ConfigError: naming the text and the fix.
+        """
+        for text in texts:
+            if len(text.encode()) > TEXT_BYTES:
+                raise ConfigError(
+                    f"the instruction {text[:_SHOWN]!r}... has {len(text.encode())} bytes, and clips and"
+                    f" rollouts carry {TEXT_BYTES}; shorten it"
+                )
+        self.words.check(texts)
+
     def forward(self, texts: Sequence[str]) -> Tensor:
         different = sorted(set(texts))  # a batch holds few, each many times
+        self.check(different)
         rows = self.map(self.words.encode(different, self.device))
         told = rows.unflatten(-1, (self.each, -1)).flatten(1, 2)
         return told[[different.index(text) for text in texts]][:, None]

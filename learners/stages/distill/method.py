@@ -64,8 +64,8 @@ class Method(nn.Module):
         raise NotImplementedError
 
     def optimise(self, trained: Parameters, lr: float, weight_decay: float) -> list[Optimizer]:
-        """The optimisers of what learns, as `fit` takes them."""
-        return OPTIMISERS[self.config.optimiser](trained, lr, weight_decay)
+        """The optimisers of what learns, as `fit` takes them; hidden layers are the student's own."""
+        return OPTIMISERS[self.config.optimiser](trained, lr, weight_decay, self.student.hidden)
 
     def generated(self, inputs: TensorDict, generator: torch.Generator) -> Generated:
         """What the student makes of a chunk.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from envs.episodes.clips import ClipStore
 from envs.simulators.base import Simulator
@@ -73,6 +73,7 @@ def check_pair(teacher: Simulator, student: Simulator) -> None:
         "simulator.pose_map": (teacher.spec.pose_map, student.spec.pose_map),
         "simulator.ray_map": (teacher.spec.ray_map, student.spec.ray_map),
         "simulator.memory_frames": (teacher.memory_frames, student.memory_frames),
+        "simulator.actions": (_told(teacher), _told(student)),
         "simulator._target_": (type(teacher).__name__, type(student).__name__),
     }
     odd = [f"{key}: {a!r} and {b!r}" for key, (a, b) in pairs.items() if a != b]
@@ -91,3 +92,12 @@ def check_pair(teacher: Simulator, student: Simulator) -> None:
             f"distill.steps={few} are more than the teacher's {many}; lower distill.steps, or raise"
             " simulator.denoising.steps (dit, forcing) or simulator.sampling.steps (gesim)"
         )
+
+
+def _told(world: Simulator) -> str:
+    """How an engine that may be told of actions in several ways is, with its numbers; "" of others."""
+    told = getattr(world, "actions", None)
+    if not isinstance(told, nn.Module):
+        return ""
+    numbers = {key: value for key, value in vars(told).items() if type(value) in (int, float, str)}
+    return f"{type(told).__name__} {numbers}"

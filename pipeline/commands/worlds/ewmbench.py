@@ -31,7 +31,9 @@ from pipeline.evaluation.ewmbench.samples import Samples
 from pipeline.evaluation.ewmbench.semantics import Reader
 from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.grippers.ruler import GripperRuler, gripper_ruler, known_ends, looked_through
+from pipeline.evaluation.judging import cost_text
 from pipeline.graph.code_version import code_of
+from pipeline.stages.judge_cost import COST, Spending
 
 _MODULE = "pipeline.evaluation.ewmbench.samples"
 _SHORTEST = 4  # frames of an episode: the first is given, and accelerations need three
@@ -130,7 +132,9 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
         cfg["simulator"]["bf16"],
         set(chosen.episodes[: section["videos"]].tolist()),
     )
-    true, made = measured(samples, chosen.episodes, section["samples"])
+    with Spending(cfg["judge"], root / "ewmbench" / COST) as spending:
+        true, made = measured(samples, chosen.episodes, section["samples"])
+        cost = {} if reader is None else spending.total
     scoring = Scoring(
         store.spec.size,
         section["strict_parity"],
@@ -152,8 +156,11 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
         notes.append(f"Of {lost} videos the model answered not everything; what is missing counts nowhere.")
     if section["samples"] > 1 and alike([made[row["episode"]] for row in rows]):
         notes.append(ALIKE)
+    if cost:
+        notes.append(f"Asking the model: {cost_text(cost)}.")
     result = {
         **subject.about(),
+        "judge_cost": cost,
         "task": cfg["task"]["name"],
         "size": list(store.spec.size),
         "fps": store.fps,

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,6 @@ from tqdm import tqdm
 
 from envs.episodes.clips import ClipStore
 from envs.files import write_text
-from envs.perceptual import PerceptualDistance
 from envs.targets import ConfigError, build
 from pipeline.commands.worlds.subject import Subject
 from pipeline.evaluation.fidelity.end_effector import end_effector_ruler
@@ -26,9 +26,12 @@ from pipeline.evaluation.fidelity.masks import part_labels
 from pipeline.evaluation.fidelity.open_loop import OpenLoop, held_coded, held_still
 from pipeline.evaluation.fidelity.page import build_page, summary_text
 from pipeline.evaluation.measurement import evenly, groups, speed
+from pipeline.evaluation.value.trials import Kept
+from pipeline.graph.code_version import code_of
 from pipeline.loop import has_physics
 
 Cfg = Mapping[str, Any]
+_MODULE = "pipeline.evaluation.fidelity.open_loop"
 
 
 def fidelity(cfg: Cfg, root: Path) -> str:
@@ -54,7 +57,12 @@ def fidelity(cfg: Cfg, root: Path) -> str:
     simulator = subject.simulator()
     labels = part_labels(cfg, store, episodes, section["masks"])
     hands = end_effector_ruler(subject.cfg, store, subject.data, root)
-    loop = OpenLoop(store, episodes, cfg["simulator"]["bf16"], labels, extractors, section["clip"], hands)
+    kept = Kept(root / "fidelity")
+    loop = OpenLoop(
+        *(store, episodes, cfg["simulator"]["bf16"], labels, extractors, section["clip"], hands),
+        kept=kept,
+        identity=identity_of(subject, store),
+    )
     place = {int(number): n for n, number in enumerate(episodes)}
     mine = {
         name: torch.tensor([place[n] for n in some.tolist()])
@@ -78,22 +86,23 @@ def fidelity(cfg: Cfg, root: Path) -> str:
             **({} if coded is None else {"the same through the autoencoder": coded.overall}),
         },
         "frames_per_second": {f"batch {n}": speed(simulator, store, n, 1) for n in (1, 32)},
-        "long": _long(cfg, root, subject, store, distance) if section["long"]["frames"] else None,
+        "long": _long(cfg, root, subject, store, loop) if section["long"]["frames"] else None,
         "grid": None,
     }
     if settled:
-        alone = OpenLoop(store, episodes, cfg["simulator"]["bf16"], labels)
+        alone = replace(loop, extractors=(), hands="nobody asked")
         result["grid"] = _grid(cfg, subject, alone, tried, len(settled))
     write_text(root / "fidelity.json", json.dumps(result, indent=1))
     write_text(root / "fidelity.html", build_page(result))
-    return summary_text(result)
+    return f"{summary_text(result)}\n{kept.reused} parts were reused"
 
 
 def build_extractors(section: Mapping[str, Any]) -> list[Extractor]:
     """The extractors of a section fidelity, of frames and of clips.
 
     Raises:
-        ConfigError: for weights of another architecture, or an extractor of the other kind.
+        ConfigError: for weights of another architecture, an extractor of the other kind, or one whose clips
+            are longer than fidelity.clip.
     """
     out = []
     for key, clips in (("frames_extractor", False), ("clips_extractor", True)):
@@ -102,6 +111,11 @@ def build_extractors(section: Mapping[str, Any]) -> list[Extractor]:
             raise ConfigError(
                 f"fidelity.{key}._target_={section[key]['_target_']} should be an Extractor of"
                 f" {'clips' if clips else 'single frames'} (pipeline/evaluation/fidelity/extractors.py)"
+            )
+        if clips and section["clip"] < extractor.shortest:
+            raise ConfigError(
+                f"fidelity.clip={section['clip']}: {extractor.name} takes clips of {extractor.shortest}"
+                " frames or more; raise fidelity.clip, or choose another fidelity.clips_extractor"
             )
         out.append(extractor)
     return out
@@ -115,9 +129,7 @@ def _masks(section: Mapping[str, Any], labels: Tensor | None) -> dict[str, Any]:
     return {"source": section["masks"] or "physics", "episodes": known}
 
 
-def _long(
-    cfg: Cfg, root: Path, subject: Subject, store: ClipStore, distance: PerceptualDistance
-) -> dict[str, Any] | None:
+def _long(cfg: Cfg, root: Path, subject: Subject, store: ClipStore, loop: OpenLoop) -> dict[str, Any] | None:
     section, simulator = cfg["fidelity"]["long"], subject.simulator()
     if has_physics(cfg):
         longer = long_episodes(cfg, root / "fidelity-long")
@@ -126,8 +138,22 @@ def _long(
         store, episodes = longer, torch.arange(len(longer))
     else:
         episodes = longest(store, subject.held_out(store), section["episodes"])
-    out = drift(simulator, store, episodes, cfg["simulator"]["bf16"], distance)
+    assert loop.kept is not None
+    about = {**loop.identity, "long": dict(section), "episodes": episodes.tolist()}
+    bf16, distance = cfg["simulator"]["bf16"], loop.distance
+    out = loop.kept.figures("long", about, lambda: drift(simulator, store, episodes, bf16, distance))
     return {"wanted": section["frames"], **out}
+
+
+def identity_of(subject: Subject, store: ClipStore) -> dict[str, Any]:
+    """What rollouts of a subject's simulator depend on beside episodes and options that are tried."""
+    sizes = {str(folder): len(part.frames) for folder, part in zip(subject.data, store.parts, strict=True)}
+    return {
+        "world": subject.identity("simulator"),
+        "task": {key: subject.cfg["task"][key] for key in ("size", "chunk", "horizon")},
+        "data": sizes,
+        "code": code_of(_MODULE, subject.cfg["simulator"]),
+    }
 
 
 def _grid(cfg: Cfg, subject: Subject, loop: OpenLoop, tried: Mapping[str, Any], count: int) -> dict[str, Any]:
@@ -135,7 +161,9 @@ def _grid(cfg: Cfg, subject: Subject, loop: OpenLoop, tried: Mapping[str, Any], 
 
         def measure(settings: Settings) -> Mapping[str, Any]:
             simulator = subject.simulator(with_settings(cfg, settings))
-            found = loop.measure(simulator).result(loop.store.spec.embodiment.views, {})
+            found = loop.measure(simulator, {"settings": dict(settings)}).result(
+                loop.store.spec.embodiment.views, {}
+            )
             bar.update()
             return {**found["overall"], "frames_per_second": speed(simulator, loop.store, 1, 1)}
 

@@ -16,7 +16,7 @@ import torch
 from actors.factory import build_judge, open_clips
 from envs.judges.base import Judge
 from envs.targets import ConfigError, target
-from pipeline.evaluation.judging import labelled
+from pipeline.evaluation.judging import cost_text, facts_text, labelled
 from pipeline.evaluation.rewards.shown import check_frames, shown_table
 from pipeline.loop import build_loop, has_physics, last_round
 from pipeline.stages.given import datasets, learns
@@ -86,10 +86,9 @@ def judge_study(cfg: Mapping[str, Any], root: Path, selection: Selection) -> str
         found = shown_table(judge, store, episodes, frames)
         after = kind.spent(cfg["judge"])  # type: ignore[attr-defined]
         spent = {key: after[key] - before[key] for key in after}
-        cost = ", ".join(f"{key.replace('_', ' ')} {value:g}" for key, value in spent.items() if value)
-        lines.append(
-            f"{_line([frames, *_cells(found)])}  {cost or ('free' if not spent else 'all remembered')}"
-        )
+        lines.append(f"{_line([frames, *_cells(found)])}  {cost_text(spent)}")
+    if facts := facts_text(judge.facts()):
+        lines.append(f"Judged by {facts}")
     return "\n".join(lines)
 
 

@@ -27,6 +27,7 @@ from pipeline.graph.code_version import code_of
 from pipeline.loop import has_physics
 from pipeline.stages import imitation, rl
 from pipeline.stages.given import mode_of
+from pipeline.stages.judge_cost import COST, Spending
 
 _ACTING = (imitation.imitation, imitation.clone, rl.rl)  # stages that leave a policy
 _MODULE = "pipeline.evaluation.value.trials"
@@ -56,11 +57,16 @@ def policy_value(cfg: Mapping[str, Any], root: Path) -> str:
     physics = {**task_of(cfg), "code": _code(cfg)}
     true = comparison.true(physics, kept) if physics_there else {}
     simulator = subject.simulator()
-    parts = (simulator, subject.decoder(simulator), subject.judge())
+    judge = subject.judge()
+    parts = (simulator, subject.decoder(simulator), judge)
     world = {**subject.identity("simulator", "state", "judge"), **physics}
-    cells = comparison.imagined(parts, world, kept, true)
+    with Spending(cfg["judge"], root / "policy-value" / COST) as spending:
+        cells = comparison.imagined(parts, world, kept, true)
+        cost = spending.total
     result = {
         **subject.about(),
+        "judged_by": judge.facts(),
+        "judge_cost": cost,
         "starts": {task: len(episodes) for task, episodes in starts.items()},
         "repeats": section["repeats"],
         "cells": [cell.row() for cell in cells],

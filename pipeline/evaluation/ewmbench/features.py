@@ -25,6 +25,7 @@ from envs.targets import ConfigError
 from pipeline.evaluation.fidelity.extractors import Extractor
 
 _AT_ONCE = 64  # pictures
+_SHOWN = 60  # letters of a text in a message
 _HEAD = 1 << 20  # bytes of each file of weights that tell it from others
 
 
@@ -156,6 +157,9 @@ class ClipTexts(TextExtractor):
 
     Args:
         path: folder of a CLIP model with its tokenizer.
+
+    Raises:
+        ConfigError: also by `similarity`, for a sentence that the model would cut.
     """
 
     def __init__(self, path: str):
@@ -176,9 +180,14 @@ class ClipTexts(TextExtractor):
         """See TextExtractor."""
         sides = []
         for texts in (one, other):
-            words = self._tokenizer(
-                list(texts), return_tensors="pt", padding=True, truncation=True, max_length=self._longest
-            )
+            words = self._tokenizer(list(texts), return_tensors="pt", padding=True)
+            for text, numbers in zip(texts, words["attention_mask"].sum(1).tolist(), strict=True):
+                if numbers > self._longest:
+                    raise ConfigError(
+                        f"{self.name} takes {self._longest} tokens, and {text[:_SHOWN]!r}... has {numbers};"
+                        " ask for shorter steps (ewmbench.prompts.steps), or compare words"
+                        f" (ewmbench.texts._target_={__name__}.WordGrams)"
+                    )
             asked = {name: words[name] for name in ("input_ids", "attention_mask")}
             sides.append(functional.normalize(_embedding(self._network.get_text_features(**asked)), dim=-1))
         return (sides[0] @ sides[1].T).clamp(0, 1)

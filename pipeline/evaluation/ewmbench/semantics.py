@@ -202,7 +202,8 @@ def read_errors(name: str) -> tuple[LogicalError, ...]:
 def bleu(caption: str, instruction: str, strict_parity: bool) -> float:
     """BLEU (Papineni et al. 2002) of a caption against the instruction, 0..1.
 
-    Up to 4-grams, or as many words as the instruction has; small letters, no punctuation; one is added to the
+    Up to 4-grams, or as many words as the shorter of the two has, for a gram longer than either text is in
+    neither, and one added to no counts would be a hit; small letters, no punctuation; one is added to the
     counts of pairs and longer grams (Lin and Och 2004), for instructions are a few words, and one gram that
     is missing would be 0. With strict_parity as in the public code: 4-grams of words as they stand between
     blanks, and nothing is added.
@@ -212,7 +213,7 @@ def bleu(caption: str, instruction: str, strict_parity: bool) -> float:
     said, wanted = words_of(caption), words_of(instruction)
     if not set(said) & set(wanted):
         return 0.0
-    longest, total = min(_GRAMS, len(wanted)), 0.0
+    longest, total = min(_GRAMS, len(wanted), len(said)), 0.0
     for length in range(1, longest + 1):
         found, due = (_grams(words, length) for words in (said, wanted))
         hits, more = sum((found & due).values()), int(length > 1)

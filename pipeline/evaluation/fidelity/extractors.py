@@ -26,10 +26,12 @@ class Extractor(ABC):
     Attributes:
         name: of the network and its weights; distances of different names are not comparable.
         clips: whether it takes clips uint8 [N, T, 3, H, W] instead of pictures uint8 [N, 3, H, W].
+        shortest: frames that a clip must have.
     """
 
     name: str
     clips: bool
+    shortest: int = 1
 
     @abstractmethod
     def __call__(self, pictures: Tensor) -> Tensor:
@@ -58,7 +60,7 @@ class PyramidClips(Extractor):
     """Mean, spread and change from frame to frame of PyramidFrames over a clip."""
 
     name = "pyramid contrast of clips, no learned weights"
-    clips = True
+    clips, shortest = True, 2
 
     def __init__(self) -> None:
         self._frames = PyramidFrames()
@@ -122,20 +124,12 @@ class Inception(_TorchScript):
 class I3D(_TorchScript):
     """I3D logits as of Kinetics-400, by which FVD is defined; the usual TorchScript file."""
 
-    title, width, clips = "I3D Kinetics-400", 400, True
+    title, width, clips, shortest = "I3D Kinetics-400", 400, True, 10
     options: ClassVar[dict[str, bool]] = {"rescale": True, "resize": True, "return_features": True}
     probe = (1, 3, 16, 64, 64)
 
     @torch.no_grad()
     def __call__(self, pictures: Tensor) -> Tensor:
-        """Features float32 [N, 400] of clips of 10 frames or more.
-
-        Raises:
-            ConfigError: for shorter ones.
-        """
-        if pictures.shape[1] < 10:
-            raise ConfigError(
-                f"{self.title} takes clips of 10 frames or more, not {pictures.shape[1]}; raise fidelity.clip"
-            )
+        """Features float32 [N, 400] of clips of 10 frames or more."""
         parts = [self._network(some.float().transpose(1, 2), **self.options) for some in pictures.split(4)]
         return torch.cat(parts).float()

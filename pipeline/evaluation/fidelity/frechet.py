@@ -23,7 +23,11 @@ class Moments:
 
     def add(self, pictures: Tensor) -> None:
         """Take in pictures or clips, as the extractor takes them."""
-        features = self.extractor(pictures).double()
+        self.take(self.extractor(pictures))
+
+    def take(self, features: Tensor) -> None:
+        """Take in what the extractor said, float32 [N, D]."""
+        features = features.double()
         self.count += len(features)
         self._sum = self._sum + features.sum(0)
         self._outer = self._outer + features.T @ features
@@ -72,17 +76,3 @@ def _root(matrix: Tensor) -> Tensor:
     """The square root of a symmetric positive semidefinite matrix."""
     values, vectors = torch.linalg.eigh((matrix + matrix.T) / 2)
     return (vectors * values.clamp(min=0).sqrt()) @ vectors.T
-
-
-def check_comparable(results: list[dict[str, Any]], names: list[str]) -> None:
-    """Refuse to put Frechet distances side by side that are of different extractors.
-
-    Args:
-        results: of `frechet`, one for each of `names`.
-
-    Raises:
-        ValueError: naming who was measured by what.
-    """
-    if len({result["extractor"] for result in results}) > 1:
-        said = [f"{name}: {result['extractor']}" for name, result in zip(names, results, strict=True)]
-        raise ValueError(f"Frechet distances of different extractors cannot be compared: {said}")

@@ -17,9 +17,8 @@ from envs.episodes.clips import ClipStore
 from envs.physics.render import PARTS
 from envs.targets import ConfigError
 
-_ALIKE = (
-    12.0  # mean grey levels between a recorded picture and the same one rendered anew; encoding costs some
-)
+# mean grey levels between a recorded picture and the same one rendered anew; encoding costs some
+ALIKE = 12.0
 
 
 def part_labels(
@@ -86,7 +85,7 @@ def _repeated(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor) -> Ten
     for number in episodes.tolist():
         rows = store.rows(torch.tensor([number]))
         commands = store.arrays["commands"][rows].double().numpy()
-        jobs.append((int(store.episodes[number]["seed"] or 0), commands))
+        jobs.append((int(store.episodes[number]["seed"]), commands))
     pool = build_pool(cfg)
     try:
         made = pool.segment(jobs)
@@ -100,6 +99,6 @@ def _repeated(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor) -> Ten
         number = episodes[n]
         ends = torch.stack((store.start[number], store.start[number] + store.length[number] - 1))
         off = (store.frames(ends).float() - torch.from_numpy(pictures).float()).abs().mean()
-        if labels is not None and off <= _ALIKE:
+        if labels is not None and off <= ALIKE:
             out[n, : len(labels) - 1] = torch.from_numpy(labels[1:])
     return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,9 +19,12 @@ from pipeline.evaluation.fidelity.end_effector import EndEffectorRuler, end_effe
 from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.fidelity.frames import by_frame, frame_errors, summary
 from pipeline.evaluation.fidelity.frechet import Moments, frechet
-from pipeline.evaluation.objects.error import object_error
+from pipeline.evaluation.objects.error import object_offsets, object_summary
+from pipeline.evaluation.value.trials import Kept, Tensors
 
 _SIDE_BY_SIDE = 16  # episodes, whose frames are held at once
+_AT_ONCE = {False: 256, True: 32}  # pictures, or clips, that an extractor is shown
+_SIDES = ("made", "true")
 
 
 @dataclass
@@ -35,6 +39,8 @@ class OpenLoop:
         extractors: of Frechet distances.
         clip: frames of a clip.
         hands: measures end effectors, or why nothing can.
+        kept: where what was measured of each batch is kept; None for nowhere.
+        identity: what that depends on beside episodes, labels and extractors.
     """
 
     store: ClipStore
@@ -45,28 +51,70 @@ class OpenLoop:
     clip: int = 8
     hands: EndEffectorRuler | str = "nobody asked"
     distance: PerceptualDistance = field(default_factory=PerceptualDistance)
+    kept: Kept | None = None
+    identity: Mapping[str, Any] = field(default_factory=dict)
 
-    def measure(self, simulator: Simulator) -> Measured:
-        """Roll it out over all episodes."""
+    def measure(self, simulator: Simulator, about: Mapping[str, Any] | None = None) -> Measured:
+        """Roll it out over all episodes.
+
+        Args:
+            about: what tells it from others of the same identity.
+        """
         out = Measured()
-        sides = {e.name: (Moments(e), Moments(e)) for e in self.extractors}
+        sides = [(Moments(e), Moments(e)) for e in self.extractors]
         parts = range(0, len(self.episodes), _SIDE_BY_SIDE)
         for begin in tqdm(parts, desc="rolled out", unit="batch", dynamic_ncols=True, leave=False):
             some = slice(begin, begin + _SIDE_BY_SIDE)
-            made = replay(simulator, self.store, self.episodes[some], bf16=self.bf16)
-            true = self.store.frames(made.rows)
-            marks = None if self.labels is None else _fitted(self.labels[some], made.rows.shape[1])
-            out.add(frame_errors(made.frames, true, self.distance, marks), made.valid)
-            for extractor in self.extractors:
-                for moments, video in zip(sides[extractor.name], (made.frames, true), strict=True):
-                    for pictures in _samples(video, made.valid, extractor.clips, self.clip):
-                        moments.add(pictures)
-            out.objects.append(object_error(self.store, self.episodes[some], made, true))
+            part = self._part(simulator, some, about or {})
+            out.add(_named(part, "error"), part["valid"])
+            for number, pair in enumerate(sides):
+                for moments, side in zip(pair, _SIDES, strict=True):
+                    if (features := part.get(f"{side}/{number}")) is not None:
+                        for few in features.split(_AT_ONCE[moments.extractor.clips]):
+                            moments.take(few)
+            out.objects.append(_named(part, "object"))
             if isinstance(self.hands, EndEffectorRuler):
-                out.hands.append(self.hands.measure(self.store, self.episodes[some], made, true))
-        enough = {name: pair for name, pair in sides.items() if min(one.count for one in pair) > 1}
-        out.frechet = [frechet(*pair) for pair in enough.values()]
+                out.hands.append(_named(part, "hand"))
+        out.frechet = [frechet(*pair) for pair in sides if min(one.count for one in pair) > 1]
         out.end_effector = end_effector_summary(self.hands, out.hands)
+        return out
+
+    def _part(self, simulator: Simulator, some: slice, about: Mapping[str, Any]) -> Tensors:
+        """What is measured of some episodes, now or at some earlier time."""
+        if self.kept is None:
+            return self._rolled_out(simulator, some)
+        shown = b"" if self.labels is None else self.labels[some].numpy().tobytes()
+        identity = {
+            **self.identity,
+            **about,
+            "episodes": self.episodes[some].tolist(),
+            "labels": hashlib.sha256(shown).hexdigest(),
+            "extractors": [extractor.name for extractor in self.extractors],
+            "clip": self.clip,
+            "hands": self.hands if isinstance(self.hands, str) else self.hands.ruler.identity,
+            "distance": self.distance.name,
+        }
+        return self.kept.get(f"rolled-out-{some.start}", identity, lambda: self._rolled_out(simulator, some))
+
+    def _rolled_out(self, simulator: Simulator, some: slice) -> Tensors:
+        """Errors and valid, see Measured.add; features of generated and true samples by the extractor's
+        number; offsets of objects and hands.
+        """
+        episodes = self.episodes[some]
+        made = replay(simulator, self.store, episodes, bf16=self.bf16)
+        true = self.store.frames(made.rows)
+        marks = None if self.labels is None else _fitted(self.labels[some], made.rows.shape[1])
+        errors = frame_errors(made.frames, true, self.distance, marks)
+        out = {"valid": made.valid, **{f"error/{name}": values for name, values in errors.items()}}
+        for number, extractor in enumerate(self.extractors):
+            for side, video in zip(_SIDES, (made.frames, true), strict=True):
+                if samples := _samples(video, made.valid, extractor.clips, self.clip):
+                    out[f"{side}/{number}"] = torch.cat([extractor(few) for few in samples])
+        found = object_offsets(self.store, episodes, made, true)
+        out |= {f"object/{name}": values for name, values in found.items()}
+        if isinstance(self.hands, EndEffectorRuler):
+            hands = self.hands.measure(self.store, episodes, made, true)
+            out |= {f"hand/{name}": values for name, values in hands.items()}
         return out
 
 
@@ -77,7 +125,7 @@ class Measured:
         errors: float32 [N, T, V] by name, see frames.frame_errors.
         valid: bool [N, T].
         frechet: see frechet.frechet, one for each extractor that had samples enough.
-        objects: see objects.error.object_error, of each part.
+        objects: see objects.error.object_offsets, of each part.
         hands: see end_effector.EndEffectorRuler.measure, of each part; end_effector: what they come to.
     """
 
@@ -85,7 +133,7 @@ class Measured:
         self.errors: dict[str, Tensor] = {}
         self.valid = torch.zeros(0, 0, dtype=torch.bool)
         self.frechet: list[dict[str, Any]] = []
-        self.objects: list[dict[str, Any]] = []
+        self.objects: list[dict[str, Tensor]] = []
         self.hands: list[dict[str, Tensor]] = []
         self.end_effector: dict[str, Any] = {}
 
@@ -115,7 +163,7 @@ class Measured:
             view: {name: values[..., k : k + 1] for name, values in self.errors.items()}
             for k, view in enumerate(views)
         }
-        known = [part for part in self.objects if part]
+        objects = object_summary(self.objects)
         return {
             "episodes": len(self.valid),
             "overall": self.overall,
@@ -126,8 +174,8 @@ class Measured:
                 for name, which in groups.items()
             },
             "frechet": self.frechet,
-            "object_cm": _mean([part["object_cm"]["median"] for part in known if "object_cm" in part]),
-            "object_lost": _mean([part["object_lost"] for part in known if "object_lost" in part]),
+            "object_cm": _median(objects.get("object_cm")),
+            "object_lost": objects.get("object_lost"),
             "end_effector": self.end_effector,
         }
 
@@ -135,13 +183,18 @@ class Measured:
 def _samples(video: Tensor, valid: Tensor, clips: bool, length: int) -> list[Tensor]:
     """Pictures [n, 3, H, W], or clips [n, length, 3, H, W], of the frames that exist; every view is one."""
     if not clips:
-        return [some for some in video[valid].flatten(0, 1).split(256)]
+        return [some for some in video[valid].flatten(0, 1).split(_AT_ONCE[clips])]
     count = video.shape[1] // length
     if not count:
         return []
     whole = video[:, : count * length].unflatten(1, (count, length)).transpose(2, 3)  # [N, c, V, L, ...]
     there = valid[:, : count * length].unflatten(1, (count, length)).all(2)
-    return [some for some in whole[there].flatten(0, 1).split(32)]
+    return [some for some in whole[there].flatten(0, 1).split(_AT_ONCE[clips]) if len(some)]
+
+
+def _named(part: Tensors, kind: str) -> Tensors:
+    """Those of a part whose names begin so, without that."""
+    return {name.partition("/")[2]: value for name, value in part.items() if name.startswith(f"{kind}/")}
 
 
 def _fitted(labels: Tensor, frames: int) -> Tensor:
@@ -157,9 +210,9 @@ def _longer(values: Tensor, frames: int) -> Tensor:
     return torch.cat((values, more), 1)
 
 
-def _mean(values: list[float]) -> float | None:
-    known = [value for value in values if value == value]
-    return sum(known) / len(known) if known else None
+def _median(found: Mapping[str, float] | None) -> float | None:
+    """That of quantiles; None where nothing was found."""
+    return None if found is None or found["median"] != found["median"] else found["median"]
 
 
 def held_still(store: ClipStore, episodes: Tensor, distance: PerceptualDistance) -> Measured:

@@ -4,6 +4,7 @@ calibrated and stands still.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -21,15 +22,22 @@ POSES = "object_poses"  # privileged: [O, n], for every object x, y, z in metres
 
 
 def object_error(store: ClipStore, episodes: Tensor, made: Replay, truth: Tensor) -> dict[str, Any]:
-    """Error of the object's place in generated against true video, as one colour locator sees both.
+    """Error of the object's place in generated against true video, as one colour locator sees both; see
+    `object_offsets` and `object_summary`.
+    """
+    return object_summary([object_offsets(store, episodes, made, truth)])
+
+
+def object_offsets(store: ClipStore, episodes: Tensor, made: Replay, truth: Tensor) -> dict[str, Tensor]:
+    """How far off the object is in each frame in which the locator finds it in true video, [n] each.
 
     Args:
         truth: uint8 [N, T, V, 3, H, W], the true frames beside made.frames.
 
     Returns:
-        object_px and object_cm (median, 90th percentile over all frames), object_cm_at_end, object_lost
-        (share of frames), and locator_px, the locator's own error on true video; {} where this cannot be
-        measured: without calibration, without the column, or where it has no row of positions per object.
+        pixels and cm in generated and locator_px in true video, float32; lost, not found in generated video,
+        and at_end, the episode's last frame, bool; {} where this cannot be measured: without calibration,
+        without the column, or where it has no row of positions per object.
     """
     view = store.spec.embodiment.main_view
     if not store.spec.embodiment.calibrated or store.spec.embodiment.cameras[view].wrist is not None:
@@ -46,16 +54,36 @@ def object_error(store: ClipStore, episodes: Tensor, made: Replay, truth: Tensor
     true, _ = project(places[made.rows], intrinsic, c2w)
     height = places[start][:, None, None, 2].expand(-1, found.shape[1], 1)
     metres = (on_plane(found, height, intrinsic, c2w) - places[made.rows])[..., :2].norm(dim=-1)
-    pixels = (found - true).norm(dim=-1)
     ends = torch.zeros_like(made.valid)
     ends[torch.arange(len(ends)), made.valid.long().cumsum(1).argmax(1)] = True
     use = made.valid & ~hidden  # where the locator fails on true video it says nothing of generated video
-    if not use.any():
+    every = {
+        "pixels": (found - true).norm(dim=-1),
+        "cm": metres * 100,
+        "locator_px": (seen - true).norm(dim=-1),
+        "lost": lost,
+        "at_end": ends,
+    }
+    return {name: values[use] for name, values in every.items()}
+
+
+def object_summary(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Any]:
+    """What the `object_offsets` of some episodes come to, those of all parts in one.
+
+    Returns:
+        object_px and object_cm (median, 90th percentile over all frames), object_cm_at_end, object_lost
+        (share of frames), and locator_px, the locator's own error on true video; {} where nothing was
+        measured.
+    """
+    known = [part for part in parts if part and len(part["lost"])]
+    if not known:
         return {}
+    whole = {name: torch.cat([part[name] for part in known]) for name in known[0]}
+    there = ~whole["lost"]
     return {
-        "object_px": quantiles(pixels[use & ~lost]),
-        "object_cm": quantiles(metres[use & ~lost] * 100),
-        "object_cm_at_end": quantiles(metres[use & ~lost & ends] * 100),
-        "object_lost": float(lost[use].float().mean()),
-        "locator_px": quantiles((seen - true).norm(dim=-1)[use]),
+        "object_px": quantiles(whole["pixels"][there]),
+        "object_cm": quantiles(whole["cm"][there]),
+        "object_cm_at_end": quantiles(whole["cm"][there & whole["at_end"]]),
+        "object_lost": float(whole["lost"].float().mean()),
+        "locator_px": quantiles(whole["locator_px"]),
     }

@@ -15,13 +15,16 @@ from actors.factory import build_world
 from envs.episodes.clips import ClipStore
 from envs.initial_states import InitialStates
 from envs.manifest import mark_of
+from envs.targets import ConfigError
 from pipeline.evaluation.by_task import tasks_of_episodes
+from pipeline.evaluation.fidelity.masks import ALIKE
 from pipeline.evaluation.value.agreement import Cell
 from pipeline.evaluation.value.candidates import Candidate
 from pipeline.evaluation.value.trials import Imagination, Kept, Physics, Tensors
 
 Cfg = Mapping[str, Any]
 _SIDE_BY_SIDE = 64  # imagined episodes
+_NEARER = 0.5  # mean grey levels, more than encoding a picture changes its distance to others
 
 
 @dataclass(frozen=True)
@@ -54,13 +57,18 @@ class Comparison:
 
         Args:
             identity: what tells this physics from others.
+
+        Raises:
+            ConfigError: if physics lays out other starts than those that were recorded.
         """
         physics = Physics(self.cfg, identity, kept, self.spread)
         out: dict[tuple[str, str], Tensors] = {}
         try:
             with self._bar("true values") as bar:
                 for task, episodes in self.starts.items():
-                    seeds = [int(self.store.episodes[n]["seed"] or 0) for n in episodes.tolist()]
+                    seeds = [int(self.store.episodes[n]["seed"]) for n in episodes.tolist()]
+                    first = self.store.frames(self.store.start[episodes])
+                    check_starts(physics.strangeness(seeds, first, self._where(episodes)), episodes, seeds)
                     for candidate in self.candidates:
                         about = self._about(candidate)
                         out[task, candidate.name] = physics.outcome(candidate, about, seeds)
@@ -90,8 +98,8 @@ class Comparison:
             for task, episodes in self.starts.items():
                 first = InitialStates.of(self.store, episodes)
                 env = build_world(drawn, *parts, first, min(_SIDE_BY_SIDE, len(episodes)))
-                where = {"data": [str(path) for path in self.data], "episodes": episodes.tolist()}
-                imagination = Imagination(self.cfg, env, {**identity, **where}, kept, self.spread)
+                mine = {**identity, **self._where(episodes)}
+                imagination = Imagination(self.cfg, env, mine, kept, self.spread)
                 for candidate in self.candidates:
                     known = true.get((task, candidate.name))
                     about = self._about(candidate)
@@ -108,6 +116,10 @@ class Comparison:
     def _bar(self, title: str) -> tqdm:
         return tqdm(total=self.count, desc=title, unit="cell", dynamic_ncols=True)
 
+    def _where(self, episodes: Tensor) -> dict[str, Any]:
+        """What tells recorded starts from others."""
+        return {"data": [str(path) for path in self.data], "episodes": episodes.tolist()}
+
     def _about(self, candidate: Candidate) -> dict[str, Any]:
         """What tells a candidate's behaviour from others'; names are none of it."""
         about = {key: value for key, value in asdict(candidate).items() if key not in ("name", "weights")}
@@ -122,6 +134,27 @@ def starts_of(cfg: Cfg, store: ClipStore, held: Tensor) -> dict[str, Tensor]:
     tasks = tasks_of_episodes(cfg, store, held)
     mine = {task: held[torch.tensor([one == task for one in tasks])] for task in sorted(set(tasks))}
     return {task: episodes[: cfg["policy_value"]["starts"]] for task, episodes in mine.items()}
+
+
+def check_starts(off: Tensor, episodes: Tensor, seeds: Sequence[int]) -> None:
+    """See that physics lays out the starts that were recorded: data without seeds say their numbers instead.
+
+    Args:
+        off: see Physics.strangeness.
+
+    Raises:
+        ConfigError: if a recorded first picture is more like another's start than like its own.
+    """
+    own = off.diagonal()
+    wrong = ((own > ALIKE) | (own > off.amin(1) + _NEARER)).nonzero().flatten().tolist()
+    if wrong:
+        n = wrong[0]
+        raise ConfigError(
+            f"physics lays out other starts than {len(wrong)} of {len(seeds)} held-out episodes had: from"
+            f" seed {seeds[n]} another picture than the first of episode {int(episodes[n])}"
+            f" ({float(own[n]):.1f} grey levels apart), so nobody knows their true values; name data sets"
+            " that this task's physics recorded by imagined.data=[folder], or a task without a suite"
+        )
 
 
 def task_of(cfg: Cfg) -> dict[str, Any]:

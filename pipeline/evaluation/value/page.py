@@ -8,6 +8,7 @@ from typing import Any
 from markupsafe import Markup
 
 from pipeline.evaluation.charts import Point, agreement_chart
+from pipeline.evaluation.judging import cost_text, facts_text
 from pipeline.evaluation.report import templates
 from pipeline.evaluation.statistics import rate
 
@@ -32,6 +33,7 @@ def build_page(result: Mapping[str, Any]) -> str:
         .render(
             result=result,
             verdict=verdict(result),
+            notes=[*result["notes"], *judge_lines(result)],
             charts=_charts(result["cells"], tasks),
             figures=[title for _, title, _ in FIGURES],
             agreements=[
@@ -58,8 +60,15 @@ def table_text(result: Mapping[str, Any]) -> str:
     for policy in dict.fromkeys(cell["policy"] for cell in result["cells"]):
         cells = [_cell_text(found[policy, task]) for task in tasks]
         lines.append(f"| {policy} | {' | '.join(cells)} |")
-    lines += ["", verdict(result), *result["notes"]]
+    lines += ["", verdict(result), *result["notes"], *judge_lines(result)]
     return "\n".join(lines)
+
+
+def judge_lines(result: Mapping[str, Any]) -> list[str]:
+    """What the judge measures by, and what it was asked for and paid."""
+    facts, cost = facts_text(result["judged_by"]), result["judge_cost"]
+    said = [f"Judged by {facts}."] if facts else []
+    return [*said, f"Asking the judge: {cost_text(cost)}."] if cost else said
 
 
 def verdict(result: Mapping[str, Any]) -> str:

@@ -21,14 +21,16 @@ from torchrl.envs import TransformedEnv
 from actors.factory import build_physics, build_pool
 from actors.policies.recorded import Commands, RecordedActions
 from actors.rollouts.evaluate import Outcome, evaluate
-from envs.files import atomic
+from envs.files import atomic, write_text
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import PoolError, TaskPool
 from envs.physics.worker import Track
+from envs.specs import IMAGE
 from pipeline.evaluation.value.candidates import Candidate
 from pipeline.graph.code_version import digest
 
 Tensors = dict[str, Tensor]
+_ODD = r"[^\w.+-]+"  # in names of files
 
 
 class Kept:
@@ -44,8 +46,7 @@ class Kept:
     def get(self, name: str, identity: Mapping[str, Any], make: Callable[[], Tensors]) -> Tensors:
         """What `make` gave for this identity, now or at some earlier time."""
         key = digest(json.dumps(identity, sort_keys=True, default=str))
-        readable = re.sub(r"[^\w.+-]+", "_", name)
-        path = self.folder / f"{readable}-{key}.safetensors"
+        path = self.folder / f"{re.sub(_ODD, '_', name)}-{key}.safetensors"
         if path.exists():
             self.reused += 1
             return load_file(path)
@@ -53,6 +54,14 @@ class Kept:
         with atomic(path) as part:
             save_file({field: value.contiguous() for field, value in made.items()}, part)
         return made
+
+    def figures(self, name: str, identity: Mapping[str, Any], make: Callable[[], dict[str, Any]]) -> Any:
+        """The same of what JSON holds."""
+        key = digest(json.dumps(identity, sort_keys=True, default=str))
+        path = self.folder / f"{re.sub(_ODD, '_', name)}-{key}.json"
+        if not path.exists():
+            write_text(path, json.dumps(make()))
+        return json.loads(path.read_text())
 
 
 @dataclass
@@ -84,13 +93,36 @@ class Physics:
         make = self._scripted if candidate.expert is not None else self._acted
         return self.kept.get(f"true-{candidate.name}", identity, lambda: make(candidate, seeds))
 
-    def _acted(self, candidate: Candidate, seeds: list[int]) -> Tensors:
-        width = min(self.cfg["evaluate"]["envs"], len(seeds))
+    def strangeness(self, seeds: list[int], first: Tensor, where: Mapping[str, Any]) -> Tensor:
+        """Mean absolute difference in grey levels, float32 [N, N], of recorded first frames uint8
+        [N, V, 3, H, W] and of the pictures with which the episodes of N seeds begin.
+
+        Args:
+            where: what tells the recordings from others.
+        """
+        identity = {"physics": self.identity, **where, "seeds": seeds}
+        return self.kept.get("starts", identity, lambda: self._compared(seeds, first))["off"]
+
+    def _compared(self, seeds: list[int], first: Tensor) -> Tensors:
+        env, seen = self._physics(len(seeds)), []
+        for begin in range(0, len(seeds), env.batch_size[0]):
+            part = seeds[begin : begin + env.batch_size[0]]
+            env.schedule([*part, *[part[-1]] * (env.batch_size[0] - len(part))])
+            seen.append(env.reset()[IMAGE][: len(part)])
+        begun = torch.cat(seen).float()
+        return {"off": torch.stack([(row.float() - begun).abs().flatten(1).mean(1) for row in first])}
+
+    def _physics(self, seeds: int) -> PhysicsEnv:
+        width = min(self.cfg["evaluate"]["envs"], seeds)
         if self._env is None or self._env.batch_size[0] != width:
             self._close_env()
             self._env = build_physics(self.cfg, width)
+        return self._env
+
+    def _acted(self, candidate: Candidate, seeds: list[int]) -> Tensors:
+        env = self._physics(len(seeds))
         policy, stochastic = candidate.build(self.cfg, self.spread), self.cfg["policy_value"]["stochastic"]
-        outcome = evaluate(self._env, policy, seeds, stochastic, f"true {candidate.name}")
+        outcome = evaluate(env, policy, seeds, stochastic, f"true {candidate.name}")
         _check_all(
             candidate, seeds, [seed for seed, told in zip(seeds, outcome.counted, strict=True) if told]
         )

@@ -84,6 +84,7 @@ SURROUNDINGS: dict[str, Callable[[], AbstractContextManager[dict[str, Any]]]] = 
     "goal_picture": goal,
     "goal_image": goal,
     "golden_goal": partial(nullcontext, {"text_world": TINY_TEXT_WORLD}),
+    "golden_goal_full": partial(nullcontext, {"text_world": TINY_TEXT_WORLD}),
     "vlm": server,
     "vlm_local": weights,
 }

@@ -76,7 +76,13 @@ def test_goals_are_imagined_once_for_each_first_frame_and_instruction() -> None:
     assert torch.allclose(torch.cat([part.success for part in parts], 1), whole.success, atol=1e-5)
     assert judge.facts() == {
         "metric": "NLPD (normalised Laplacian pyramid)",
-        **{"success_by": "done", "fallback": "drop", "goals": 2, "goals_unfinished": 0},
+        **{
+            "success_by": "done",
+            "fallback": "drop",
+            "ending_threshold": 0.0,
+            "goals": 2,
+            "goals_unfinished": 0,
+        },
     }
     judge.score(frames, first, TEXTS[::-1])  # other words are other goals
     assert judge.imagined == 4

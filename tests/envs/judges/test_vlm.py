@@ -248,6 +248,24 @@ def test_votes_that_are_missing_do_not_count_as_no(make: Make, server: ChatServe
     assert score(judge, clip(DONE)).status.tolist() == [Status.ERROR.value]  # two of five could still come
 
 
+def test_a_model_that_never_says_what_it_is_asked_for_stops_the_run(make: Make, server: ChatServer) -> None:
+    judge = make(votes={"count": 1}, asking={"stop_after": 3, "in_flight": 1})
+    said = iter(["Perhaps.", "Perhaps.", "Answer: Yes", *["I cannot say."] * 20])
+    server.answer = lambda asked: next(said)
+    status = [int(score(judge, clip(k / 20)).status) for k in range(3)]
+    assert status == [Status.ABSTAIN.value] * 2 + [Status.OK.value]  # two in a row, and one that was usable
+    with pytest.raises(
+        JudgeError, match=r"3 answers in a row .*stop_after=3.*judge\.prompt=done.*I cannot say"
+    ):
+        score(judge, *(clip(k / 20) for k in range(3, 20)))
+    assert len(server.seen) < 20  # nobody is asked any more
+    new_command()
+    asked = len(server.seen)
+    with pytest.raises(JudgeError, match="nothing usable"):  # what was remembered says no more
+        score(make(votes={"count": 1}, asking={"stop_after": 3}), *(clip(k / 20) for k in range(3, 6)))
+    assert len(server.seen) == asked
+
+
 def test_a_dead_server_stops_the_run(make: Make, server: ChatServer) -> None:
     judge = make(votes={"count": 1}, asking={"retries": 0, "stop_after": 3, "in_flight": 1})
     score(judge, clip(0.3))

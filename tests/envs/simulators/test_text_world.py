@@ -127,7 +127,7 @@ def test_the_loss_falls_and_every_weight_but_the_tokenizers_learns() -> None:
 
 def test_texts_that_would_be_cut_are_refused() -> None:
     model, long = world(), "put " * TEXT_BYTES
-    with pytest.raises(ValueError, match=rf"has {len(long)} bytes.*takes {TEXT_BYTES}"):
+    with pytest.raises(ValueError, match=rf"has {len(long)} bytes.*carry {TEXT_BYTES}"):
         model.imagine(firsts(), [*TEXTS[:2], long], torch.arange(3))
     with pytest.raises(ValueError, match="'put put"):
         model.check([*TEXTS, long])
@@ -170,3 +170,6 @@ def test_t5_from_a_folder_tells_word_by_word(tmp_path: Path) -> None:
     assert torch.equal(made.reader(TEXTS[1:2])[0], told[1])
     with pytest.raises(ValueError, match=r"has 10 tokens, more than text_world\.words\.max_tokens=9"):
         made.check(["cube " * 10])
+    given["max_tokens"] = 512  # more than clips and rollouts carry: it would learn from half of a text
+    with pytest.raises(ValueError, match=rf"has 300 bytes.*carry {TEXT_BYTES}"):
+        world(words=given).check(["cube " * 60])

@@ -293,7 +293,7 @@ def test_episodes_with_nan_are_dropped_and_counted_until_they_are_too_many(
             assert stats["ledger"]["dropped"] == {"NaN actions": 2} and stats["ledger"]["learned"] == 6
             assert all(bool(p.isfinite().all()) for p in policy.parameters())
         else:
-            with pytest.raises(FleetError, match="NaN"):
+            with pytest.raises(FleetError, match=r"the last: a policy that says NaN$"):
                 train_rl(fleet, policy, algorithm, limit, tmp_path / "all", Starts(range(4)))
 
 

@@ -26,6 +26,7 @@ from envs.targets import ConfigError, build, target
 from learners.stages.distill.stage import check_pair, train_student
 from learners.stages.simulator import SimulatorFitConfig
 from learners.training.fit import FitConfig
+from learners.training.optimisers import optimiser_state
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
 from tests.learners.models import section_of, simulator_of
 from tests.moving_square import SIZE
@@ -164,14 +165,35 @@ def test_a_killed_distillation_goes_on_bit_for_bit(
     assert [row["step"] for row in rows] == [0, 1, 2, 3]
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_muon_moves_the_hidden_layers_that_the_engine_names(method: str, tiny_store: Stores) -> None:
+    teacher, student = pair("forcing_small", tiny_store(BIMANUAL_POSES).spec)
+    options = FitConfig(1, 2, 1e-3, bf16=False, optimiser="muon")
+    made = build(
+        section(f"distiller/{method}"), "distill.method", teacher=teacher, student=student, config=options
+    )
+    trained = {name: p for name, p in made.named_parameters() if p.requires_grad}
+    state = optimiser_state(made.optimise(trained, 1e-3, 0.0), trained)
+    matrices = {name for name, held in state.items() if "momentum_buffer" in held}
+    assert matrices and all(set(student.hidden) & set(name.split(".")) for name in matrices)
+
+
 def test_teacher_and_student_must_belong_together(tiny_store: Stores) -> None:
     spec = tiny_store(BIMANUAL_POSES).spec
     teacher, student = pair("dit_small", spec)
     check_pair(teacher, student)
     with pytest.raises(ValueError, match=r"conditioned differently: simulator\.pose_map: True and False"):
         check_pair(teacher, pair("dit_small", replace(spec, pose_map=False))[1])
+    forcing, words = pair("forcing_small", spec)[0], {"_target_": "envs.conditioning.ActionText"}
+    one = other_than("forcing_small", spec, {"actions": words})
+    other = other_than("forcing_small", spec, {"actions": {**words, "decimals": 2}})
+    with pytest.raises(ValueError, match=r"simulator\.actions: .*ActionVector .* and .*ActionText "):
+        check_pair(forcing, one)
+    with pytest.raises(ValueError, match=r"simulator\.actions: .*'decimals': 0.* and .*'decimals': 2"):
+        check_pair(one, other)
+    denoising = section_of("simulator", "dit_small")["denoising"]
     with pytest.raises(ValueError, match=r"distill\.steps=2 are more than the teacher's 1"):
-        check_pair(small(spec, {"steps": 1}), student)
+        check_pair(other_than("dit_small", spec, {"denoising": {**denoising, "steps": 1}}), student)
     with pytest.raises(ValueError, match=r"a student samples in distilled steps; set"):
         check_pair(teacher, teacher)
     unet = simulator_of("unet_small", spec)
@@ -179,11 +201,10 @@ def test_teacher_and_student_must_belong_together(tiny_store: Stores) -> None:
         check_pair(unet, student)
 
 
-def small(spec: WorldSpec, denoising: dict[str, Any]) -> Simulator:
-    """A dit_small of other options."""
-    own = {k: v for k, v in section_of("simulator", "dit_small").items() if k not in WORLD_OPTIONS}
-    own["denoising"] |= denoising
-    return build(own, "simulator", spec=spec)  # type: ignore[no-any-return]
+def other_than(name: str, spec: WorldSpec, changes: dict[str, Any]) -> Simulator:
+    """An engine of a config with other options."""
+    own = {k: v for k, v in section_of("simulator", name).items() if k not in WORLD_OPTIONS}
+    return build(own | changes, "simulator", spec=spec)  # type: ignore[no-any-return]
 
 
 def test_jumps_are_no_trajectories(tiny_store: Stores, tmp_path: Path) -> None:

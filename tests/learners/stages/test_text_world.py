@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
 
 from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
-from learners.stages.text_world import SuccessfulClips, train_text_world
+from learners.stages.text_world import SuccessfulClips, calibrate_ending, train_text_world
 from learners.training.fit import FitConfig
 from tests.embodiments import ARM_DELTAS
-from tests.envs.simulators.test_text_world import world
+from tests.envs.simulators.clips import moving_square
+from tests.envs.simulators.test_text_world import TEXTS, lean, world
 from tests.moving_square import INSTRUCTION
 
 Stores = Callable[[Embodiment], ClipStore]
@@ -33,6 +35,55 @@ def test_it_learns_from_successes_and_then_goes_where_they_go(tiny_store: Stores
     first = store.frames(store.start[:2])
     golden = model.imagine(first, [INSTRUCTION] * 2, torch.arange(2))
     assert golden.frames.shape[0] == 2 and golden.frames.shape[1] <= 3
+
+
+class Sees(nn.Module):
+    """Stands for a text world that says of each frame how near the square has come to the corner.
+
+    Args:
+        shift: of all that it says.
+    """
+
+    def __init__(self, shift: float):
+        super().__init__()
+        self.register_buffer("threshold", torch.tensor(0.9))
+        self.shift, self.seen = shift, 0
+
+    def done_along(self, frames: torch.Tensor, instruction: Sequence[str]) -> torch.Tensor:
+        self.seen += frames.shape[1]
+        light = frames[:, :, 0].float().mean(2)  # of the main view, [B, T, H, W]
+        light = (light - light.amin((2, 3), keepdim=True)).square()
+        down = torch.linspace(0, 1, light.shape[2])[:, None]
+        return (light * down).sum((2, 3)) / light.sum((2, 3)) - self.shift
+
+
+def test_a_trajectory_ends_where_recorded_frames_are_as_likely_done_as_not(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    every, found = torch.arange(len(store)), []
+    for shift in (0.0, 0.2):
+        sees = Sees(shift)
+        assert calibrate_ending(sees, store, every, 2)  # type: ignore[arg-type]
+        rows, valid = store.whole(every)
+        right = (sees.done_along(store.frames(rows), ()) > sees.threshold) == (store.success(every, rows) > 0)
+        assert float(right[valid].float().mean()) > 0.9
+        found.append(float(sees.threshold))
+    assert found[0] == pytest.approx(found[1] + 0.2, abs=0.05)
+    sees = Sees(0.0)
+    assert not calibrate_ending(sees, store, store.select(succeeded=False), 2)  # type: ignore[arg-type]
+    assert float(sees.threshold) == pytest.approx(0.9)  # no frame shows success
+    model = world(ending={"threshold": 0.97})
+    lean(model, -3.0)  # of every frame the same, which rises with nothing
+    assert not calibrate_ending(model, store, every, 2) and float(model.threshold) == pytest.approx(0.97)
+
+
+def test_what_is_said_along_a_video_hangs_on_the_frames_before_it() -> None:
+    model = world()  # of four frames
+    lean(model, 0.0, spread=30.0)
+    frames = moving_square(model.video.spec, torch.linspace(0.1, 0.9, 6).expand(3, -1))
+    said = model.done_along(frames, TEXTS)
+    assert said.shape == (3, 6) and torch.allclose(said[:, :4], model.done(frames[:, :4], TEXTS), atol=1e-4)
+    other = model.done_along(frames.flip(1)[:, 1:5], TEXTS)  # the same frame after others
+    assert not torch.allclose(other[:, 3], said[:, 1], atol=1e-3)
 
 
 def test_clips_rest_at_the_end_where_the_task_is_done(tiny_store: Stores) -> None:

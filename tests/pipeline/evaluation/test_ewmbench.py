@@ -224,6 +224,8 @@ def test_bleu_by_hand() -> None:
     # Two of three words; 0 + 1 of 2 + 1 pairs; 0 + 1 of 1 + 1 triples.
     assert bleu("put a cup", "put the cup", False) == pytest.approx((2 / 3 / 3 / 2) ** (1 / 3))
     assert bleu("put a cup", "put the cup", True) == 0.0  # no 4-gram
+    # a caption of two words has no triples: they are no hits
+    assert bleu("red cup", "put the cup", False) == pytest.approx((1 / 2 / 2) ** 0.5 * math.exp(-1 / 2))
     assert bleu("a b c d", "a b c d", True) == pytest.approx(1) and bleu("?", wanted, False) == 0.0
 
 

@@ -18,9 +18,10 @@ from envs.rng import constant_generator
 from envs.simulators.base import Simulator
 from envs.specs import WorldSpec
 from envs.targets import ConfigError
+from pipeline.commands.worlds.fidelity import build_extractors
 from pipeline.evaluation.fidelity.extractors import I3D, Extractor, Inception, PyramidClips, PyramidFrames
 from pipeline.evaluation.fidelity.frames import by_frame, check_pair, frame_errors, psnr, summary
-from pipeline.evaluation.fidelity.frechet import Moments, check_comparable, frechet
+from pipeline.evaluation.fidelity.frechet import Moments, frechet
 from pipeline.evaluation.fidelity.grid import combinations, optimum, with_settings
 from pipeline.evaluation.fidelity.long import drift
 from pipeline.evaluation.fidelity.masks import read_labels
@@ -130,10 +131,6 @@ def test_distances_of_different_extractors_are_never_mixed() -> None:
         frechet(frames, clips)
     with pytest.raises(ValueError, match="two samples"):
         frechet(Moments(PyramidFrames()), frames)
-    rows = [frechet(one, one) for one in (frames, clips)]
-    with pytest.raises(ValueError, match="different extractors"):
-        check_comparable(rows, ["a", "b"])
-    check_comparable(rows[:1], ["a"])
 
 
 def test_blur_is_further_from_the_truth_than_the_truth(store: ClipStore) -> None:
@@ -188,8 +185,16 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
         Inception(str(tmp_path / "nowhere.pt"))
     clips = I3D(scripted(tmp_path / "i3d.pt", VideoNetwork()))
     assert clips(torch.zeros(2, 16, 3, 8, 8, dtype=torch.uint8)).shape == (2, 400)
-    with pytest.raises(ConfigError, match=r"10 frames or more, not 4; raise fidelity\.clip"):
-        clips(torch.zeros(2, 4, 3, 8, 8, dtype=torch.uint8))
+
+
+def test_clips_that_are_too_short_are_told_before_anything_is_measured(tmp_path: Path) -> None:
+    names = {"frames": "PyramidFrames", "clips": "I3D"}
+    where = f"{Extractor.__module__}."
+    section = {f"{key}_extractor": {"_target_": where + name} for key, name in names.items()}
+    section["clips_extractor"]["weights"] = scripted(tmp_path / "i3d.pt", VideoNetwork())
+    with pytest.raises(ConfigError, match=r"fidelity\.clip=8: I3D.*10 frames or more; raise fidelity\.clip"):
+        build_extractors({**section, "clip": 8})
+    assert [one.clips for one in build_extractors({**section, "clip": 10})] == [False, True]
 
 
 def test_a_right_world_is_measured_as_right(store: ClipStore) -> None:

@@ -178,5 +178,16 @@ def test_extractors_refuse_weights_of_another_architecture(tmp_path: Path) -> No
         ClipFrames(str(tmp_path / "dino"))
     with pytest.raises(ConfigError, match="holds no tokenizer"):
         ClipTexts(str(tmp_path / "clip"))
+    from tokenizers import Tokenizer, models, pre_tokenizers
+    from transformers import PreTrainedTokenizerFast
+
+    cut = Tokenizer(models.WordLevel({"<pad>": 0, "<unk>": 1, "cup": 2}, unk_token="<unk>"))
+    cut.pre_tokenizer = pre_tokenizers.Whitespace()
+    special = {"pad_token": "<pad>", "unk_token": "<unk>"}
+    PreTrainedTokenizerFast(tokenizer_object=cut, **special).save_pretrained(tmp_path / "clip")
+    texts = ClipTexts(str(tmp_path / "clip"))
+    assert texts.similarity(["a cup", "cup " * 77], ["the cup"]).shape == (2, 1)
+    with pytest.raises(ConfigError, match=r"takes 77 tokens, and 'cup cup.* has 78; ask for shorter"):
+        texts.similarity(["cup"], ["cup " * 78])
     with pytest.raises(ConfigError, match=r"must be a folder with config\.json"):
         DinoPatches(str(tmp_path / "nowhere"))

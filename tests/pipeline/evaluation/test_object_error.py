@@ -18,7 +18,9 @@ from envs.physics.suite import build_suite
 from envs.simulators.replay import Replay
 from envs.specs import WorldSpec
 from envs.targets import ConfigError
+from pipeline.evaluation.fidelity.open_loop import Measured
 from pipeline.evaluation.measurement import rollout_error
+from pipeline.evaluation.objects.error import object_offsets
 from pipeline.evaluation.objects.rays import on_plane
 from tests.embodiments import BIMANUAL_POSES, world_spec
 from tests.envs.physics.sections import task_section
@@ -74,6 +76,18 @@ def test_the_first_object_is_measured_however_much_a_suite_says_of_it(more: int,
     assert shifted["object_px"]["median"] == pytest.approx(4.0, abs=1.0)
     assert shifted["object_cm"]["median"] == pytest.approx(4 / 32 * 100, abs=3.0)
     assert shifted["locator_px"] == exact["locator_px"]
+
+
+def test_a_median_is_that_of_all_frames_however_they_were_measured(tmp_path: Path) -> None:
+    store, measured = store_of(tmp_path, with_positions(0)), Measured()
+    # one batch of one episode that is right, one of two that are not: the mean of medians is a third number
+    for episodes, shift in ((torch.arange(1), 0), (torch.arange(1, 3), 4)):
+        made = recorded(store, episodes, shift)
+        measured.objects.append(object_offsets(store, episodes, made, store.frames(made.rows)))
+    measured.add({"mse": torch.zeros(3, 1, 1)}, torch.ones(3, 1, dtype=torch.bool))
+    found = measured.result((), {})
+    every = torch.cat([part["cm"] for part in measured.objects])
+    assert found["object_cm"] == float(every.median()) > 8.0 and found["object_lost"] == 0.0
 
 
 def test_poses_that_are_no_rows_of_objects_are_left_alone(tmp_path: Path) -> None:

@@ -70,6 +70,51 @@ def test_worlds_stand_side_by_side_after_equal_time(root: Path) -> None:
     assert run_study(study) == text and {path: path.stat().st_mtime_ns for path in made} == made
 
 
+TOKENS = (
+    *("study=tokens", "study.rows=[adaln,raster]", "study.places=[]", "simulator=tokens_small"),
+    *("equal_time={seconds: 1, measured: 2}", "fidelity.episodes=2", "task.horizon=8"),
+)
+
+
+def test_worlds_of_tokens_differ_in_what_their_rows_say(root: Path) -> None:
+    assert "not run" not in run_study(planned(root, TOKENS))
+    assert {"training", "rollout", "speed", "verdicts"} <= set(table_of(root)["rows"][0]["cells"])
+    every = "study.rows=[cross,adaln,maskgit2,maskgit8,raster]"
+    rows = {entry.name: entry.made.graph for entry in planned(root, [*TOKENS, every]).rows}
+    sections = {name: graph.cfg["simulator"] for name, graph in rows.items()}
+    told = {name: section["conditioning"]["_target_"].split(".")[-1] for name, section in sections.items()}
+    assert told == {name: "AdaLN" if name == "adaln" else "CrossAttention" for name in rows}
+    assert "steps" not in sections["raster"]["decoding"]
+    assert [sections[name]["decoding"]["steps"] for name in ("maskgit2", "maskgit8")] == [2, 8]
+
+
+STUDENTS = (
+    *(
+        "study=students",
+        "study.rows=[teacher,one]",
+        "simulator=dit_small",
+        "tokenizer_fit={steps: 2, batch: 4}",
+    ),
+    *("distill.first.fit={steps: 5, batch: 2}", "distill.method.critic_updates=1", "fidelity.episodes=2"),
+    *("task.horizon=8", "rounds.deploy=[8]", "rounds.splits.held_out=0.25", "rounds.clone=0"),
+    *(
+        row("teacher", "simulator.denoising.steps=2"),
+        row("one", "simulator.denoising.steps=2", "distill.steps=1"),
+    ),
+)
+
+
+def test_students_gain_by_the_same_rl_as_their_teacher(root: Path) -> None:
+    assert "not run" not in run_study(planned(root, STUDENTS))
+    cells = [entry["cells"] for entry in table_of(root)["rows"]]
+    assert all({"gain", "gap", "verdicts", "speed", "rollout"} <= set(each) for each in cells)
+    teacher, student = (entry.made.graph for entry in planned(root, STUDENTS).rows)
+    shared = ("collect", "imitation", "tokenizer", "simulator-1")
+    assert all(teacher.key(name) == student.key(name) for name in shared)
+    assert teacher.key("rl-1") != student.key("rl-1")
+    assert student.nodes["rl-1"].settings == teacher.nodes["rl-1"].settings
+
+
 ROBOSCAPE = (
     *("study=roboscape", "task=tabletop", "task.horizon=32", "task.suite.cameras=[head]"),
     *("judge=golden_goal", "simulator=tokens_small", "study.places=[two_tasks]"),

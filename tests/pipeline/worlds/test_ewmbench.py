@@ -44,6 +44,8 @@ def test_two_arms_in_physics_with_a_model_that_reads(tmp_path: Path) -> None:
         more = load_config([*words, "ewmbench.samples=3", "ewmbench.strict_parity=false"])
         assert "4 samples were reused" in ewmbench(more, tmp_path / "run")
         assert server.tries == asked + 3 * 2
+        paid = json.loads((tmp_path / "run/ewmbench.json").read_text())["judge_cost"]
+        assert paid["calls"] == server.tries  # of all three lives
     result = json.loads((tmp_path / "run/ewmbench.json").read_text())
     assert len(result["rows"]) == 2 and len(result["rows"][0]["samples"]) == 3
     assert result["set"]["of"] == 4 and "end effectors in space (commanded poses)" in result["set"]["by"]
@@ -60,6 +62,7 @@ def test_two_arms_in_physics_with_a_model_that_reads(tmp_path: Path) -> None:
         set(result["detector"]["cameras"]) == {"head"} and result["detector"]["source"] == "commanded poses"
     )
     page = (tmp_path / "run/ewmbench.html").read_text()
+    assert f"Asking the model: calls {paid['calls']:g}, prompt tokens" in page
     assert "Best samples" in page and page.count("<video") == 1 and "best of 2" in said
     assert not re.findall(r'(?:src|href)=(?!"(?:#|data:))', page)
     with pytest.raises(ConfigError, match=r"ewmbench\.patches\._target_=.*should be a PatchExtractor"):

@@ -50,6 +50,12 @@ def test_fidelity_with_masks_from_physics(tmp_path: Path) -> None:
     hands = result["end_effector"]
     assert hands["truth"] == "physics" and "line of sight of head" in hands["method"]
     assert hands["generated_cm"]["median"] > 0 and "End effectors lie" in said
+    # nothing is rolled out twice: neither the one batch, nor that of each setting
+    again = fidelity(tried, tmp_path / "run")
+    assert said.endswith("0 parts were reused") and again.endswith("3 parts were reused")
+    both = json.loads((tmp_path / "run/fidelity.json").read_text())
+    for name in ("overall", "by_frame", "frechet", "long", "end_effector", "object_cm"):
+        assert both[name] == result[name]
     page = (tmp_path / "run/fidelity.html").read_text()
     assert "Frechet distances" in page and not re.findall(r'(?:src|href)=(?!"#)', page)
     with pytest.raises(ConfigError, match="another architecture"):

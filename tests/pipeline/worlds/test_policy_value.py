@@ -7,6 +7,8 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as parquet
 import pytest
 
 from actors.factory import build_physics, build_pool
@@ -16,6 +18,7 @@ from envs.embodiment import Embodiment
 from envs.targets import ConfigError
 from pipeline.commands.worlds.policy_value import policy_value
 from pipeline.config import load_config
+from pipeline.evaluation.value.page import judge_lines
 from pipeline.evaluation.value.trials import scripted_outcomes
 from tests.embodiments import ARM_DELTAS
 from tests.worlds import scripted_set, untrained_world
@@ -47,7 +50,7 @@ def test_values_beside_true_ones_and_nothing_is_tried_twice(tmp_path: Path) -> N
     root = tmp_path / "run"
     policy_value(load_config([*words, "policy_value.repeats=1"]), root)
     said = policy_value(load_config([*words, "policy_value.repeats=2"]), root)
-    assert said.endswith("8 parts were reused")  # true outcomes and the first repeat of four candidates
+    assert said.endswith("9 parts were reused")  # the starts, true outcomes and the first repeat of all four
     result = json.loads((root / "policy-value.json").read_text())
     rows = {cell["policy"]: cell for cell in result["cells"]}
     assert list(rows) == ["policy", "policy + noise 0.5", "expert 0", "expert 1"]
@@ -57,9 +60,25 @@ def test_values_beside_true_ones_and_nothing_is_tried_twice(tmp_path: Path) -> N
     table = result["agreement"]["micro"]
     assert sum(table[name] for name in ("tp", "fp", "fn", "tn")) == 24
     assert any("open loop" in note for note in result["notes"])
+    assert result["judged_by"] == {} and result["judge_cost"] == {}  # a learned judge is free
+    asked = {
+        "judged_by": {"metric": "NLPD", "goals_unfinished": 1},
+        "judge_cost": {"calls": 2.0, "cost": 0.5},
+    }
+    assert judge_lines(asked) == [
+        "Judged by metric: NLPD, goals unfinished: 1.",
+        "Asking the judge: calls 2, cost 0.5.",
+    ]
     page = (root / "policy-value.html").read_text()
     assert page.count("<title>") == 5 and "expert 0, push: 100 -&gt; " in page
     assert not re.findall(r'(?:src|href)=(?!"#)', page)
+    # Recordings without seeds say their numbers, from which physics lays out starts of its own.
+    for path in (data / "data").rglob("*.parquet"):
+        table = parquet.read_table(path)
+        moved = pa.array([seed.as_py() + 1000 for seed in table["seed"]])
+        parquet.write_table(table.set_column(table.column_names.index("seed"), "seed", moved), path)
+    with pytest.raises(ConfigError, match=r"lays out other starts than 3 of 3 .* seed 1000 .*imagined\.data"):
+        policy_value(load_config([*words, "policy_value.repeats=1"]), tmp_path / "other")
 
 
 def test_without_physics_values_are_estimated_alone(

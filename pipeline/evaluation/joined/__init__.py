@@ -1,0 +1,1 @@
+"""What separate commands measured of one simulator, on one page."""
