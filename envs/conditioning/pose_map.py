@@ -13,6 +13,7 @@ from typing import Literal
 import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from envs.geometry.rotations import pose_transforms
@@ -121,6 +122,20 @@ def render_pose_map(
                     colour = AXIS_RGB[arm % 2][axis][channel]
                     line(plane, origin, points[arm][axis + 1], colour, thickness, edges, bits)
     return torch.from_numpy(canvas).reshape(*lead, views, steps, 3, *size)
+
+
+def pose_map_cells(maps: Tensor, stride: int) -> Tensor:
+    """Pose maps uint8 [B, T, V, 3, H, W] at the resolution of latents or tokens, float32 [B, T, V, C, H /
+    stride, W / stride] in -1..1: pixels become channels at half their resolution. Means over whole cells
+    would not say where in them a gripper is.
+    """
+    half = F.avg_pool2d(maps.flatten(0, 2).float() / 127.5 - 1, 2)
+    return F.pixel_unshuffle(half, stride // 2).unflatten(0, maps.shape[:3])
+
+
+def pose_map_channels(stride: int) -> int:
+    """The channels C that `pose_map_cells` gives."""
+    return 3 * (stride // 2) ** 2
 
 
 def fixed_point(values: np.ndarray, bits: int) -> np.ndarray:

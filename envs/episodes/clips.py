@@ -22,11 +22,12 @@ class ClipStore(EpisodeStore):
         """Clips that begin at frame `begin` [B] of `episode` [B].
 
         Returns:
-            TensorDict [B] with memory (index [L, M], frames uint8 [L, M, V, 3, H, W], commands [L, M, A]),
-            future (frames uint8 [L*K, V, 3, H, W], commands [L*K, A], states [L*K, S], valid bool [L*K],
-            success float32 [L*K], NaN where nobody labelled the episode), now (command [A], state [S]),
-            history (commands, states [spec.history, ...]), begin [], stride int64 []; memory and future have
-            c2w [..., V, 4, 4] too, and the clip intrinsic [V, 3, 3], if the robot is calibrated, and pose_map
+            TensorDict [B] with memory (index [L, M], frames uint8 [L, M, V, 3, H, W], commands [L, M, A],
+            present bool [L, M], whether there is a picture), future (frames uint8 [L*K, V, 3, H, W],
+            commands [L*K, A], states [L*K, S], valid bool [L*K], success float32 [L*K], NaN where nobody
+            labelled the episode), now (command [A], state [S]), history (commands, states
+            [spec.history, ...]), begin [], stride int64 []; memory and future have c2w [..., V, 4, 4] too,
+            and the clip intrinsic [V, 3, 3], if the robot is calibrated, and pose_map
             uint8 [..., V, 3, H, W] if the spec asks for it. Frames past the episode's end repeat its last;
             they and frames without a picture are not valid.
         """
@@ -47,6 +48,7 @@ class ClipStore(EpisodeStore):
             "index": index,
             "frames": self.frames(memory),
             "commands": self.commands(memory, base, spec.stride),
+            "present": self.arrays["present"][memory],
             **self._conditioning(memory),
         }
         future = {

@@ -45,11 +45,14 @@ class Simulator(nn.Module):
         hidden: names of the layers that optimisers may take for hidden ones (training/optimisers.py);
             none for all.
         recent_memory: whether memory is the newest frames instead of some that are spread over the past.
+        told_in_steps: whether absolute commands are told as moves since the frame before, instead of since
+            the chunk began.
     """
 
     feature_shape: tuple[int, ...]
     hidden: tuple[str, ...] = ()
     recent_memory: bool = False
+    told_in_steps: bool = False
 
     def __init__(self, spec: WorldSpec, memory_frames: int):
         super().__init__()
@@ -114,12 +117,19 @@ class Simulator(nn.Module):
         """Only the features of `predict`, for training the state expert."""
         return self.predict(inputs)[1]
 
+    def coded(self, frames: Tensor) -> Tensor | None:
+        """Frames uint8 [B, T, V, 3, H, W] as its autoencoder keeps each of them: how sharp it can be where it
+        knows everything. None of engines that have none.
+        """
+        return None
+
     def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
         """Take units from data before the first training; here there are none to take.
 
         Args:
             commands: [N, A].
-            moves: [N, A], changes of absolute commands within a chunk; zeros of delta actions.
+            moves: [N, A], changes of absolute commands within a chunk, or from frame to frame where the
+                engine is told_in_steps; zeros of delta actions.
             states: [N, S].
         """
 

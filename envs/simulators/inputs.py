@@ -75,3 +75,14 @@ def own_frames(simulator: Simulator, clip: TensorDict, generator: torch.Generato
             frames = simulator.predict(build_inputs(simulator.spec, clip, number, own, generator))[0]
         own = frames if own is None else torch.cat([own, frames], 1)
     return chosen, build_inputs(simulator.spec, clip, chosen, own, generator)
+
+
+def taught_memory(clip: TensorDict, number: int) -> Tensor:
+    """Which frames of the memory of chunk `number` of a training clip [B] are true ones that a command led
+    to, bool [B, M]: no repeats of the first frame, none of the model's own, none without a picture. For
+    engines whose memory is the newest frames.
+    """
+    memory = clip["memory"][:, number]
+    index = memory["index"]
+    led = index.diff(dim=1, prepend=index[:, :1]) > 0
+    return led & (index <= clip["begin"][:, None]) & memory["present"].bool()

@@ -78,7 +78,7 @@ def train_simulator(
             " nothing to learn from them (GE-Sim 2.0's bundles are such: they say where a rollout begins)"
         )
     if fresh:
-        simulator.normalise(*units(store, episodes))
+        simulator.normalise(*units(store, episodes, 1 if simulator.told_in_steps else store.spec.chunk))
         order = torch.randperm(len(episodes), generator=step_generator(options.seed, options.steps))
         simulator.fit_camera_statistics(store.frames(store.start[episodes[order[:_FIRST_FRAMES]]]))
 
@@ -133,19 +133,22 @@ class ClipBatches:
                 yield self.store.sample(episodes, share, spec, generator)
 
 
-def units(store: ClipStore, episodes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def units(store: ClipStore, episodes: Tensor, most: int) -> tuple[Tensor, Tensor, Tensor]:
     """What simulators and state experts take their units from: commands, moves and states of all frames.
 
+    Args:
+        most: frames that a move spans at most, each number of them as often.
+
     Returns:
-        commands float32 [N, A]; moves [N, A], by how much absolute commands differ from the one in force when
-        a chunk begins, at any of its frames (zeros of actions that are changes themselves); states [N, S].
+        commands float32 [N, A]; moves [N, A], by how much absolute commands differ from those of 1 to `most`
+        frames before (zeros of actions that are changes themselves); states [N, S].
     """
-    rows, chunk = store.rows(episodes), store.spec.chunk
+    rows = store.rows(episodes)
     commands = store.arrays["commands"]
     if store.spec.embodiment.delta:
         moves = torch.zeros_like(commands[rows])
     else:
-        ahead = 1 + torch.arange(len(rows)) % chunk
+        ahead = 1 + torch.arange(len(rows)) % most
         moves = commands[torch.minimum(rows + ahead, last_rows(store, rows))] - commands[rows]
     return commands[rows], moves, store.arrays["states"][rows]
 

@@ -56,7 +56,7 @@ def train_state(
         ValueError: if lora is asked of a decoder without projections to adapt.
     """
     if fresh and not decoder.normalised:
-        decoder.normalise(*units(store, episodes))
+        decoder.normalise(*units(store, episodes, store.spec.chunk))
     clips = _Features(decoder, simulator, store, episodes, options.bf16)
     wanted = {name: parameter.requires_grad for name, parameter in simulator.named_parameters()}
     simulator.eval().requires_grad_(False)

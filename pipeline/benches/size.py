@@ -133,7 +133,7 @@ def _clip(spec: WorldSpec, remembered: int) -> TensorDict:
     index = torch.zeros(1, 1, remembered, dtype=torch.int64, device="meta")
     states = torch.zeros(1, max(spec.chunk, remembered), spec.state_dim, device="meta")
     clip = {
-        "memory": TensorDict({"index": index, **part(remembered, 1)}, [1]),
+        "memory": TensorDict({"index": index, "present": index == 0, **part(remembered, 1)}, [1]),
         "future": TensorDict(
             {
                 **part(spec.chunk),

@@ -120,6 +120,13 @@ class LatentWorld(Simulator):
         """See Simulator.features; nothing is decoded to pixels."""
         return self._denoise(inputs)[1]
 
+    @torch.no_grad()
+    def coded(self, frames: Tensor) -> Tensor:
+        """See Simulator.coded; each frame is a still of its own, as memory is."""
+        latents = self.encode_stills(unit(frames)).permute(0, 3, 1, 2, 4, 5).flatten(0, 1)
+        stills = self.decode(latents[:, :, :, None])  # [B * T, 1, V, 3, H, W]
+        return to_bytes(stills).squeeze(1).unflatten(0, frames.shape[:2])
+
     def layers(self, inputs: TensorDict) -> list[Tensor]:
         """Outputs of every block of the trunk at the last step, each [B * V, tokens, width], from which a
         state expert learns its mix.

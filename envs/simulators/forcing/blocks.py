@@ -29,11 +29,13 @@ class Denoising:
     Args:
         sampler: "ddim", or "distilled" for the jumps of a few-step student (see samplers.py).
         steps: of the sampler, per block.
-        stabilisation: time on the schedule, 0..1, that context frames are said to stand at. They are shown as
-            they are: a network that took its own frames for clean would trust their errors.
+        stabilisation: time on the schedule, 0..1, that context frames are said to stand at: a network that
+            took its own frames for clean would trust their errors. They are shown without that noise, and
+            scaled as frames of that level are.
         as_sampled: chance that a clip of training has the levels of sampling (context as above, all newer
             frames at one level) instead of independent ones.
-        foreground: extra loss weight of what differs from the picture's median colour.
+        foreground: extra loss weight of where the last known frame differs from its median colour. By what
+            is still to be said itself, things would be drawn wherever they may be.
         schedule: options of Sigmoid.
     """
 
@@ -50,7 +52,7 @@ class Block:
     """What stays the same at every step of a block.
 
     Args:
-        context: latents [B, c, V, C, h, w] of the frames before it.
+        context: latents [B, c, V, C, h, w] of the frames before it, as those of their level are scaled.
         old: the levels [B, c] at which they are said to stand.
         ahead: what stands beside the block's own frames: channels [B, n, V, C', h, w], and action vectors [B,
             n, size].
@@ -94,8 +96,8 @@ class Blockwise(Simulator):
         """
         raise NotImplementedError
 
-    def _weight(self, truth: Tensor, valid: Tensor) -> Tensor:
-        """Loss weights [B, T, V, 1, h, w] of true frames [B, T, V, 3, H, W] and valid [B, T]."""
+    def _weight(self, last: Tensor, valid: Tensor) -> Tensor:
+        """Loss weights [B, T, V, 1, h, w] by the last known frame [B, V, 3, H, W], and valid [B, T]."""
         raise NotImplementedError
 
     def _run(
@@ -133,6 +135,7 @@ class Blockwise(Simulator):
         past = context.shape[1]
         stable = float(self.schedule.level(torch.tensor(self.denoising.stabilisation)))
         old = torch.full(context.shape[:2], stable, device=context.device)
+        context = (1 - stable) * context  # z = (1 - s) x + s e, whose noise is left out
         _, _, known = self._run(context, old, (beside[0][:, :past], beside[1][:, :past]))
         return Block(context, old, (beside[0][:, past:], beside[1][:, past:]), known)
 
@@ -196,15 +199,16 @@ class Blockwise(Simulator):
         """See Stepwise; weights [B, n, V, 1, h, w] are those of `loss`."""
         number, inputs = own_frames(self, clip, generator)
         begin = number * self.spec.chunk
-        part = slice(begin, begin + min(self.horizon, self.spec.chunk))
-        return inputs, self._weight(unit(clip["future", "frames"][:, part]), clip["future", "valid"][:, part])
+        part = slice(begin, begin + self.horizon)
+        last = unit(inputs["memory", "frames"][:, -1])
+        return inputs, self._weight(last, clip["future", "valid"][:, part])
 
     def prepare(self, inputs: TensorDict) -> Block:
         """See Stepwise; of the chunk's first block."""
         remembered = {name: rows[:, -self.context :] for name, rows in inputs["memory"].items()}
         frames = self._whole(remembered, inputs)
         latents = self._encode(unit(frames["frames"]))
-        window = slice(0, latents.shape[1] + min(self.horizon, self.spec.chunk))
+        window = slice(0, latents.shape[1] + self.horizon)
         return self._read(latents, self._beside(frames, window, inputs))
 
     def noise(self, inputs: TensorDict, given: Block) -> Tensor:

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.conditioning import Pace, render_ray_map
+from envs.conditioning import Pace, pose_map_cells, pose_map_channels, render_ray_map
 from envs.ranges import Count
 from envs.simulators import memory
 from envs.simulators.base import to_bytes
@@ -25,7 +25,9 @@ from envs.simulators.forcing.network import ForcingDiT, Known, Trunk
 from envs.simulators.forcing.prediction import Prediction
 from envs.simulators.forcing.schedule import Sigmoid
 from envs.simulators.foreground import foreground_weight
+from envs.simulators.inputs import own_frames, taught_memory
 from envs.simulators.tokenizers.autoencoder import STRIDE, Autoencoder
+from envs.simulators.tokenizers.detail import restore_detail
 from envs.specs import WorldSpec
 from envs.targets import OptionsOf, build, options
 
@@ -40,7 +42,7 @@ class ForcingSimulator(Blockwise):
         window: frames of a training clip of one chunk, more than a chunk has.
         context: newest frames that a block is generated from, c; before there are so many, the first repeats,
             as for a robot that stood still.
-        horizon: frames generated at once, h, at most.
+        horizon: frames generated at once, h, at most a chunk's.
         net: options of Trunk.
         codec: options of Autoencoder.
         denoising: options of Denoising.
@@ -48,7 +50,8 @@ class ForcingSimulator(Blockwise):
         actions: how it is told of actions, a class such as ActionVector.
 
     Attributes:
-        context, horizon: may be set to other numbers at any time; no weight depends on them.
+        context, horizon: may be set to other numbers at any time, within what is said above; no weight
+            depends on them.
 
     Raises:
         ValueError: if sizes do not fit.
@@ -56,6 +59,7 @@ class ForcingSimulator(Blockwise):
     """
 
     recent_memory = True
+    told_in_steps = True
     hidden = ("attn", "ff")
 
     def __init__(
@@ -75,6 +79,11 @@ class ForcingSimulator(Blockwise):
                 f"simulator.window={window} must be more than task.chunk={spec.chunk}: a chunk goes on from"
                 " at least one frame"
             )
+        if horizon > spec.chunk:
+            raise ValueError(
+                f"simulator.horizon={horizon} must be at most task.chunk={spec.chunk}: a block is generated"
+                " under its actions, and a chunk has no more of them; lower it, or raise task.chunk"
+            )
         super().__init__(spec, window - spec.chunk)
         trunk = options(Trunk, net, "simulator.net")
         if any(side % (STRIDE * trunk.patch) for side in spec.size):
@@ -89,7 +98,7 @@ class ForcingSimulator(Blockwise):
         self.actions = build(actions, "simulator.actions", embodiment=spec.embodiment)
         self.pace = Pace(self.actions.size)
         self.codec = Autoencoder(**codec).requires_grad_(False)
-        latents, maps = self.codec.channels, 3 * spec.pose_map + 6 * spec.ray_map
+        latents, maps = self.codec.channels, pose_map_channels(STRIDE) * spec.pose_map + 6 * spec.ray_map
         none = torch.zeros(1, 1, 1, 1, 1, 1)
         seen = latents * (1 if self.prediction.base(none, none) is None else 2)
         self.net = ForcingDiT(trunk, seen + maps, latents, spec.views, self.actions.size)
@@ -107,16 +116,23 @@ class ForcingSimulator(Blockwise):
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; features are those of the last step, means over each view of each frame."""
         latents, features = self._generate(inputs)
-        return to_bytes(
-            self.codec.decode(latents.flatten(0, 2)).float().unflatten(0, latents.shape[:3])
-        ), features
+        decoded = self._decode(latents)
+        last = unit(inputs["memory", "frames"][:, -1:])
+        return to_bytes(restore_detail(decoded[:, 1:], decoded[:, :1], last)), features
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is decoded to pixels."""
         return self._generate(inputs)[1]
 
+    @torch.no_grad()
+    def coded(self, frames: Tensor) -> Tensor:
+        """See Simulator.coded."""
+        return to_bytes(self._decode(self._encode(unit(frames))))
+
     def _generate(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
-        """Latents [B, K, V, C, h, w] of a chunk and its features [B, K * V * width], block by block."""
+        """Latents [B, 1 + K, V, C, h, w] of the last known frame and of a chunk, and the chunk's features
+        [B, K * V * width], block by block.
+        """
         remembered = {name: rows[:, -self.context :] for name, rows in inputs["memory"].items()}
         frames, chunk = self._whole(remembered, inputs), self.spec.chunk
         latents = self._encode(unit(frames["frames"]))
@@ -128,23 +144,26 @@ class ForcingSimulator(Blockwise):
             made, seen = self._block(latents[:, begin:], ahead, self._beside(frames, window, inputs))
             latents = torch.cat([latents, made], 1)
             features.append(seen)
-        return latents[:, before:], torch.cat(features, 1).flatten(1)
+        return latents[:, before - 1 :], torch.cat(features, 1).flatten(1)
 
     # -- training
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of every frame that has one before it; memory and all chunks of the clip are one window."""
-        first = {name: rows[:, 0] for name, rows in clip["memory"].items()}
-        frames = self._whole(first, clip)
-        truth = unit(frames["frames"])
-        clean = self._encode(truth)
-        level = self._levels(clean.shape[:2], first["index"].shape[1], generator).to(clean.device)
+        """Loss of every frame of memory and of one chunk, any of the clip's, that has one before it; the
+        frames of the chunks before that are the model's own, and are only seen.
+        """
+        number, inputs = own_frames(self, clip, generator)
+        part = slice(number * self.spec.chunk, (number + 1) * self.spec.chunk)
+        frames = self._whole(inputs["memory"], inputs)
+        seen = unit(torch.cat([frames["frames"], clip["future", "frames"][:, part]], 1))
+        clean, past = self._encode(seen), frames["frames"].shape[1]
+        level = self._levels(clean.shape[:2], past, generator).to(clean.device)
         noise = torch.randn(clean.shape, generator=generator).to(clean.device)
         z = (1 - wide(level)) * clean + wide(level) * noise
         base = self._base(z, level)
-        output, _, _ = self._run(z, level, self._beside(frames, slice(None), clip), base)
+        output, _, _ = self._run(z, level, self._beside(frames, slice(None), inputs), base)
         error = self.prediction.error(output, (clean, noise), wide(level), base)
-        repeats = first["index"].diff(dim=1, prepend=first["index"][:, :1]) == 0  # the first frame as well
-        weight = self._weight(truth, torch.cat([~repeats, clip["future", "valid"].bool()], 1))
+        valid = torch.cat([taught_memory(clip, number), clip["future", "valid"][:, part].bool()], 1)
+        weight = self._weight(seen[:, past - 1], valid)
         return (error.square() * weight).sum() / (weight.sum() * clean.shape[3]).clamp(min=1), {}
 
     def _levels(self, shape: torch.Size, past: int, generator: torch.Generator) -> Tensor:
@@ -155,10 +174,10 @@ class ForcingSimulator(Blockwise):
         like[:, :past] = self.denoising.stabilisation
         return self.schedule.level(torch.where(sampled, like, times))
 
-    def _weight(self, truth: Tensor, valid: Tensor) -> Tensor:
-        """Loss weights [B, T, V, 1, h, w] of true frames [B, T, V, 3, H, W] and valid [B, T]."""
-        weight = foreground_weight(truth, self.denoising.foreground) * valid[:, :, None, None, None, None]
-        return F.avg_pool2d(weight.flatten(0, 2), STRIDE).unflatten(0, truth.shape[:3])
+    def _weight(self, last: Tensor, valid: Tensor) -> Tensor:
+        """Loss weights [B, T, V, 1, h, w] by the last known frame [B, V, 3, H, W], and valid [B, T]."""
+        weight = F.avg_pool2d(foreground_weight(last, self.denoising.foreground).flatten(0, 1), STRIDE)
+        return weight.unflatten(0, last.shape[:2])[:, None] * valid[:, :, None, None, None, None]
 
     # -- parts
     def _whole(self, remembered: Mapping[str, Tensor], inputs: TensorDict) -> dict[str, Tensor]:
@@ -178,6 +197,10 @@ class ForcingSimulator(Blockwise):
             flat = torch.cat([self.codec.encode(piece) for piece in frames.flatten(0, 2).split(_ENCODED)])
         return flat.float().unflatten(0, frames.shape[:3])
 
+    def _decode(self, latents: Tensor) -> Tensor:
+        """Frames float [B, T, V, 3, H, W] of latents [B, T, V, C, h, w]."""
+        return self.codec.decode(latents.flatten(0, 2)).float().unflatten(0, latents.shape[:3])
+
     def _beside(
         self, frames: Mapping[str, Tensor], window: slice, inputs: TensorDict
     ) -> tuple[Tensor, Tensor]:
@@ -193,10 +216,7 @@ class ForcingSimulator(Blockwise):
         latent_hw = tuple(side // STRIDE for side in self.spec.size)
         channels = [torch.zeros(*commands.shape[:2], self.spec.views, 0, *latent_hw, device=commands.device)]
         if self.spec.pose_map:
-            maps = frames["pose_map"][:, window]
-            scaled = maps.flatten(0, 2).float() / 127.5 - 1
-            small = F.interpolate(scaled, size=latent_hw, mode="bilinear", antialias=True)
-            channels.append(small.unflatten(0, maps.shape[:3]))
+            channels.append(pose_map_cells(frames["pose_map"][:, window], STRIDE))
         if self.spec.ray_map:
             c2w = frames["c2w"][:, window].transpose(1, 2)
             rays = render_ray_map(inputs["intrinsic"], c2w, self.spec.size, stride=STRIDE)

@@ -11,17 +11,16 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import torch
-import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from envs.conditioning import ActionVector, Pace, render_ray_map
+from envs.conditioning import ActionVector, Pace, pose_map_cells, pose_map_channels, render_ray_map
 from envs.ranges import Count
 from envs.rng import noise_generator
-from envs.simulators import memory
-from envs.simulators.base import Simulator
-from envs.simulators.inputs import own_frames
+from envs.simulators.base import Simulator, to_bytes
+from envs.simulators.inputs import own_frames, taught_memory
 from envs.simulators.row_linear import RowLinear
+from envs.simulators.tokenizers.detail import restore_detail
 from envs.simulators.tokenizers.lfq import LookupFreeTokenizer
 from envs.simulators.tokens.decoding import Draws
 from envs.simulators.tokens.transformer import Trunk
@@ -34,11 +33,12 @@ _KEY = "simulator"
 
 @dataclass(frozen=True)
 class Made:
-    """A chunk: tokens int64 [B, K, P, F], features [B, *feature_shape], done float32 [B, K] in 0..1."""
+    """A chunk: tokens int64 [B, 1 + K, P, F] of the last known frame and of its own, and features
+    [B, *feature_shape].
+    """
 
     tokens: Tensor
     features: Tensor
-    done: Tensor
 
 
 class TokensSimulator(Simulator):
@@ -54,8 +54,9 @@ class TokensSimulator(Simulator):
             them.
         codec, net, conditioning, decoding, training: see TokenVideo.
 
-    A session's state also holds `done`, float32 [B, K]: whether the task is done in the frames of the last
-    chunk, in 0..1, as the world itself says; 0 before there is one.
+    Features also tell whether the task is done, by recorded success: a head that learns beside the tokens
+    reads the mean over each frame's places. Judges that read features have it; what it says itself decides
+    nothing.
 
     Raises:
         ValueError: if sizes do not fit.
@@ -64,6 +65,7 @@ class TokensSimulator(Simulator):
 
     hidden = ("blocks",)
     recent_memory = True
+    told_in_steps = True
 
     def __init__(
         self,
@@ -90,7 +92,7 @@ class TokensSimulator(Simulator):
             RowLinear(width, self.video.told_tokens * width),
         )
         self.pace = Pace(self.video.told_tokens * width)
-        self.pose_embed = RowLinear(3 * (stride // 2) ** 2, width) if spec.pose_map else None
+        self.pose_embed = RowLinear(pose_map_channels(stride), width) if spec.pose_map else None
         self.ray_embed = RowLinear(6, width) if spec.ray_map else None
         self.feature_shape = ((spec.chunk + spec.views) * width,)
 
@@ -104,31 +106,18 @@ class TokensSimulator(Simulator):
         self.action_vector.normalise(commands, moves)
 
     # -- contract
-    def resume(
-        self, past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1, stride: int = 1
-    ) -> TensorDict:
-        """See Simulator.resume."""
-        state = super().resume(past, length, seed, capacity, stride)
-        state["done"] = torch.zeros(len(state), self.spec.chunk, device=state["length"].device)
-        return state
-
-    @torch.no_grad()
-    def step(self, state: TensorDict, future: TensorDict) -> tuple[Tensor, Tensor, TensorDict]:
-        """See Simulator.step."""
-        made = self.generate(memory.build_inputs(state, self.recall(state, future), future))
-        frames = self.video.decode(made.tokens)
-        state = memory.append(state, frames, future)
-        state["done"] = made.done
-        return frames, made.features, state
-
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; all draws come from (seed, chunk_index)."""
         made = self.generate(inputs)
-        return self.video.decode(made.tokens), made.features
+        return self._frames(made, inputs), made.features
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is decoded to pixels."""
         return self.generate(inputs).features
+
+    def coded(self, frames: Tensor) -> Tensor:
+        """See Simulator.coded."""
+        return to_bytes(self.video.decode(self.video.encode(frames)))
 
     @torch.no_grad()
     def generate(self, inputs: TensorDict) -> Made:
@@ -139,13 +128,13 @@ class TokensSimulator(Simulator):
         self.video.net.observe(tokens, told[:, :past], _of(beside, slice(past)), known)
         pairs = zip(inputs["seed"].tolist(), inputs["chunk_index"].tolist(), strict=True)
         draws = Draws([noise_generator(seed, chunk) for seed, chunk in pairs], tokens.device)
-        made, seen = [], []
+        made, seen = [tokens[:, -1]], []
         for frame in range(past, told.shape[1]):
             at = slice(frame, frame + 1)
             made.append(self.video.next_frame(known, told[:, at], _of(beside, at), draws))
             seen.append(self.video.net.observe(made[-1][:, None], told[:, at], _of(beside, at), known))
         features = torch.cat(seen, 1).float()
-        return Made(torch.stack(made, 1), self._pooled(features), self.video.done(features))
+        return Made(torch.stack(made, 1), self._pooled(features))
 
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of all frames of memory and of one chunk, any of the clip's, each from those before it; the
@@ -153,20 +142,24 @@ class TokensSimulator(Simulator):
         """
         number, inputs = own_frames(self, clip, generator)
         part = slice(number * self.spec.chunk, (number + 1) * self.spec.chunk)
-        index = clip["memory", "index"][:, number]
+        true = taught_memory(clip, number)
         truth, valid, success = (clip["future", name][:, part] for name in ("frames", "valid", "success"))
         frames = torch.cat((inputs["memory", "frames"], truth), 1)
-        # Where there are fewer frames than memory holds the first repeats, which no command led to.
-        true = (index[:, 1:] > index[:, :-1]) & (index[:, 1:] <= clip["begin"][:, None])
-        unknown = torch.full(index.shape, torch.nan, device=index.device)
+        unknown = torch.full(true.shape, torch.nan, device=true.device)
         lesson = Lesson(
             tokens=self.video.encode(frames),
-            counted=torch.cat((true, valid), 1),
+            counted=torch.cat((true[:, 1:], valid), 1),
             success=torch.cat((unknown, torch.where(valid, success, torch.nan)), 1),
         )
         return self.video.loss(lesson, self._told(inputs), self._beside(inputs), generator)
 
     # -- parts
+    def _frames(self, made: Made, inputs: TensorDict) -> Tensor:
+        """Frames uint8 [B, K, V, 3, H, W] of a chunk, with the detail of the last known one."""
+        decoded = self.video.decode(made.tokens)
+        last = inputs["memory", "frames"][:, -1:].float() / 255
+        return to_bytes(restore_detail(decoded[:, 1:], decoded[:, :1], last))
+
     def _told(self, inputs: TensorDict) -> Tensor:
         """Commands of memory and chunk as tokens [B, T, N, width]: each beside the one before it, so that a
         frame is told the same wherever it stands in a chunk.
@@ -183,9 +176,8 @@ class TokensSimulator(Simulator):
         parts = []
         if self.pose_embed is not None:
             maps = torch.cat([inputs["memory", "pose_map"], inputs["future", "pose_map"]], 1)
-            small = F.avg_pool2d(maps.flatten(0, 2).float() / 127.5 - 1, 2)
-            cells = F.pixel_unshuffle(small, self.codec.stride // 2).flatten(2).mT
-            parts.append(self.pose_embed(cells.unflatten(0, maps.shape[:3]).flatten(2, 3)))
+            cells = pose_map_cells(maps, self.codec.stride).flatten(4).mT
+            parts.append(self.pose_embed(cells.flatten(2, 3)))
         if self.ray_embed is not None:
             c2w = torch.cat([inputs["memory", "c2w"], inputs["future", "c2w"]], 1).transpose(1, 2)
             rays = render_ray_map(inputs["intrinsic"], c2w, self.spec.size, stride=self.codec.stride)

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from envs.ranges import Count, Share
 from envs.rng import noise_generator
+from envs.simulators.base import to_bytes
 from envs.simulators.tokenizers.lfq import LookupFreeTokenizer
 from envs.simulators.tokens.decoding import Draws
 from envs.simulators.tokens.transformer import Trunk
@@ -146,7 +147,7 @@ class TextWorld(nn.Module):
         every = torch.stack(done, 1)
         over = every > self.ending.threshold
         goal = torch.where(ended, over.long().argmax(1), over.shape[1] - 1)
-        frames = self.video.decode(torch.stack(tokens, 1))
+        frames = to_bytes(self.video.decode(torch.stack(tokens, 1)))
         return GoldenTrajectory(*(part.to(first.device) for part in (frames, every, goal, ended)))
 
     @torch.no_grad()

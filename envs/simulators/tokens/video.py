@@ -15,7 +15,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from envs.ranges import Count, NonNegative, Share
-from envs.simulators.base import to_bytes
 from envs.simulators.row_linear import RowLinear
 from envs.simulators.tokenizers.lfq import LookupFreeTokenizer
 from envs.simulators.tokens.blocks import Memory
@@ -34,7 +33,9 @@ class TokenTraining:
     """How the transformer is trained.
 
     Args:
-        motion: extra loss weight of places whose tokens differ from those of the frame before.
+        motion: extra loss weight of places at or beside which tokens changed in the frame before the one
+            asked for. What is asked itself decides nothing: weighted by its own changes, places would be
+            taken for likelier to change than they are.
         corrupt: largest share of the known tokens that are replaced by random ones, drawn for every clip: a
             world's own frames hold mistakes, too.
         done: weight of the done head's error.
@@ -120,11 +121,11 @@ class TokenVideo(nn.Module):
 
     @torch.no_grad()
     def decode(self, tokens: Tensor) -> Tensor:
-        """Frames uint8 [B, T, V, 3, H, W] of tokens [B, T, P, F]."""
+        """Frames float32 [B, T, V, 3, H, W], about 0..1, of tokens [B, T, P, F]."""
         v = self.vocabulary
         grids = tokens.unflatten(2, (v.views, v.rows, v.columns))
         flat = grids.flatten(0, 2).split(_AT_ONCE)
-        return torch.cat([to_bytes(self.codec.decode(part)) for part in flat]).unflatten(0, grids.shape[:3])
+        return torch.cat([self.codec.decode(part) for part in flat]).unflatten(0, grids.shape[:3])
 
     # -- frames to come
     def next_frame(self, memory: Memory, told: Tensor, beside: Tensor | None, draws: Draws) -> Tensor:
@@ -147,14 +148,22 @@ class TokenVideo(nn.Module):
         logits, features = self.net(known, shown, told, beside, self.decoding.causal)
         error = F.cross_entropy(logits.flatten(0, 3), tokens[:, 1:].flatten(), reduction="none")
         error = error.view(tokens[:, 1:].shape).sum(-1)
-        moved = (tokens[:, 1:] != tokens[:, :-1]).any(-1)
-        weight = (1 + how.motion * moved) * (asked & lesson.counted[..., None])
+        weight = (1 + how.motion * self._stirred(tokens)) * (asked & lesson.counted[..., None])
         value = (error * weight).sum() / weight.sum().clamp(min=1)
         labelled = torch.isfinite(lesson.success)
         gap = torch.where(labelled, self.done(features) - torch.nan_to_num(lesson.success), 0.0)
         done = (gap.square().sum() / labelled.sum().clamp(min=1) + _FLAT).sqrt()
         figures = {"tokens": value.detach(), "done": done.detach()}
         return value + how.done * done, figures
+
+    def _stirred(self, tokens: Tensor) -> Tensor:
+        """Where tokens [B, T, P, F] changed in the last known frame, or beside it, for every frame but the
+        first: float32 [B, T - 1, P] of 0 and 1. Of the frame after the first nothing is known.
+        """
+        v = self.vocabulary
+        moved = F.pad((tokens[:, 1:-1] != tokens[:, :-2]).any(-1).float(), (0, 0, 1, 0))
+        grids = moved.reshape(-1, 1, v.rows, v.columns)
+        return F.max_pool2d(grids, 3, stride=1, padding=1).reshape(moved.shape)
 
     def _corrupted(self, tokens: Tensor, generator: torch.Generator) -> Tensor:
         """Tokens [B, T, P, F], some of them replaced by random ones."""

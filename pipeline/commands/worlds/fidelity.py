@@ -23,7 +23,7 @@ from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.fidelity.grid import Settings, combinations, run_grid, with_settings
 from pipeline.evaluation.fidelity.long import drift, long_episodes, longest
 from pipeline.evaluation.fidelity.masks import part_labels
-from pipeline.evaluation.fidelity.open_loop import OpenLoop, held_still
+from pipeline.evaluation.fidelity.open_loop import OpenLoop, held_coded, held_still
 from pipeline.evaluation.fidelity.page import build_page, summary_text
 from pipeline.evaluation.measurement import evenly, groups, speed
 from pipeline.loop import has_physics
@@ -62,6 +62,7 @@ def fidelity(cfg: Cfg, root: Path) -> str:
     }
     measured = loop.measure(simulator).result(store.spec.embodiment.views, mine)
     distance = loop.distance
+    still, coded = held_still(store, episodes, distance), held_coded(store, episodes, distance, simulator)
     result: dict[str, Any] = {
         **subject.about(),
         "task": cfg["task"]["name"],
@@ -70,7 +71,12 @@ def fidelity(cfg: Cfg, root: Path) -> str:
         "perceptual": distance.name,
         **measured,
         "masks": _masks(section, labels),
-        "still": held_still(store, episodes, distance),
+        "still": still.by_frame,
+        "still_coded": None if coded is None else coded.by_frame,
+        "held": {
+            "first frame held": still.overall,
+            **({} if coded is None else {"the same through the autoencoder": coded.overall}),
+        },
         "frames_per_second": {f"batch {n}": speed(simulator, store, n, 1) for n in (1, 32)},
         "long": _long(cfg, root, subject, store, distance) if section["long"]["frames"] else None,
         "grid": None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -97,6 +97,16 @@ class Measured:
             self.errors[name] = torch.cat([_longer(part, most) for part in (before, values)])
         self.valid = torch.cat([_longer(part, most) for part in (self.valid, valid)])
 
+    @property
+    def overall(self) -> dict[str, Any]:
+        """See frames.summary."""
+        return summary(self.errors, self.valid)
+
+    @property
+    def by_frame(self) -> dict[str, list[float | None]]:
+        """See frames.by_frame."""
+        return by_frame(self.errors, self.valid)
+
     def result(self, views: Sequence[str], groups: Mapping[str, Tensor]) -> dict[str, Any]:
         """In numbers: overall, by_frame, views (overall of each), groups (overall of some episodes, positions
         int64 by name), frechet, and the errors of objects and end effectors where physics knows them.
@@ -108,8 +118,8 @@ class Measured:
         known = [part for part in self.objects if part]
         return {
             "episodes": len(self.valid),
-            "overall": summary(self.errors, self.valid),
-            "by_frame": by_frame(self.errors, self.valid),
+            "overall": self.overall,
+            "by_frame": self.by_frame,
             "views": {view: summary(errors, self.valid) for view, errors in one.items()},
             "groups": {
                 name: summary({k: v[which] for k, v in self.errors.items()}, self.valid[which])
@@ -152,11 +162,39 @@ def _mean(values: list[float]) -> float | None:
     return sum(known) / len(known) if known else None
 
 
-def held_still(store: ClipStore, episodes: Tensor, distance: PerceptualDistance) -> dict[str, Any]:
-    """Errors by frame of a world that shows each episode's first frame for ever: what is to be beaten."""
+def held_still(store: ClipStore, episodes: Tensor, distance: PerceptualDistance) -> Measured:
+    """Errors of a world that shows each episode's first frame for ever: what is to be beaten."""
+    return _held(store, episodes, distance, lambda first: first)
+
+
+def held_coded(
+    store: ClipStore, episodes: Tensor, distance: PerceptualDistance, simulator: Simulator
+) -> Measured | None:
+    """The same where the first frame is shown as the simulator's autoencoder keeps it, which is as far as
+    decoding alone gets; None if it has none.
+    """
+    if simulator.coded(store.frames(store.start[episodes[:1]])[:, None].to(simulator.device)) is None:
+        return None
+
+    def shown(first: Tensor) -> Tensor:
+        coded = simulator.coded(first.to(simulator.device))
+        assert coded is not None
+        return coded.cpu()
+
+    return _held(store, episodes, distance, shown)
+
+
+def _held(
+    store: ClipStore,
+    episodes: Tensor,
+    distance: PerceptualDistance,
+    shown: Callable[[Tensor], Tensor],
+) -> Measured:
+    """Errors of what is shown for ever of first frames uint8 [N, 1, V, 3, H, W]."""
     out = Measured()
     for some in episodes.split(_SIDE_BY_SIDE):
         rows, valid = store.whole(some)
-        first = store.frames(store.start[some])[:, None].expand(-1, rows.shape[1], -1, -1, -1, -1)
-        out.add(frame_errors(first, store.frames(rows), distance), valid)
-    return by_frame(out.errors, out.valid)
+        first = shown(store.frames(store.start[some])[:, None])
+        frames = first.expand(-1, rows.shape[1], -1, -1, -1, -1)
+        out.add(frame_errors(frames, store.frames(rows), distance), valid)
+    return out

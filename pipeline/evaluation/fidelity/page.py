@@ -29,6 +29,7 @@ def build_page(result: Mapping[str, Any]) -> str:
         "all": result["overall"],
         **result["groups"],
         **{f"view {k}": v for k, v in result["views"].items()},
+        **result["held"],
     }
     return (
         templates()
@@ -56,7 +57,7 @@ def summary_text(result: Mapping[str, Any]) -> str:
         f"| | {' | '.join(titles)} |",
         f"| --- |{' --- |' * len(titles)}",
     ]
-    for name, row in {"all": result["overall"], **result["groups"]}.items():
+    for name, row in {"all": result["overall"], **result["groups"], **result["held"]}.items():
         lines.append(f"| {name} | {' | '.join(texts(row))} |")
     lines.append("")
     for one in result["frechet"]:
@@ -100,6 +101,8 @@ def _curves(result: Mapping[str, Any]) -> list[Markup]:
         lines = [Curve("generated", *_points(result["by_frame"].get(key, [])))]
         if key in result["still"]:
             lines.append(Curve("first frame held", *_points(result["still"][key])))
+        if key in (result["still_coded"] or {}):
+            lines.append(Curve("through the autoencoder", *_points(result["still_coded"][key])))
         charts.append(line_chart(lines, f"{titles[key]} against frame number", "frame", titles[key]))
     return [chart for chart in charts if chart]
 

@@ -26,7 +26,7 @@ def video_errors(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     simulator = build_simulator(cfg, inputs.weights("simulator")).eval()
     found = loop.measure(simulator).result(store.spec.embodiment.views, {})
     kept = ("episodes", "overall", "by_frame", "object_cm", "object_lost")
-    still = held_still(store, episodes, loop.distance)
+    still = held_still(store, episodes, loop.distance).by_frame
     return {
         **{name: found[name] for name in kept},
         "still": still,

@@ -116,6 +116,8 @@ def test_joint_commands_of_a_bundle_are_clips(shared: Path, tmp_path: Path) -> N
     clip = store.clips(torch.tensor([0]), torch.tensor([0]), ClipSpec(4, 5))
     assert clip["future", "commands"].shape == (1, 5, 16) and clip["now", "state"].shape == (1, 20)
     assert not clip["future", "valid"].any()  # nobody photographed those frames
+    later = store.clips(torch.tensor([0]), torch.tensor([3]), ClipSpec(4, 5))
+    assert later["memory", "present"].tolist() == [[[True, False, False, False]]]
     assert clip["future", "c2w"].shape == (1, 5, 3, 4, 4)
 
 

@@ -9,9 +9,12 @@ import pytest
 import torch
 
 from envs.conditioning import (
+    CANVAS,
     ActionVector,
     PoseMapStyle,
     end_effector_poses,
+    pose_map_cells,
+    pose_map_channels,
     render_pose_map,
     render_ray_map,
 )
@@ -189,3 +192,13 @@ def test_end_effector_poses_are_the_robots_own_affair() -> None:
         elif robot.kinematics is None:
             with pytest.raises(EmbodimentError, match=r"simulator\.pose_map=false"):
                 end_effector_poses(robot, commands)
+
+
+def test_cells_of_pose_maps_say_where_in_them_a_gripper_is() -> None:
+    maps = torch.full((1, 2, 1, 3, 16, 16), CANVAS, dtype=torch.uint8)
+    maps[:, 0, :, :, 0:2, 0:2] = 255
+    maps[:, 1, :, :, 4:6, 6:8] = 255
+    cells = pose_map_cells(maps, 8)
+    assert cells.shape == (1, 2, 1, pose_map_channels(8), 2, 2)
+    assert not torch.equal(cells[:, 0], cells[:, 1])
+    assert torch.allclose(cells[:, 0].mean(2), cells[:, 1].mean(2))  # as means over cells they are the same

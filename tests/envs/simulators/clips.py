@@ -54,6 +54,7 @@ def clip(spec: WorldSpec, batch: int, memory: int, chunks: int = 1, seed: int = 
             "memory": TensorDict(
                 {
                     "index": index,
+                    "present": torch.ones(index.shape, dtype=torch.bool),
                     **{name: arrays[name][rows, index] for name in ("frames", "commands", *maps)},
                 },
                 [batch],

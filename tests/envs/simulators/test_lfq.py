@@ -8,9 +8,13 @@ from typing import Any
 import pytest
 import torch
 
+from envs.simulators.tokenizers.detail import restore_detail
 from envs.simulators.tokenizers.errors import gradient_difference
 from envs.simulators.tokenizers.lfq import LookupFreeQuantiser, LookupFreeTokenizer
 from learners.stages.tokenizer import CodecAlarm
+from tests.embodiments import BIMANUAL_POSES, world_spec
+from tests.envs.simulators.clips import clip
+from tests.envs.simulators.test_engines import ENGINES, build_engine
 
 OPTIONS: dict[str, Any] = {
     "bits": 8,
@@ -118,3 +122,24 @@ def test_a_collapsed_codebook_gives_one_alarm_that_says_what_to_do(
     healthy = CodecAlarm(codec, patience=1)
     healthy.check({"psnr": 20.0, "perplexity": 9.0})
     assert not healthy.said and codec.warning(codec.figures(pictures(2)))
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_engines_show_stills_as_their_autoencoders_keep_them(name: str) -> None:
+    simulator, _ = build_engine(name, world_spec(BIMANUAL_POSES, chunk=5))
+    frames = clip(simulator.spec, 2, 4)["future", "frames"]
+    coded = simulator.coded(frames)
+    assert (coded is None) == (not hasattr(simulator, "codec"))
+    if coded is not None:
+        assert coded.shape == frames.shape and coded.dtype == torch.uint8 and not torch.equal(coded, frames)
+        alone = simulator.coded(frames[1:, 2:3])
+        assert alone is not None and (alone.int() - coded[1:, 2:3].int()).abs().max() <= 1
+
+
+def test_detail_stays_where_the_picture_does_and_goes_where_it_changes() -> None:
+    last, seen = torch.rand(2, 2, 1, 1, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    made = seen.expand(-1, 2, -1, -1, -1, -1).clone()
+    made[:, 1, ..., :4] += 0.5  # in its left half the second frame shows something else
+    shown = restore_detail(made, seen, last)
+    assert torch.allclose(shown[:, :1], last) and torch.allclose(shown[:, 1:, ..., 4:], last[..., 4:])
+    assert torch.equal(shown[:, 1, ..., :4], made[:, 1, ..., :4])

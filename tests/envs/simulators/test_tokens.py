@@ -6,8 +6,10 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from envs.simulators.base import WORLD_OPTIONS
+from envs.simulators.tokenizers.autoencoder import STRIDE
 from envs.simulators.tokens.conditioning import AdaLN, Conditioning, CrossAttention
 from envs.simulators.tokens.decoding import Decoding, Draws, MaskGIT, Raster
 from envs.simulators.tokens.engine import TokensSimulator
@@ -155,7 +157,8 @@ def test_what_lies_beyond_the_window_is_forgotten_and_sessions_go_on(order: Deco
     state = model.reset(first_of(model.spec, clips), torch.tensor([1, 2]))
     for number in range(4):  # 13 frames, of which the last two are remembered
         _, _, state = model.step(state, future_of(model.spec, clips, number))
-    assert state["done"].shape == (2, CHUNK) and bool((state["done"] > 0).all())
+    own = {"history", "length", "seed", "chunk_index", "stride", "intrinsic"}  # as of any engine
+    assert set(state.keys()) <= own
     other, future = state.clone(), future_of(model.spec, clips, 4)
     other["history", "frames"][:, :11] = 0
     frames = model.step(state, future)[0]
@@ -174,6 +177,45 @@ def test_seeds_draw_and_commands_tell() -> None:
     assert torch.equal(told[0], frames[0]) and not torch.equal(told[1], told[0])
 
 
+def test_frames_without_a_picture_are_never_asked_for() -> None:
+    model = engine()
+    clips = clip(model.spec, 2, model.memory_frames)
+
+    def loss(data: TensorDict) -> torch.Tensor:
+        return model.loss(data, torch.Generator().manual_seed(0))[0]
+
+    whole = loss(clips)
+    clips["memory", "present"] = torch.zeros_like(clips["memory", "present"])
+    less = loss(clips)
+    clips["memory", "index"] = torch.zeros_like(clips["memory", "index"])  # as if all were repeats
+    assert not torch.equal(less, whole) and torch.equal(loss(clips), less)
+
+
+def test_what_is_asked_does_not_decide_what_it_weighs() -> None:
+    """Or places would seem likelier to change than they are."""
+    model = engine()
+    v = model.video.vocabulary
+    still = torch.zeros(1, 6, v.places, v.factors, dtype=torch.int64)
+    moved = still.clone()
+    moved[:, 3:, 0] = 1  # one place changes in frame 3, and stays
+    weight = model.video._stirred(moved)[0].unflatten(1, (v.views, v.rows, v.columns)) > 0
+    assert weight.shape[0] == 5 and not model.video._stirred(still).any()
+    assert weight.flatten(1).any(1).tolist() == [False, False, False, True, False]  # asked for frames 1 .. 5
+    beside = torch.zeros(v.views, v.rows, v.columns, dtype=torch.bool)
+    beside[0, :2, :2] = True
+    assert torch.equal(weight[3], beside)
+
+
+def test_where_tokens_stay_the_picture_does() -> None:
+    model = engine(decoding={"temperature": 0.0})
+    torch.nn.init.constant_(model.video.net.head.keep.bias, 1e3)
+    clips = clip(model.spec, 2, model.memory_frames)
+    first = first_of(model.spec, clips)
+    frames = model.step(model.reset(first, torch.tensor([3, 4])), future_of(model.spec, clips))[0]
+    # The tokenizer has learned nothing: decoded, the frame would be noise.
+    assert torch.equal(frames, first["frames"][:, None].expand_as(frames))
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -186,6 +228,10 @@ def test_seeds_draw_and_commands_tell() -> None:
 def test_options_that_cannot_work_are_named(changes: dict[str, Any], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         engine(**changes)
+
+
+def test_the_default_sees_as_finely_as_worlds_of_latents() -> None:
+    assert engine("tokens").codec.stride == STRIDE
 
 
 def test_the_full_size_is_built_and_runs_without_memory() -> None:

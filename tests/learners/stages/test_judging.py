@@ -51,7 +51,7 @@ def test_a_judge_learns_who_succeeded(
 def test_a_judge_learns_who_succeeded_from_a_simulators_features(tiny_store: Stores, tmp_path: Path) -> None:
     store = tiny_store(ARM_DELTAS)
     simulator, train = simulator_of("unet_small", store.spec), store.split("train")
-    simulator.normalise(*units(store, train))
+    simulator.normalise(*units(store, train, store.spec.chunk))
     simulator.fit_camera_statistics(store.frames(store.start))
     judge = judge_of(store.spec, name="embedding", feature_shape=simulator.feature_shape)
     with pytest.raises(MissingFeatures, match="recorded_features"):

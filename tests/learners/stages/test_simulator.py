@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from envs.conditioning import ActionVector
 from envs.embodiment import Embodiment
 from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
@@ -24,7 +25,7 @@ Stores = Callable[[Embodiment], ClipStore]
 
 def test_units_are_changes_within_a_chunk_of_absolute_commands_only(tiny_store: Stores) -> None:
     store = tiny_store(BIMANUAL_POSES)
-    commands, moves, states = units(store, torch.tensor([4, 2]))
+    commands, moves, states = units(store, torch.tensor([4, 2]), store.spec.chunk)
     rows = store.rows(torch.tensor([4, 2]))
     assert torch.equal(commands, store.arrays["commands"][rows])
     assert torch.equal(states, store.arrays["states"][rows])
@@ -33,7 +34,24 @@ def test_units_are_changes_within_a_chunk_of_absolute_commands_only(tiny_store: 
     )
     last = int(store.length[4]) - 1  # what follows belongs to another episode
     assert not bool(moves[last].any())
-    assert not bool(units(tiny_store(ARM_DELTAS), torch.arange(4))[1].any())
+    assert not bool(units(tiny_store(ARM_DELTAS), torch.arange(4), 4)[1].any())
+
+
+@pytest.mark.parametrize(
+    ("name", "most"), [("tokens_small", 1), ("forcing_small", 1), ("dit_small", 4), ("unet_small", 4)]
+)
+def test_moves_are_told_in_units_of_what_is_told(
+    tiny_store: Stores, tmp_path: Path, name: str, most: int
+) -> None:
+    store = tiny_store(BIMANUAL_POSES)
+    simulator = simulator_of(name, store.spec)
+    episodes = torch.arange(6)
+    config, fit = SimulatorFitConfig(1.0, 1, (1,), 0.0, 0), FitConfig(1, 2, 1e-4, bf16=False)
+    train_simulator(simulator, store, episodes, config, fit, tmp_path)
+    (vector,) = [part for part in simulator.modules() if isinstance(part, ActionVector)]
+    spread = units(store, episodes, most)[1].square().mean(0).sqrt()
+    told = (vector.move_scale * spread)[spread > 1e-3]
+    assert len(told) and torch.allclose(told, torch.ones_like(told), atol=1e-4)
 
 
 @pytest.mark.parametrize("unrolled", [False, True])

@@ -38,6 +38,8 @@ def test_fidelity_with_masks_from_physics(tmp_path: Path) -> None:
         *("mse", "psnr", "ssim", "perceptual", "arm_mse", "object_mse"),
     }
     assert None not in result["overall"].values() and set(result["groups"]) == {"noisy"}
+    held, coded = (row["psnr"] for row in result["held"].values())
+    assert held > coded and "the same through the autoencoder" in said  # which has learned nothing
     assert len(result["frechet"]) == 2 and "no learned weights" in result["frechet"][0]["extractor"]
     assert result["long"]["frames"] == 32 and len(result["long"]["by_frame"]["mse"]) == 32
     assert [row["settings"] for row in result["grid"]["rows"]] == [
