@@ -14,8 +14,6 @@ from envs.simulators.row_linear import RowLinear
 from envs.simulators.unet.folding import fold
 from envs.specs import WorldSpec
 
-FOLD = 2  # pixels of the main view folded into channels, both ways
-SIDE_FOLD = 4  # of the other views, at half the detail
 _MAPS = 16  # channels of the action map before it is lifted
 
 

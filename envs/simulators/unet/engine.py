@@ -20,8 +20,6 @@ from envs.ranges import Count, Natural, NonNegative
 from envs.simulators.base import Simulator
 from envs.simulators.inputs import build_inputs
 from envs.simulators.unet.blocks import (
-    FOLD,
-    SIDE_FOLD,
     ActionEncoder,
     Embed,
     FilmBlock,
@@ -34,19 +32,20 @@ from envs.simulators.unet.folding import unfold
 from envs.specs import WorldSpec
 
 _COND = 256  # numbers of the action embedding
-_DEEP = 8  # pixels of the main view, each way, of a place at the coarsest level
 
 
 class UNetSimulator(Simulator):
     """One-pass deterministic video predictor over all views.
 
     Args:
-        spec: what it shows; sizes must be multiples of 16.
+        spec: what it shows; sizes must be multiples of 8 * fold.
         memory_frames: sparse memory frames, the first and the last among them.
-        width: channels at half the resolution, a multiple of 8; twice as many at a quarter, and again at an
-            eighth.
-        fine_blocks, mid_blocks: residual blocks on the way down, and on the way up, at a half and a quarter.
-        deep_blocks: residual blocks at an eighth.
+        fold: pixels of the main view, each way, that lie in one place of the finest level, 2 or 4. Four cost
+            little more than two of a picture half as large, and see twice as finely.
+        width: channels of the finest level, a multiple of 8; twice as many of the middle one, at half its
+            resolution, and again of the deep one, at a quarter.
+        fine_blocks, mid_blocks: residual blocks on the way down, and on the way up, of these levels.
+        deep_blocks: residual blocks of the deep one.
         motion: extra loss weight of pixels that change, or look unusual for their place.
         side_weight: loss weight of every view but the main one.
     """
@@ -59,6 +58,7 @@ class UNetSimulator(Simulator):
         self,
         spec: WorldSpec,
         memory_frames: Count,
+        fold: Count,
         width: Count,
         fine_blocks: Natural,
         mid_blocks: Natural,
@@ -67,19 +67,26 @@ class UNetSimulator(Simulator):
         side_weight: NonNegative,
     ):
         super().__init__(spec, memory_frames)
-        if any(side % 16 for side in spec.size):
-            raise ValueError(f"task.size={list(spec.size)} must be multiples of 16 for this network")
+        if fold not in (2, 4):
+            raise ValueError(f"simulator.fold={fold} must be 2 or 4")
+        if any(side % (8 * fold) for side in spec.size):
+            raise ValueError(
+                f"task.size={list(spec.size)} must be multiples of {8 * fold} for simulator.fold={fold}"
+            )
         main = spec.embodiment.main_view
         self.motion = motion
         self.shrink = tuple(1 if view == main else 2 for view in range(spec.views))
         self.emphasis = tuple(1.0 if view == main else side_weight for view in range(spec.views))
-        half, wide, cells = 2 * width, 4 * width, (spec.size[0] // _DEEP, spec.size[1] // _DEEP)
+        self.edges = tuple(fold * s for s in self.shrink)  # of the squares that a place of each view says
+        self.deep_edge = 4 * fold
+        half, wide = 2 * width, 4 * width
+        cells = (spec.size[0] // self.deep_edge, spec.size[1] // self.deep_edge)
         self.feature_shape = (wide + _COND,)
         self.actions = ActionEncoder(spec, _COND, wide, cells)
         pictures = 3 * (memory_frames + (memory_frames + spec.chunk if spec.pose_map else 0))
         self.embed = nn.ModuleList(
-            Embed(pictures, width, s, FOLD) if s == 1 else Embed(pictures, wide, s, SIDE_FOLD)
-            for s in self.shrink
+            Embed(pictures, width if s == 1 else wide, s, edge)
+            for s, edge in zip(self.shrink, self.edges, strict=True)
         )
         self.where = nn.Parameter(0.02 * torch.randn(1, half, 2 * cells[0], 2 * cells[1]))
         self.rays = nn.Conv2d(12 * spec.views, wide, 1) if spec.ray_map else None
@@ -93,10 +100,8 @@ class UNetSimulator(Simulator):
         self.fine_out = nn.ModuleList(FilmBlock(width, _COND) for _ in range(fine_blocks))
         self.maps = memory_frames + 1 + DRAWN  # logits of the sources, and drawn colour
         self.heads = nn.ModuleList(
-            output_head(width, spec.chunk, self.maps, memory_frames, FOLD)
-            if s == 1
-            else output_head(wide, spec.chunk, self.maps, memory_frames, SIDE_FOLD)
-            for s in self.shrink
+            output_head(width if s == 1 else wide, spec.chunk, self.maps, memory_frames, edge)
+            for s, edge in zip(self.shrink, self.edges, strict=True)
         )
         self.flows = nn.ModuleList(flow_head(half if s == 1 else wide, spec.chunk) for s in self.shrink)
         self.register_buffer("mean", torch.zeros(spec.views, 3, *spec.size))
@@ -174,12 +179,13 @@ class UNetSimulator(Simulator):
             x = block(x, cond)
         views: list[Sources] = []
         chunk, frames = self.spec.chunk, inputs["memory", "frames"]
-        for view, (shrink, head, flow) in enumerate(zip(self.shrink, self.heads, self.flows, strict=True)):
-            said, edge, still = (x, FOLD, y) if shrink == 1 else (z, SIDE_FOLD, z)
+        for view, (shrink, edge, head, flow) in enumerate(
+            zip(self.shrink, self.edges, self.heads, self.flows, strict=True)
+        ):
+            said, still = (x, y) if shrink == 1 else (z, z)
             drawn = unfold(head(said).permute(0, 2, 3, 1).float(), edge).unflatten(1, (chunk, self.maps))
-            moves = F.interpolate(flow(still).float(), scale_factor=4, mode="bilinear").unflatten(
-                1, (chunk, 2)
-            )
+            moves = F.interpolate(flow(still).float(), scale_factor=self.deep_edge // 2, mode="bilinear")
+            moves = moves.unflatten(1, (chunk, 2))
             known = at_detail(frames[:, :, view].flatten(0, 1), shrink).unflatten(0, frames.shape[:2])
             views.append(compose(drawn, moves, known))
         return views, torch.cat([z.float().mean((-2, -1)), cond.float()], 1)
@@ -190,7 +196,7 @@ class UNetSimulator(Simulator):
         """
         # [B, V, 2, 4, 4]
         c2w = torch.stack([inputs["memory", "c2w"][:, -1], inputs["future", "c2w"][:, -1]], 2)
-        rays = render_ray_map(inputs["intrinsic"], c2w, self.spec.size, stride=_DEEP)
+        rays = render_ray_map(inputs["intrinsic"], c2w, self.spec.size, stride=self.deep_edge)
         return rays.flatten(1, 3).to(working_dtype(rays.device, rays.dtype))
 
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:

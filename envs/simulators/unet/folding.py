@@ -31,6 +31,8 @@ def unfold(maps: Tensor, edge: int) -> Tensor:
     """The reverse of fold, with gradient: [B, h, w, C * edge * edge] -> [B, C, edge h, edge w]; fastest where
     the channels lie side by side.
     """
+    if edge * maps.element_size() not in _WIDE:
+        return F.pixel_shuffle(maps.permute(0, 3, 1, 2), edge)
     out: Tensor = _Unfold.apply(maps, edge)
     return out
 

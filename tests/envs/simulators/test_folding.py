@@ -11,7 +11,8 @@ from envs.simulators.unet.folding import fold, unfold
 
 
 @pytest.mark.parametrize(
-    ("edge", "dtype"), [(4, torch.uint8), (8, torch.uint8), (4, torch.float32), (4, torch.bfloat16)]
+    ("edge", "dtype"),
+    [(4, torch.uint8), (8, torch.uint8), (4, torch.float32), (4, torch.bfloat16), (8, torch.float32)],
 )
 def test_folding_is_torchs_unshuffling(edge: int, dtype: torch.dtype) -> None:
     pictures = (torch.rand(2, 3, 16, 24) * 255).to(dtype)
