@@ -84,7 +84,6 @@ SURROUNDINGS: dict[str, Callable[[], AbstractContextManager[dict[str, Any]]]] = 
     "goal_picture": goal,
     "goal_image": goal,
     "golden_goal": partial(nullcontext, {"text_world": TINY_TEXT_WORLD}),
-    "golden_goal_full": partial(nullcontext, {"text_world": TINY_TEXT_WORLD}),
     "vlm": server,
     "vlm_local": weights,
 }
@@ -96,7 +95,8 @@ IGNORES: dict[str, tuple[str, ...]] = {
     "embedding": ("first frame", "frames"),
 }
 FEATURES = (6, 10)  # of a simulator whose features judges read: tokens and their width
-JUDGES = {name: CONFIGS for name in offered("judge")} | {
+FULL = "_full"  # of a published size, which is counted on the meta device (tests/pipeline/test_bench_size.py)
+JUDGES = {name: CONFIGS for name in offered("judge") if not name.endswith(FULL)} | {
     path.stem: EXAMPLES for path in (EXAMPLES / "judge").glob("*.yaml")
 }
 
