@@ -1,88 +1,39 @@
-"""judge=vlm against a real server that also misbehaves: what is asked, what comes of it, what it costs."""
+"""judge=vlm against a real server: what is asked, what comes of it, what it costs."""
 
 from __future__ import annotations
 
-import json
 import logging
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from email.utils import formatdate
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
-from envs.judges import JudgeError, Judgement
+from envs.judges import JudgeError
 from envs.judges.vlm import VLMJudge
 from envs.judges.vlm.answers import parse
-from envs.judges.vlm.ledger import _ledger
 from envs.specs import Status
-from envs.targets import ConfigError, build
-from tests.embodiments import ARM_DELTAS, world_spec
+from envs.targets import ConfigError
 from tests.envs.judges.chat_server import (
-    MODEL,
     ChatServer,
-    completion,
-    half,
     hashing,
     refuse,
-    say,
     seeing,
-    serving,
-    sleep,
 )
-from tests.moving_square import SIZE, picture
-from tests.sections import merged, section
-
-SPEC = world_spec(ARM_DELTAS.at(SIZE), SIZE)  # two cameras, chunks of four frames
-FIRST = torch.from_numpy(picture(np.zeros(2), 2))
-DONE, FAR = 0.95, 0.2  # places of the square
-Make = Callable[..., VLMJudge]
-
-
-@pytest.fixture
-def server() -> Iterator[ChatServer]:
-    """A server whose model sees the square."""
-    with serving() as chat:
-        yield chat
-
-
-@pytest.fixture
-def options(server: ChatServer, tmp_path: Path) -> dict[str, Any]:
-    """The section judge for that server, in a hurry."""
-    quick = {"cache": str(tmp_path / "cache"), "deadline_s": 20.0, "retries": 2, "pause_s": 0.01}
-    found = section("judge/vlm", chat={"url": server.url, "model": MODEL}, asking=quick, pictures={"side": 0})
-    found.pop("rewards")
-    return found
-
-
-@pytest.fixture
-def make(options: dict[str, Any]) -> Make:
-    """Makes a judge with other options."""
-
-    def judge(**changes: Any) -> VLMJudge:
-        return build(merged(options, changes), "judge", spec=SPEC)  # type: ignore[no-any-return]
-
-    return judge
-
-
-def new_command() -> None:
-    """What a process knows is gone; what lies on disk stays."""
-    _ledger.cache_clear()
-
-
-def clip(*places: float) -> Tensor:
-    """Frames uint8 [1, T, 2, 3, 32, 32] with the square at these places of the diagonal."""
-    return torch.from_numpy(np.stack([picture(np.array([at, at]), 2) for at in places]))[None]
-
-
-def score(judge: VLMJudge, *clips: Tensor) -> Judgement:
-    frames = torch.cat(clips)
-    return judge.score(frames, FIRST.expand(len(frames), -1, -1, -1, -1), ["move the square"] * len(frames))
+from tests.envs.judges.vlm_clips import (
+    DONE,
+    FAR,
+    FIRST,
+    Make,
+    clip,
+    new_command,
+    score,
+)
+from tests.moving_square import picture
+from tests.sections import merged
 
 
 def test_one_chunk_is_one_question_asked_until_the_majority_is_sure(make: Make, server: ChatServer) -> None:
@@ -174,137 +125,6 @@ def test_an_unusable_chunk_spoils_the_episode_as_in_imagination(make: Make, serv
         make(), torch.cat([odd, clip(*[DONE - k / 100 for k in range(4)])], 1), torch.cat([black] * 2, 1)
     )
     assert said.status.tolist() == [Status.ABSTAIN.value, Status.OK.value]
-
-
-@pytest.mark.parametrize(
-    "fault",
-    [
-        refuse(500),
-        refuse(503),
-        refuse(408),
-        half,
-        say("<html>gateway</html>"),
-        say('{"choices": []}'),
-        say('{"choices": [{"message": null}]}'),
-        say('["not", "an", "object"]'),
-    ],
-    ids=["500", "503", "408", "cut", "html", "no choices", "no message", "list"],
-)
-def test_a_question_that_came_to_nothing_is_asked_again(make: Make, server: ChatServer, fault: Any) -> None:
-    server.faults.extend([fault, fault])
-    judge = make(votes={"count": 1})
-    said = score(judge, clip(DONE))
-    assert said.status.tolist() == [0] and said.success.item() == 1.0 and server.tries == 3
-    assert judge.asker.ledger.counts["unanswered"] == 2
-    server.faults.extend([fault] * 3)
-    lost = score(judge, clip(FAR))
-    assert lost.status.tolist() == [Status.ERROR.value] and lost.success.item() == 0.0
-    assert score(judge, clip(FAR)).status.tolist() == [Status.OK.value]  # errors are not remembered
-
-
-def test_what_the_server_will_never_take_is_not_asked_again(make: Make, server: ChatServer) -> None:
-    server.faults.append(refuse(400, "too many pictures"))
-    assert score(make(votes={"count": 1}), clip(DONE)).status.tolist() == [Status.ERROR.value]
-    assert server.tries == 1
-
-
-def test_a_refusal_without_words_is_an_unusable_answer(make: Make, server: ChatServer) -> None:
-    server.faults.append(
-        say(json.dumps(completion("", (5, 1)) | {"choices": [{"message": {"content": None}}]}))
-    )
-    judge = make(votes={"count": 1})
-    assert score(judge, clip(DONE)).status.tolist() == [Status.ABSTAIN.value]
-    assert judge.asker.ledger.counts["unusable"] == 1
-
-
-@pytest.mark.parametrize("say_when", ["seconds", "date"])
-def test_retry_after_is_waited_for_by_all(make: Make, server: ChatServer, say_when: str) -> None:
-    when = "1" if say_when == "seconds" else formatdate(time.time() + 2, usegmt=True)
-    server.faults.append(refuse(429, **{"Retry-After": when}))
-    began = time.monotonic()
-    said = score(make(votes={"count": 1}), clip(DONE), clip(FAR))
-    assert said.status.tolist() == [0, 0] and time.monotonic() - began > 0.9
-
-
-def test_a_server_that_wants_too_long_a_rest_is_not_waited_for(make: Make, server: ChatServer) -> None:
-    server.faults.append(refuse(429, **{"Retry-After": "86400"}))
-    judge = make(votes={"count": 1}, asking={"stop_after": 1})
-    with pytest.raises(JudgeError, match=r"86400 s, longer than judge\.asking\.longest_pause_s=120"):
-        score(judge, clip(DONE))
-
-
-def test_slow_answers_end_at_the_deadline_even_if_they_trickle(make: Make, server: ChatServer) -> None:
-    judge = make(votes={"count": 1}, asking={"deadline_s": 0.5, "retries": 1})
-    score(judge, clip(0.3))  # the greeting takes no part
-    server.faults.extend([sleep(60.0)] * 2)
-    began = time.monotonic()
-    assert score(judge, clip(DONE)).status.tolist() == [Status.ERROR.value]
-    assert 0.9 < time.monotonic() - began < 20
-
-
-def test_votes_that_are_missing_do_not_count_as_no(make: Make, server: ChatServer) -> None:
-    server.faults.extend([refuse(500)] * 3)
-    judge = make(asking={"retries": 0, "in_flight": 1})
-    assert score(judge, clip(DONE)).status.tolist() == [Status.ERROR.value]  # two of five could still come
-
-
-def test_a_model_that_never_says_what_it_is_asked_for_stops_the_run(make: Make, server: ChatServer) -> None:
-    judge = make(votes={"count": 1}, asking={"stop_after": 3, "in_flight": 1})
-    said = iter(["Perhaps.", "Perhaps.", "Answer: Yes", *["I cannot say."] * 20])
-    server.answer = lambda asked: next(said)
-    status = [int(score(judge, clip(k / 20)).status) for k in range(3)]
-    assert status == [Status.ABSTAIN.value] * 2 + [Status.OK.value]  # two in a row, and one that was usable
-    with pytest.raises(
-        JudgeError, match=r"3 answers in a row .*stop_after=3.*judge\.prompt=done.*I cannot say"
-    ):
-        score(judge, *(clip(k / 20) for k in range(3, 20)))
-    assert len(server.seen) < 20  # nobody is asked any more
-    new_command()
-    asked = len(server.seen)
-    with pytest.raises(JudgeError, match="nothing usable"):  # what was remembered says no more
-        score(make(votes={"count": 1}, asking={"stop_after": 3}), *(clip(k / 20) for k in range(3, 6)))
-    assert len(server.seen) == asked
-
-
-def test_a_dead_server_stops_the_run(make: Make, server: ChatServer) -> None:
-    judge = make(votes={"count": 1}, asking={"retries": 0, "stop_after": 3, "in_flight": 1})
-    score(judge, clip(0.3))
-    server.faults.extend([refuse(500, "out of memory")] * 20)
-    with pytest.raises(JudgeError, match=r"3 questions in a row .*stop_after=3.* 500: out of memory"):
-        score(judge, *(clip(k / 20) for k in range(8)))
-    assert server.tries == 4
-
-
-@pytest.mark.parametrize(
-    ("chat", "said"),
-    [
-        ({"url": "http://127.0.0.1:9/v1"}, r"judge\.chat\.url=http://127\.0\.0\.1:9/v1: nobody answers"),
-        ({"url": "nonsense"}, r"judge\.chat\.url must be the address"),
-        ({"url": "http://me:secret@127.0.0.1/v1"}, r"without a key in it$"),
-        ({"model": ""}, r"judge\.chat\.model is empty"),
-        ({"model": "tiny-vml"}, r"judge\.chat\.model=tiny-vml is not served by .*did you mean tiny-vlm"),
-        (
-            {"key": "NO_SUCH_KEY"},
-            r"judge\.chat\.key=NO_SUCH_KEY should be the name of an environment variable",
-        ),
-        ({"key": "sk-aBc123"}, r"judge\.chat\.key should be the name"),
-    ],
-)
-def test_what_is_missing_is_told_by_its_key(make: Make, chat: dict[str, Any], said: str) -> None:
-    with pytest.raises((JudgeError, ConfigError), match=said) as told:
-        score(make(chat=chat), clip(DONE))
-    assert "\n" not in str(told.value) and "aBc123" not in str(told.value) and "secret" not in str(told.value)
-
-
-def test_a_wrong_address_and_an_unwelcome_key_stop_the_run_at_once(
-    options: dict[str, Any], make: Make, server: ChatServer
-) -> None:
-    server.faults.append(refuse(404, "no such path"))
-    with pytest.raises(JudgeError, match=r"404: no such path.*judge\.chat\.url"):
-        score(make(), clip(DONE))
-    server.key = "right"
-    with pytest.raises(JudgeError, match=r"401: wrong key: None; judge\.chat\.key=null"):
-        score(make(), clip(DONE))
 
 
 @pytest.mark.parametrize(
