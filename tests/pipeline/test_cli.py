@@ -108,7 +108,10 @@ def test_shells_complete_commands_and_choices() -> None:
 
     assert completed("worldloop", "ru") == ["run"]
     assert "experiment=smoke" in completed("worldloop", "run", "exp")
-    assert completed("worldloop", "run", "experiment", "=", "quickstart_") == ["quickstart_dit", "quickstart_fine"]
+    assert completed("worldloop", "run", "experiment", "=", "quickstart_") == [
+        "quickstart_dit",
+        "quickstart_fine",
+    ]
     assert "bashcompinit" in worldloop("completion", "zsh").stdout
     assert "say which shell" in worldloop("completion", "fish").stderr
 
