@@ -116,7 +116,11 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
     teacher = graph.add("simulator", world.simulator, {"data": data, "warm": warm}, phase="first")
     rows = {}
     asks: Any = target(cfg["judge"], "judge")
-    golden = graph.add("text_world", world.text_world, {"data": data}, phase="first") if _golden(cfg) else ""
+    golden = (
+        graph.add("text_world", world.text_world, {"data": data}, phase="first")
+        if "text_world" in cfg["judge"]
+        else ""
+    )
 
     def judged(own: Graph, name: str, simulator: str) -> str:
         """The judge of a simulator; one that sees pictures alone is the same for all."""
@@ -145,10 +149,6 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
             few = acting({**given, "distill": {**given["distill"], "steps": steps}})
             measured(f"{name}, {steps}", f"{name}-{steps}", student, few["simulator"], steps)
     return graph, rows
-
-
-def _golden(cfg: Mapping[str, Any]) -> bool:
-    return "text_world" in cfg["judge"]
 
 
 @stage(reads=(*WORLD, "measure.speed_chunks"), place=Place.EVALUATOR)

@@ -26,8 +26,8 @@ from pipeline.evaluation.fidelity.masks import part_labels
 from pipeline.evaluation.fidelity.open_loop import OpenLoop, held_coded, held_still
 from pipeline.evaluation.fidelity.page import build_page, summary_text
 from pipeline.evaluation.measurement import evenly, groups, speed
-from pipeline.evaluation.value.trials import Kept
 from pipeline.graph.code_version import code_of
+from pipeline.graph.kept import Kept
 from pipeline.loop import has_physics
 
 Cfg = Mapping[str, Any]

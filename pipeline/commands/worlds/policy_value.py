@@ -22,8 +22,8 @@ from pipeline.evaluation.value.agreement import Cell, agreement
 from pipeline.evaluation.value.candidates import Candidate, action_spread, candidates
 from pipeline.evaluation.value.estimate import Comparison, starts_of, task_of
 from pipeline.evaluation.value.page import build_page, table_text
-from pipeline.evaluation.value.trials import Kept
 from pipeline.graph.code_version import code_of
+from pipeline.graph.kept import Kept
 from pipeline.loop import has_physics
 from pipeline.stages import imitation, rl
 from pipeline.stages.given import mode_of

@@ -20,7 +20,7 @@ from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.fidelity.frames import by_frame, frame_errors, summary
 from pipeline.evaluation.fidelity.frechet import Moments, frechet
 from pipeline.evaluation.objects.error import object_offsets, object_summary
-from pipeline.evaluation.value.trials import Kept, Tensors
+from pipeline.graph.kept import Kept, Tensors
 
 _SIDE_BY_SIDE = 16  # episodes, whose frames are held at once
 _AT_ONCE = {False: 256, True: 32}  # pictures, or clips, that an extractor is shown

@@ -20,7 +20,8 @@ from pipeline.evaluation.by_task import tasks_of_episodes
 from pipeline.evaluation.fidelity.masks import ALIKE
 from pipeline.evaluation.value.agreement import Cell
 from pipeline.evaluation.value.candidates import Candidate
-from pipeline.evaluation.value.trials import Imagination, Kept, Physics, Tensors
+from pipeline.evaluation.value.trials import Imagination, Physics
+from pipeline.graph.kept import Kept, Tensors
 
 Cfg = Mapping[str, Any]
 _SIDE_BY_SIDE = 64  # imagined episodes

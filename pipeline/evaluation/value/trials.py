@@ -6,62 +6,23 @@ imagination. A file's name ends in a hash of all that its numbers depend on.
 
 from __future__ import annotations
 
-import json
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from actors.factory import build_physics, build_pool
 from actors.policies.recorded import Commands, RecordedActions
 from actors.rollouts.evaluate import Outcome, evaluate
-from envs.files import atomic, write_text
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import PoolError, TaskPool
 from envs.physics.worker import Track
 from envs.specs import IMAGE
 from pipeline.evaluation.value.candidates import Candidate
-from pipeline.graph.code_version import digest
-
-Tensors = dict[str, Tensor]
-_ODD = r"[^\w.+-]+"  # in names of files
-
-
-class Kept:
-    """Files of tensors by what they depend on.
-
-    Args:
-        folder: made if it is not there.
-    """
-
-    def __init__(self, folder: Path):
-        self.folder, self.reused = folder, 0
-
-    def get(self, name: str, identity: Mapping[str, Any], make: Callable[[], Tensors]) -> Tensors:
-        """What `make` gave for this identity, now or at some earlier time."""
-        key = digest(json.dumps(identity, sort_keys=True, default=str))
-        path = self.folder / f"{re.sub(_ODD, '_', name)}-{key}.safetensors"
-        if path.exists():
-            self.reused += 1
-            return load_file(path)
-        made = make()
-        with atomic(path) as part:
-            save_file({field: value.contiguous() for field, value in made.items()}, part)
-        return made
-
-    def figures(self, name: str, identity: Mapping[str, Any], make: Callable[[], dict[str, Any]]) -> Any:
-        """The same of what JSON holds."""
-        key = digest(json.dumps(identity, sort_keys=True, default=str))
-        path = self.folder / f"{re.sub(_ODD, '_', name)}-{key}.json"
-        if not path.exists():
-            write_text(path, json.dumps(make()))
-        return json.loads(path.read_text())
+from pipeline.graph.kept import Kept, Tensors
 
 
 @dataclass

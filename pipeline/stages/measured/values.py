@@ -15,7 +15,7 @@ from envs.files import write_atomically, write_text
 from pipeline.evaluation.value.agreement import agreement
 from pipeline.evaluation.value.candidates import action_spread, candidates
 from pipeline.evaluation.value.estimate import Comparison, starts_of
-from pipeline.evaluation.value.trials import Kept, Tensors
+from pipeline.graph.kept import Kept, Tensors
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import PHYSICS, WORLD, Cfg, datasets, mode_of, open_store
 from pipeline.stages.judge_cost import priced
