@@ -34,7 +34,8 @@ from tests.sections import offered, section
 
 Stores = Callable[[Embodiment], ClipStore]
 METHODS = ("dmd2", "trajectory")
-STEPS = {"dmd2": 300, "trajectory": 100}
+# Matching by critics circles around its goal, the less the slower its student goes.
+PACE = {"dmd2": (900, 3e-3, 0.99), "trajectory": (100, 1e-2, 0.98)}  # steps, learning rate, EMA
 CLIPS = SimulatorFitConfig(single_chunk_fraction=1.0, unroll=1, strides=(1,), recent_fraction=0.0, lora=0)
 
 
@@ -86,12 +87,12 @@ def test_a_student_of_one_step_makes_what_the_teacher_makes(
     assert float(teacher.sample().std()) == pytest.approx(0.5, abs=0.05)
     assert float(student.sample().std()) < 0.05
     method = section(f"distiller/{name}", **({"critic_lr": 1e-2} if name == "dmd2" else {}))
-    options = FitConfig(STEPS[name], 1, 1e-2, warmup=5, bf16=False, ema=0.98, checkpoint_every=1000)
+    steps, lr, ema = PACE[name]
+    options = FitConfig(steps, 1, lr, warmup=5, bf16=False, ema=ema, checkpoint_every=1000)
     train_student(teacher, student, method, store, torch.arange(4), CLIPS, options, tmp_path)
     made = student.sample()
     assert float(made.mean()) == pytest.approx(2.0, abs=0.12)
-    # Matching by critics circles around where regression comes to rest.
-    assert float(made.std()) == pytest.approx(0.5, abs=0.2 if name == "dmd2" else 0.1)
+    assert float(made.std()) == pytest.approx(0.5, abs=0.1)
 
 
 def engines() -> list[str]:
