@@ -173,7 +173,6 @@ def _data_loop(graph: Graph, cfg: Cfg) -> None:
     data = [graph.add("recordings", collect.recordings, fingerprint=mark)]
     first = add_imitation(graph, cfg, data)
     made = add_world(graph, cfg, data, World(), 1)
-    graph.add("film", show.film, {"data": data, "simulator": made.simulator})
     starts = _extra_starts(graph, cfg)
     policy = _learn(graph, cfg, data, made, first, 1, starts, deployed=0)
     _conclude(graph, data, made, first, policy, {})

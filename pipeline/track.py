@@ -165,7 +165,9 @@ class WandbTracker:
     def _send_videos(self, name: str, folder: Path) -> int:
         new = [path for path in sorted(folder.glob("*.mp4")) if f"{name}/{path.name}" not in self._videos]
         for path in new:
-            self._run.log({f"videos/{name}/{path.stem}": self._video(str(path), format="mp4")})
+            what, _, step = path.stem.partition("-step")  # of one thing, again and again while it learns
+            row = {f"videos/{name}/{what}": self._video(str(path), format="mp4")}
+            self._run.log(row | ({f"{name}/step": int(step)} if step else {}))
             self._videos.add(f"{name}/{path.name}")
         return len(new)
 

@@ -14,6 +14,8 @@ from envs.simulators.base import Simulator
 from envs.simulators.features import pooled
 from envs.simulators.state_experts.base import StateDecoder
 
+SIDE_BY_SIDE = 32  # episodes
+
 
 class Replay(NamedTuple):
     """Generated episodes beside the rows of the true ones.
@@ -35,26 +37,27 @@ def replay(
     store: ClipStore,
     episodes: Tensor,
     decoder: StateDecoder | None = None,
-    batch: int = 32,
     bf16: bool = True,
     alone: int | None = None,
     stride: int = 1,
     draw: int = 0,
+    most: int | None = None,
 ) -> Replay:
     """Generate the given episodes from their first frames on, to the end of the longest.
 
     Args:
         alone: chunks after which it goes on from true frames again; None for never.
         decoder: decodes the robot's states along the way; without one `states` repeats the first.
-        batch: episodes generated side by side.
         stride: recorded frames from one generated frame to the next; T is then so many times smaller.
         draw: number of the sample; each draws noise of its own.
+        most: chunks to generate at most; None for whole episodes.
     """
     device, chunk = simulator.device, simulator.spec.chunk
     steps = -(-(int(store.length[episodes].max()) - 1) // (chunk * stride))
+    steps = steps if most is None else min(steps, most)
     simulator.eval()
     parts = []
-    for ids in episodes.split(batch):
+    for ids in episodes.split(SIDE_BY_SIDE):
         start, last = store.start[ids], store.length[ids][:, None] - 1
         first = store.first(ids)
         # Whoever asks the same simulator twice for the same draw gets the same noise.

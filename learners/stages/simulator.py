@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -58,12 +58,14 @@ def train_simulator(
     folder: Path,
     newest: Tensor | None = None,
     fresh: bool = True,
+    look: Callable[[int], None] | None = None,
 ) -> dict[str, float]:
     """Train `simulator` in place on the given episodes of a store.
 
     Args:
         newest: episodes that `recent_fraction` speaks of.
         fresh: whether it has not been trained before; it then takes its units from these episodes first.
+        look: as in `fit`.
 
     Raises:
         EpisodeError: if no recorded picture follows another, so that there is nothing to continue.
@@ -86,7 +88,7 @@ def train_simulator(
         tqdm.write(f"simulator: {simulator.lost_in_training}")
     batch = ClipBatches(simulator, store, episodes, config, options, newest)
     with low_rank(simulator, config.lora):
-        return fit("simulator", simulator, batch, simulator.loss, options, folder)
+        return fit("simulator", simulator, batch, simulator.loss, options, folder, look=look)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -108,6 +109,7 @@ def fit(
     folder: Path,
     watch: str = "loss",
     optimise: Optimise | None = None,
+    look: Callable[[int], None] | None = None,
 ) -> dict[str, float]:
     """Train `module` in place and leave it with its averaged weights.
 
@@ -121,6 +123,8 @@ def fit(
         watch: the figure shown while it runs.
         optimise: makes the optimisers of parts that learn differently; by default config.optimiser moves
             all. A group's `lr_scale` multiplies the learning rate. What a step's loss does not reach stays.
+        look: shows what has been learned: called after each checkpoint, by every worker, with the number of
+            steps, while the averaged weights are in place. Nothing that it does changes what is learned next.
 
     Returns:
         data_seconds, spent waiting for batches; compute_seconds, spent on all else; samples_per_second over
@@ -216,7 +220,8 @@ def fit(
                 _announce(name, config.steps - step - 1, took)
             bar.set_postfix_str(f"{watch} {figures.get(watch, smooth):.4g}", refresh=False)
             stop = from_leader(asked_to_leave)
-            if stop or (step + 1) % config.checkpoint_every == 0 or step + 1 == config.steps:
+            due = (step + 1) % config.checkpoint_every == 0 or step + 1 == config.steps
+            if stop or due:
                 stream.flush()
                 checkpoints.save(step + 1, state(), {"step": step + 1, "spent": spent, "smooth": smooth})
             if stop:
@@ -225,6 +230,9 @@ def fit(
                     f"{name}: stopped after step {step}, as asked; the same command goes on from there"
                 )
                 leave(stop)
+            if due and look is not None:
+                with averaged_weights(module, trained, average if config.ema else {}):
+                    trainee(look, step + 1)
     bar.close()
     if config.ema:
         with torch.no_grad():
@@ -237,6 +245,31 @@ def fit(
         "samples_per_second": config.steps * config.batch / max(1e-9, sum(spent.values())),
         "loss": smooth if smooth is not None else math.nan,
     }
+
+
+@contextmanager
+def averaged_weights(
+    module: nn.Module, trained: Mapping[str, Tensor], average: Mapping[str, Tensor]
+) -> Iterator[None]:
+    """Within, `module` evaluates with the averages of its trained weights, as it will be handed on, and draws
+    random numbers as it likes; after it, all is as before.
+    """
+
+    def exchange() -> None:
+        with torch.no_grad():
+            for key, value in average.items():
+                kept = trained[key].clone()
+                trained[key].copy_(value)
+                value.copy_(kept)
+
+    exchange()
+    module.eval()
+    try:
+        with torch.random.fork_rng(), torch.no_grad():
+            yield
+    finally:
+        module.train()
+        exchange()
 
 
 def follow(average: Mapping[str, Tensor], trained: Mapping[str, Tensor], decay: float) -> None:

@@ -15,12 +15,12 @@ from envs.targets import ConfigError
 from pipeline.acting import acting
 from pipeline.graph.graph import Graph
 from pipeline.outside import CHECKPOINT, KINEMATICS, STATE_CHECKPOINT, WEIGHTS, files_at, fingerprint
-from pipeline.stages import finetune, show
+from pipeline.stages import finetune
 
 
 def build_finetune(cfg: Mapping[str, Any], root: Path) -> Graph:
     """The graph of the stages: the tokenizer of a simulator that has one to train and begins from nothing,
-    simulator, its student if distill.steps asks for one, a video of it, and state.
+    simulator, its student if distill.steps asks for one, and state.
 
     Raises:
         ConfigError: if finetune.data names no data sets, or the state expert cannot be their robot's.
@@ -44,6 +44,5 @@ def build_finetune(cfg: Mapping[str, Any], root: Path) -> Graph:
     if cfg["distill"]["steps"]:
         made = learning.add("student", finetune.student, {"simulator": made}, fingerprint=mark)
     files = files_at(cfg, STATE_CHECKPOINT)
-    graph.add("film", show.film, {"simulator": made}, fingerprint=mark)
     graph.add("state", finetune.state, {"simulator": made}, fingerprint=mark, **files)
     return graph

@@ -65,10 +65,12 @@ def rollout_error(store: ClipStore, episodes: Tensor, made: Replay) -> dict[str,
 
 
 def speed(simulator: Simulator, store: ClipStore, batch: int, chunks: int) -> float:
-    """Generated frames per second (all views together count as one) at a batch size, after one warm-up."""
+    """Generated frames per second (all views together count as one) at a batch size, SIDE_BY_SIDE at most, after
+    one warm-up.
+    """
     episodes = store.length.argsort(descending=True)[torch.arange(batch) % len(store)]
-    replay(simulator, store, episodes[:1], batch=1)
+    replay(simulator, store, episodes[:1])
     began, frames = time.perf_counter(), 0
     for _ in range(max(1, chunks // 10)):
-        frames += replay(simulator, store, episodes, batch=batch).frames.shape[:2].numel()
+        frames += replay(simulator, store, episodes).frames.shape[:2].numel()
     return frames / (time.perf_counter() - began)

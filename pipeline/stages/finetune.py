@@ -11,6 +11,7 @@ from typing import Any
 from actors.factory import build_simulator, build_state_decoder, open_clips
 from actors.process import prepare_process
 from envs.targets import options
+from learners.stages.film import Film
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
 from pipeline.graph.artefact import save_weights
@@ -45,7 +46,8 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg, Path(weights) if weights else inputs.weights("warm"))
     fresh = not (weights or cfg["simulator"].get("checkpoint"))
-    stats = train_simulator(model, store, learning_episodes(store), how, fit, folder, fresh=fresh)
+    look = Film(model, store, folder, cfg["simulator"]["bf16"])
+    stats = train_simulator(model, store, learning_episodes(store), how, fit, folder, fresh=fresh, look=look)
     save_weights(model, folder)
     return dict(stats)
 

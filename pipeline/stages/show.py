@@ -30,9 +30,9 @@ from pipeline.evaluation.judging import judge_both
 from pipeline.evaluation.media import paired_frames, paired_video, write_gif
 from pipeline.evaluation.report import VIDEOS, build_report
 from pipeline.evaluation.result import build_result
-from pipeline.graph.stage import Inputs, Place, stage
+from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.collect import run_recorded
-from pipeline.stages.given import EVERYTHING, TASK, WORLD, Cfg, open_store
+from pipeline.stages.given import EVERYTHING, WORLD, Cfg, open_store
 from pipeline.stages.judge_cost import priced
 from pipeline.stages.prove import EPISODES
 
@@ -124,20 +124,6 @@ def videos(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         store = open_clips(cfg, [data])
         made += studio.paired(store, torch.arange(len(store)), label)
     return studio.keep(made)
-
-
-@stage(reads=("seed", "threads", *TASK, "simulator"), place=Place.EVALUATOR)
-def film(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """A paired video of the first held-out recording, as soon as a simulator has learned: nothing is built
-    on it, so what learned stays as it is when videos change.
-    """
-    prepare_process(cfg["seed"], cfg["threads"])
-    store = open_clips(cfg, cfg["task"]["data"])
-    held = torch.cat((store.split("held_out"), torch.arange(len(store))))[:1]
-    simulator = build_simulator(cfg, inputs.weights("simulator")).eval()
-    made = replay(simulator, store, held, bf16=cfg["simulator"]["bf16"])
-    paired_video(folder / "media/held-out.mp4", paired_frames(store, held, made, 0), store.fps)
-    return {"episode": int(held)}
 
 
 @stage(reads=(*WORLD, "measure.videos", "measure.worst"))

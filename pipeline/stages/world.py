@@ -20,6 +20,7 @@ from envs.simulators.base import Simulator
 from envs.simulators.features import features_of_episodes
 from envs.targets import ConfigError, options
 from learners.stages.distill.stage import train_student
+from learners.stages.film import Film
 from learners.stages.generated import generated_frames, recorded_features
 from learners.stages.judge import calibrate, judge_recordings, train_judge
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
@@ -83,6 +84,7 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
             *(model, store, episodes, how, fit, folder),
             newest=newest_episodes(store, episodes),
             fresh=phase == "first",
+            look=Film(model, store, folder, cfg["simulator"]["bf16"]),
         )
         if learns(model)
         else {}
@@ -123,8 +125,9 @@ def distil(
     weights = inputs.weights("warm") or inputs.weights("simulator")
     model = build_simulator(acting(cfg), weights)
     method = dict(cfg["distill"]["method"])
+    look = Film(model, store, folder, cfg["simulator"]["bf16"])
     try:
-        stats = train_student(teacher, model, method, store, episodes, how, fit, folder, newest)
+        stats = train_student(teacher, model, method, store, episodes, how, fit, folder, newest, look)
     except ValueError as error:
         raise ConfigError(str(error)) from error
     save_weights(model, folder)

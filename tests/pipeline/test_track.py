@@ -67,12 +67,14 @@ def test_rows_appear_before_the_stage_ends(tmp_path: Path, monkeypatch: pytest.M
 
 @stage(reads=("name",))
 def filming(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """Learn in a part of the stage, and show two videos."""
+    """Learn in a part of the stage, show two videos, and one twice while it learns."""
     (folder / "part").mkdir()
     (folder / "part/metrics.jsonl").write_text('{"step": 3, "part/loss": 0.5}\n')
     for number in range(2):
         frames = [np.full((32, 48, 3), 40 * step, np.uint8) for step in range(4)]
         paired_video(folder / f"media/before-{number}.mp4", frames, 10.0)
+    for step in (100, 200):
+        paired_video(folder / f"media/held-out-step{step:06d}.mp4", frames, 10.0)
     return {}
 
 
@@ -83,10 +85,11 @@ def test_videos_and_parts_of_a_stage_are_tracked_once(tmp_path: Path) -> None:
         with tracking(CFG, tmp_path) as tracker:
             graph.run(tracker=tracker)
         state = json.loads((tmp_path / "wandb.json").read_text())
-        assert state["videos"] == ["videos/before-0.mp4", "videos/before-1.mp4"]
+        late = [f"videos/held-out-step000{step}.mp4" for step in (100, 200)]
+        assert state["videos"] == ["videos/before-0.mp4", "videos/before-1.mp4", *late]
         assert state["rows"] == {"videos-part": 3}
         sent = [path for path in tmp_path.rglob("*.mp4") if "wandb" in path.parts]
-        assert len(sent) == 2 and all(path.stat().st_size > 0 for path in sent)
+        assert len(sent) == 4 and all(path.stat().st_size > 0 for path in sent)
 
 
 def test_no_video_is_seen_before_it_is_whole(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -29,12 +30,14 @@ def train_student(
     options: FitConfig,
     folder: Path,
     newest: Tensor | None = None,
+    look: Callable[[int], None] | None = None,
 ) -> dict[str, float]:
     """Train `student` in place, whose weights are the teacher's or those of an earlier student.
 
     Args:
         method: section distill.method.
         newest: episodes that config.recent_fraction speaks of.
+        look: as in `fit`.
 
     Raises:
         ValueError: if the two do not belong together, naming the keys.
@@ -50,7 +53,7 @@ def train_student(
     with ExitStack() as adapted:
         for learner in made.learners:
             adapted.enter_context(low_rank(learner, config.lora))
-        return fit("distill", made, batch, made.loss, options, folder, optimise=made.optimise)
+        return fit("distill", made, batch, made.loss, options, folder, optimise=made.optimise, look=look)
 
 
 def check_pair(teacher: Simulator, student: Simulator) -> None:

@@ -95,7 +95,9 @@ IGNORES: dict[str, tuple[str, ...]] = {
     "embedding": ("first frame", "frames"),
 }
 FEATURES = (6, 10)  # of a simulator whose features judges read: tokens and their width
-FULL = "_full"  # of a published size, which is counted on the meta device (tests/pipeline/test_bench_size.py)
+FULL = (
+    "_full"  # of a published size, which is counted on the meta device (tests/pipeline/benches/test_size.py)
+)
 JUDGES = {name: CONFIGS for name in offered("judge") if not name.endswith(FULL)} | {
     path.stem: EXAMPLES for path in (EXAMPLES / "judge").glob("*.yaml")
 }

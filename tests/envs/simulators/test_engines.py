@@ -30,7 +30,7 @@ BATCH = 3
 CHUNK = 5  # 1 + 4 k, as GE-Sim's autoencoder wants it
 # It generates nothing: a server does, whose engine is tested here; tests/actors/test_remote.py has the rest.
 SERVED = ("remote",)
-# Of a published size, which is counted on the meta device (tests/pipeline/test_bench_size.py).
+# Of a published size, which is counted on the meta device (tests/pipeline/benches/test_size.py).
 FULL = "_full"
 # Conditioned on pose and ray maps alone, as released: whoever cannot draw them is refused.
 MAPS_ALONE = ("gesim_tiny",)

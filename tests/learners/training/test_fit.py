@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +38,11 @@ class Net(nn.Module):
 
 
 def train(
-    folder: Path, optimiser: str = "adamw", stop: int = -1, spoil: int = -1
+    folder: Path,
+    optimiser: str = "adamw",
+    stop: int = -1,
+    spoil: int = -1,
+    look: Callable[[Net, int], None] | None = None,
 ) -> tuple[Net, list[dict[str, float]]]:
     """The trained network and its log; stops, as if killed, or meets NaN at a step."""
     torch.manual_seed(0)
@@ -49,7 +55,7 @@ def train(
         data = torch.randn(8, 1, 6, generator=generator)
         return data * math.nan if step == spoil else data
 
-    fit("toy", net, batch, net.loss, options, folder)
+    fit("toy", net, batch, net.loss, options, folder, look=None if look is None else partial(look, net))
     return net, [json.loads(line) for line in (folder / "metrics.jsonl").open()]
 
 
@@ -67,6 +73,22 @@ def test_a_killed_run_goes_on_bit_for_bit(tmp_path: Path, optimiser: str) -> Non
     assert all(torch.equal(value, whole.state_dict()[name]) for name, value in again.state_dict().items())
     clear_checkpoints(tmp_path)
     assert not list((tmp_path / "cut").glob("*checkpoint-*"))
+
+
+def test_a_look_sees_what_will_be_handed_on_and_changes_nothing(tmp_path: Path) -> None:
+    looks: dict[int, dict[str, Tensor]] = {}
+
+    def look(net: Net, step: int) -> None:
+        assert not net.training and not torch.is_grad_enabled()
+        torch.rand(7)
+        looks[step] = {name: value.clone() for name, value in net.state_dict().items()}
+
+    blind, log = train(tmp_path / "blind")
+    seen, rest = train(tmp_path / "seen", look=look)
+    assert list(looks) == [6, 12, 18, 20] and rest == log
+    for name, value in blind.state_dict().items():
+        assert torch.equal(value, seen.state_dict()[name]) and torch.equal(value, looks[20][name])
+    assert not torch.equal(looks[6]["line.weight"], looks[20]["line.weight"])
 
 
 def test_checkpoints_hold_numbers_and_no_code(tmp_path: Path) -> None:

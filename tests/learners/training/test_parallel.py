@@ -17,6 +17,7 @@ from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
 from envs.specs import ActionMode
 from learners.stages.distill.stage import train_student
+from learners.stages.film import Film
 from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.judge import train_judge
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
@@ -110,7 +111,8 @@ def stages(folder: Path, dataset: Path) -> list[float]:
     torch.set_num_threads(1)
     spec = world_spec(ARM_DELTAS.at(SIZE), SIZE)
     store = ClipStore([dataset], spec)
-    every, options = torch.arange(len(store)), FitConfig(3, 4, microbatches=2, lr=1e-3, warmup=1, bf16=False)
+    every = torch.arange(len(store))
+    options = FitConfig(3, 4, 1e-3, microbatches=2, warmup=1, bf16=False, checkpoint_every=2)
     policy, simulator = (
         policy_of("chunk_gaussian", spec, ActionMode.ABSOLUTE),
         simulator_of("dit_small", spec),
@@ -119,13 +121,18 @@ def stages(folder: Path, dataset: Path) -> list[float]:
     clips = SimulatorFitConfig(1.0, 1, (1,), 0.0, 0)
     cloning = Cloning(policy, store, every, ActionMode.ABSOLUTE)
     train_imitation(cloning, options, folder / "imitation")
-    train_simulator(simulator, store, every, clips, options, folder / "simulator")
+    film = Film(simulator, store, folder / "simulator", False)
+    train_simulator(simulator, store, every, clips, options, folder / "simulator", look=film)
     train_state(decoder, simulator, store, every, options, folder / "state")
     train_judge(judge, store, every, options, folder / "judge")
     teacher, student = simulator_of("dit_small", spec), distilled(spec)
     student.load_state_dict(teacher.state_dict())
     method = section("distiller/dmd2", critic_updates=2)
-    train_student(teacher, student, method, store, every, clips, options, folder / "distill")
+    film = Film(student, store, folder / "distill", False)
+    train_student(teacher, student, method, store, every, clips, options, folder / "distill", look=film)
+    for stage in ("simulator", "distill"):
+        names = [path.name for path in sorted((folder / stage / "media").iterdir())]
+        assert [name.rpartition("-")[2] for name in names] == ["step000002.mp4", "step000003.mp4"]
     return [
         json.loads(line)[f"{name}/loss"]
         for name in ("imitation", "simulator", "state", "judge", "distill")

@@ -137,7 +137,7 @@ def test_a_disk_that_is_really_full_is_told_and_work_goes_on_when_there_is_room(
         [*own, sys.executable, "-m", "tests.full_disk", str(tmp_path)],
         capture_output=True,
         text=True,
-        cwd=Path(__file__).resolve().parents[2],
+        cwd=Path(__file__).resolve().parents[3],
     )
     assert done.returncode == 0, done.stderr[-3000:]
     assert int(done.stdout.split()[0]) >= 10, done.stdout

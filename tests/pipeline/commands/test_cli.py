@@ -14,7 +14,7 @@ import pytest
 
 from pipeline.cli.main import COMMANDS, main
 
-ROOT = Path(__file__).resolve().parent.parent.parent
+ROOT = Path(__file__).resolve().parents[3]
 Answer = subprocess.CompletedProcess[str]
 
 

@@ -83,7 +83,7 @@ def test_finetune_a_checkpoint_distil_it_again_and_serve_what_came_of_it(
     cfg = load_config(words)
     graph = build_finetune(cfg, tmp_path / "runs/default")
     done = graph.run()
-    assert set(done) == {"simulator", "student", "film", "state"}
+    assert set(done) == {"simulator", "student", "state"}
     assert (
         "these weights sample in 4 distilled steps, and flow matching takes that out"
         in capsys.readouterr().out
@@ -95,7 +95,7 @@ def test_finetune_a_checkpoint_distil_it_again_and_serve_what_came_of_it(
     simulator = build_simulator(graph.cfg, graph.folder("student") / "weights.safetensors")
     assert simulator.sampler == Distilled(DISTILLED[:2])
     build_state_decoder(graph.cfg, simulator, graph.folder("state") / "weights.safetensors")
-    assert verify_run(tmp_path / "runs/default").startswith("4 stages of")
+    assert verify_run(tmp_path / "runs/default").startswith("3 stages of")
     host = build_session_host(cfg, tmp_path / "runs/default", serve_config())
     assert host.simulator.spec.chunk == 5
     for served, stage in ((host.simulator, "student"), (host.decoder, "state")):

@@ -47,9 +47,10 @@ def test_finetune_on_a_set_of_lerobots(kind: str, tmp_path: Path) -> None:
     )
     graph = build_finetune(cfg, tmp_path / "smoke")
     done = graph.run()
-    assert set(done) == {"simulator", "film", "state"}
-    video = read_video(graph.folder("film") / "media/held-out.mp4")
-    assert len(video) > 5 and video.std() > 10
+    assert set(done) == {"simulator", "state"}
+    (film,) = (graph.folder("simulator") / "media").iterdir()  # of its last step, here its only checkpoint
+    video = read_video(film)
+    assert film.name.endswith("-step000002.mp4") and len(video) > 5 and video.std() > 10
     robot = world_spec(graph.cfg).embodiment
     about = SETS[kind]
     assert (robot.robot, robot.fps, len(robot.cameras)) == (about.robot, about.fps, len(about.cameras))

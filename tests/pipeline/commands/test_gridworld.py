@@ -14,7 +14,7 @@ from envs.targets import ConfigError
 from pipeline.commands.worlds.gridworld import gridworld, variant
 from pipeline.config import load_config
 from pipeline.evaluation.squares import find_squares
-from tests.pipeline.test_cli import worldloop
+from tests.pipeline.commands.test_cli import worldloop
 
 TINY = [
     *("experiment=gridworld", "task.horizon=3", "launch.workers=1"),
