@@ -65,9 +65,7 @@ def rollout_error(store: ClipStore, episodes: Tensor, made: Replay) -> dict[str,
 
 
 def speed(simulator: Simulator, store: ClipStore, batch: int, chunks: int) -> float:
-    """Generated frames per second (all views together count as one) at a batch size, SIDE_BY_SIDE at most, after
-    one warm-up.
-    """
+    """Generated frames per second (all views together count as one) at a batch size, SIDE_BY_SIDE at most."""
     episodes = store.length.argsort(descending=True)[torch.arange(batch) % len(store)]
     replay(simulator, store, episodes[:1])
     began, frames = time.perf_counter(), 0

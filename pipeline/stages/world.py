@@ -23,7 +23,7 @@ from learners.stages.distill.stage import train_student
 from learners.stages.film import Film
 from learners.stages.generated import generated_frames, recorded_features
 from learners.stages.judge import calibrate, judge_recordings, train_judge
-from learners.stages.simulator import SimulatorFitConfig, train_simulator
+from learners.stages.simulator import ClipBatches, SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
 from learners.stages.text_world import calibrate_ending, train_text_world
 from learners.stages.tokenizer import train_tokenizer
@@ -125,9 +125,10 @@ def distil(
     weights = inputs.weights("warm") or inputs.weights("simulator")
     model = build_simulator(acting(cfg), weights)
     method = dict(cfg["distill"]["method"])
+    clips = ClipBatches(model, store, episodes, how, fit, newest)
     look = Film(model, store, folder, cfg["simulator"]["bf16"])
     try:
-        stats = train_student(teacher, model, method, store, episodes, how, fit, folder, newest, look)
+        stats = train_student(teacher, method, clips, folder, look)
     except ValueError as error:
         raise ConfigError(str(error)) from error
     save_weights(model, folder)

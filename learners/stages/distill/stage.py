@@ -8,51 +8,45 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
-from envs.episodes.clips import ClipStore
 from envs.simulators.base import Simulator
 from envs.simulators.stepwise import Stepwise
 from envs.targets import build
 from learners.stages.distill.method import Method, Turn
-from learners.stages.simulator import ClipBatches, SimulatorFitConfig
-from learners.training.fit import FitConfig, fit
+from learners.stages.simulator import ClipBatches
+from learners.training.fit import fit
 from learners.training.lora import low_rank
 
 
 def train_student(
     teacher: Simulator,
-    student: Simulator,
     method: dict[str, Any],
-    store: ClipStore,
-    episodes: Tensor,
-    config: SimulatorFitConfig,
-    options: FitConfig,
+    clips: ClipBatches,
     folder: Path,
-    newest: Tensor | None = None,
     look: Callable[[int], None] | None = None,
 ) -> dict[str, float]:
-    """Train `student` in place, whose weights are the teacher's or those of an earlier student.
+    """Train the student, `clips.simulator`, in place, from the teacher's weights or an earlier student's.
 
     Args:
         method: section distill.method.
-        newest: episodes that config.recent_fraction speaks of.
+        clips: what the student learns from, and its options.
         look: as in `fit`.
 
     Raises:
         ValueError: if the two do not belong together, naming the keys.
         ConfigError: if the method cannot be built.
     """
+    student, options = clips.simulator, clips.options
     check_pair(teacher, student)
     made: Method = build(method, "distill.method", teacher=teacher, student=student, config=options)
-    clips = ClipBatches(student, store, episodes, config, options, newest)
 
     def batch(step: int, generator: torch.Generator) -> Turn:
         return Turn(clips(step, generator), step)
 
     with ExitStack() as adapted:
         for learner in made.learners:
-            adapted.enter_context(low_rank(learner, config.lora))
+            adapted.enter_context(low_rank(learner, clips.config.lora))
         return fit("distill", made, batch, made.loss, options, folder, optimise=made.optimise, look=look)
 
 

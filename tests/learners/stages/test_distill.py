@@ -24,7 +24,7 @@ from envs.simulators.stepwise import Stepwise
 from envs.specs import WorldSpec
 from envs.targets import ConfigError, build, target
 from learners.stages.distill.stage import check_pair, train_student
-from learners.stages.simulator import SimulatorFitConfig
+from learners.stages.simulator import ClipBatches, SimulatorFitConfig
 from learners.training.fit import FitConfig
 from learners.training.optimisers import optimiser_state
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
@@ -89,7 +89,7 @@ def test_a_student_of_one_step_makes_what_the_teacher_makes(
     method = section(f"distiller/{name}", **({"critic_lr": 1e-2} if name == "dmd2" else {}))
     steps, lr, ema = PACE[name]
     options = FitConfig(steps, 1, lr, warmup=5, bf16=False, ema=ema, checkpoint_every=1000)
-    train_student(teacher, student, method, store, torch.arange(4), CLIPS, options, tmp_path)
+    train_student(teacher, method, ClipBatches(student, store, torch.arange(4), CLIPS, options), tmp_path)
     made = student.sample()
     assert float(made.mean()) == pytest.approx(2.0, abs=0.12)
     assert float(made.std()) == pytest.approx(0.5, abs=0.1)
@@ -141,7 +141,8 @@ def test_a_killed_distillation_goes_on_bit_for_bit(
     def learn(folder: Path) -> dict[str, Tensor]:
         torch.manual_seed(7)  # adapters are drawn
         world = deepcopy(student)
-        train_student(deepcopy(teacher), world, how, store, torch.arange(20), clips, options, folder)
+        batches = ClipBatches(world, store, torch.arange(20), clips, options)
+        train_student(deepcopy(teacher), how, batches, folder)
         return world.state_dict()
 
     whole = learn(tmp_path / "whole")
@@ -213,7 +214,5 @@ def test_jumps_are_no_trajectories(tiny_store: Stores, tmp_path: Path) -> None:
     _, student = pair("dit_small", store.spec)
     options = FitConfig(1, 2, 1e-3, bf16=False)
     with pytest.raises(ConfigError, match=r"simulator\.sampling\.kind=edm"):
-        train_student(
-            *(deepcopy(student), student, section("distiller/trajectory"), store, torch.arange(2)),
-            *(CLIPS, options, tmp_path),
-        )
+        batches = ClipBatches(student, store, torch.arange(2), CLIPS, options)
+        train_student(deepcopy(student), section("distiller/trajectory"), batches, tmp_path)

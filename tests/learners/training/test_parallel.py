@@ -20,7 +20,7 @@ from learners.stages.distill.stage import train_student
 from learners.stages.film import Film
 from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.judge import train_judge
-from learners.stages.simulator import SimulatorFitConfig, train_simulator
+from learners.stages.simulator import ClipBatches, SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
 from learners.training.fit import FitConfig, fit
 from tests.embodiments import ARM_DELTAS, world_spec
@@ -129,7 +129,8 @@ def stages(folder: Path, dataset: Path) -> list[float]:
     student.load_state_dict(teacher.state_dict())
     method = section("distiller/dmd2", critic_updates=2)
     film = Film(student, store, folder / "distill", False)
-    train_student(teacher, student, method, store, every, clips, options, folder / "distill", look=film)
+    batches = ClipBatches(student, store, every, clips, options)
+    train_student(teacher, method, batches, folder / "distill", look=film)
     for stage in ("simulator", "distill"):
         names = [path.name for path in sorted((folder / stage / "media").iterdir())]
         assert [name.rpartition("-")[2] for name in names] == ["step000002.mp4", "step000003.mp4"]
