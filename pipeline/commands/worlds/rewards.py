@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,12 +22,13 @@ from envs.files import write_text
 from envs.judges.base import Judge
 from envs.judges.rule import RuleJudge
 from envs.simulators.base import Simulator
-from envs.simulators.replay import replay
+from envs.simulators.replay import Replay, replay
 from envs.targets import ConfigError
 from pipeline.evaluation.judging import Scores, judge_both, labelled
 from pipeline.evaluation.rewards.figures import BY_PHYSICS, Truth, by_rule, chosen, curve, figures, truth_of
 from pipeline.evaluation.rewards.page import build_page, table_text
 from pipeline.graph.graph import Graph
+from pipeline.graph.kept import Kept
 from pipeline.loop import build_loop
 from pipeline.stages.given import datasets, open_store
 from pipeline.stages.variant import variant_episodes
@@ -75,10 +76,21 @@ def compare_rewards(cfg: Cfg, root: Path, plan: Plan, tracker: Tracker | None = 
     base = build_loop(cfg, root)
     base.run(base.nodes[JUDGE].inputs["simulator"], tracker)
     judges = dict(_judges(cfg, root, plan, tracker))
-    simulator = build_simulator(base.cfg, base.inputs(JUDGE).weights("simulator")).eval()
+    weights = base.inputs(JUDGE).weights("simulator")
+    assert weights is not None
+    simulator, kept = build_simulator(base.cfg, weights).eval(), Kept(root / "rewards")
+    bf16 = cfg["simulator"]["bf16"]
+
+    def replayed(domain: Domain) -> Replay:
+        name, store, episodes, stages = domain
+        # Folders of stages are named by all that they hang on, code included.
+        identity = {"stages": [weights.parent.name, *stages], "episodes": episodes.tolist(), "bf16": bf16}
+        made = kept.get(name, identity, lambda: replay(simulator, store, episodes, bf16=bf16)._asdict())
+        return Replay(**made)
+
     domains = {
-        name: _domain(cfg, judges, simulator, store, episodes, plan.drawn)
-        for name, store, episodes in _domains(cfg, base, plan, tracker)
+        domain.name: _domain(cfg, judges, simulator, domain, replayed(domain), plan.drawn)
+        for domain in _domains(cfg, base, plan, tracker)
     }
     about = {"name": cfg["name"], "simulator": cfg["simulator"]["_target_"].rpartition(".")[2]}
     result = {**about, "domains": domains}
@@ -101,34 +113,41 @@ def _judges(cfg: Cfg, root: Path, plan: Plan, tracker: Tracker | None) -> Iterat
         yield name, build_judge(graph.cfg, graph.folder(JUDGE) / "weights.safetensors").eval()
 
 
-def _domains(
-    cfg: Cfg, base: Graph, plan: Plan, tracker: Tracker | None
-) -> Iterator[tuple[str, ClipStore, Tensor]]:
-    """Name, store and episodes of what was held out of the run's data, and of each variant."""
+class Domain(NamedTuple):
+    """Episodes of one kind of scenes: their store, which of it, and the stages' folders that hold them."""
+
+    name: str
+    store: ClipStore
+    episodes: Tensor
+    stages: list[str]
+
+
+def _domains(cfg: Cfg, base: Graph, plan: Plan, tracker: Tracker | None) -> Iterator[Domain]:
+    """What was held out of the run's data, and each variant."""
     store = open_store(cfg, base.inputs(JUDGE))
     held = labelled(store, store.split("held_out"))
     if not len(held):
         raise ConfigError("no held-out episode of the data says whether it succeeded (next.success)")
     spread = torch.linspace(0, len(held) - 1, min(plan.episodes, len(held))).round().long()
-    yield SEEN, store, held[spread]
+    yield Domain(SEEN, store, held[spread], [path.name for path in base.inputs(JUDGE).folders("data")])
     for name in plan.variants:
         node = base.add(f"variant-{name}", variant_episodes, variant=name, episodes=plan.episodes)
         base.run(node, tracker)
         other = open_clips(cfg, datasets([base.folder(node)]))
-        yield name, other, torch.arange(len(other))
+        yield Domain(name, other, torch.arange(len(other)), [base.folder(node).name])
 
 
 def _domain(
     cfg: Cfg,
     judges: Mapping[str, Judge],
     simulator: Simulator,
-    store: ClipStore,
-    episodes: Tensor,
+    domain: Domain,
+    made: Replay,
     drawn: int,
 ) -> dict[str, Any]:
-    """The entry of rewards.json for some episodes."""
+    """The entry of rewards.json for some episodes, which `made` replays."""
+    _, store, episodes, _ = domain
     truth, bf16 = truth_of(store, episodes), cfg["simulator"]["bf16"]
-    made = replay(simulator, store, episodes, bf16=bf16)
     rows, curves = {}, {}
     for name, judge in judges.items():
         if name == RULE:

@@ -125,6 +125,11 @@ def test_the_command_compares_judges_on_recordings(tmp_path: Path) -> None:
         assert set(row["figures"]) == {"recorded", "generated"}
     assert {"true", "proxy", "embedding"} == set(seen["drawn"][0]["curves"])
     assert "<svg" in (tmp_path / "smoke/rewards.html").read_text() and "| embedding | generated |" in out.said
+    (replayed,) = (tmp_path / "smoke/rewards").iterdir()
+    made = replayed.stat().st_mtime_ns
+    proxy = {"proxy": load_config([*words, *data, "judge=proxy"])}
+    compare_rewards(load_config([*words, *data]), tmp_path / "smoke", Plan(proxy, 4, ()))
+    assert replayed.stat().st_mtime_ns == made and len(list(replayed.parent.iterdir())) == 1  # nothing twice
     cfg = load_config([*words, *data])
     with pytest.raises(ConfigError, match="asks physics"):
         compare_rewards(cfg, tmp_path / "smoke", Plan({"rule": cfg}, 4, ()))
