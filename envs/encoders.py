@@ -14,29 +14,29 @@ from torch import Tensor, nn
 from envs.specs import WorldSpec
 
 _NATIVE = 64  # pixels of a view's shorter side that the encoder is laid out for; larger ones are halved first
-_LOOK = 4  # features said of each key-point
-_ASKING = 128  # width of the network that turns what is told into what is looked for
-_WAVES = 4  # of which the place of a pixel is told to key-points that are asked for, along either side
+_LOOK = 4  # features of each key-point
+_QUERY = 128  # width of the network that turns the conditioning vector into queries
+_WAVES = 4  # frequencies of the positional encoding that queried key-points see, along either side
 
 
 class ResidualBlock(nn.Module):
-    """x + conv(silu(norm(x))) of [B, channels, H, W]; with `told` numbers [B, told] what is normalised is
-    scaled and shifted by what they say (FiLM, Perez et al. 2018), at first not at all.
+    """x + conv(silu(norm(x))) of [B, channels, H, W]; with a conditioning vector `cond` [B, cond_dim] what is
+    normalised is scaled and shifted by it (FiLM, Perez et al. 2018), at first not at all.
     """
 
-    def __init__(self, channels: int, told: int = 0):
+    def __init__(self, channels: int, cond_dim: int = 0):
         super().__init__()
         self.norm = nn.GroupNorm(8, channels)
         self.conv = nn.Conv2d(channels, channels, 3, padding=1)
-        self.film = nn.Linear(told, 2 * channels) if told else None
+        self.film = nn.Linear(cond_dim, 2 * channels) if cond_dim else None
         if self.film is not None:
             nn.init.zeros_(self.film.weight)
             nn.init.zeros_(self.film.bias)
 
-    def forward(self, x: Tensor, told: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, cond: Tensor | None = None) -> Tensor:
         y = self.norm(x)
         if self.film is not None:
-            gain, shift = self.film(told)[:, :, None, None].chunk(2, 1)
+            gain, shift = self.film(cond)[:, :, None, None].chunk(2, 1)
             y = y * (1 + gain) + shift
         return x + self.conv(F.silu(y))
 
@@ -44,10 +44,10 @@ class ResidualBlock(nn.Module):
 class MultiViewEncoder(nn.Module):
     """One convolutional trunk for all views; each view has its own embedding and its own key-points.
 
-    It says three things of every view: where soft key-points are (spatial soft-argmax, Finn et al. 2016),
+    It returns three things of every view: where soft key-points are (spatial soft-argmax, Finn et al. 2016),
     what the features look like there, and a coarse grid of features. What some key-points look for, and
-    where, may hang on what the encoder is told beside the pictures, such as the instruction: where many
-    things lie about, they find the one that is spoken of. The features themselves hang on it then, too.
+    where, may depend on a conditioning vector, such as the encoded instruction: where many things lie about,
+    they find the one that it names. The features themselves then depend on it, too.
 
     Args:
         spec: what the world shows.
@@ -57,11 +57,13 @@ class MultiViewEncoder(nn.Module):
         blocks: residual blocks at the lowest resolution.
         grid: rows and columns of the coarse grid.
         cameras: which are looked through (Embodiment.views_of); the others cost nothing.
-        asked: key-points per view that look for what the encoder is told, beside `points`.
-        told: numbers that it is told, of `asked` key-points.
+        instruction_keypoints: key-points per view that look for what the conditioning vector names, beside
+            `points`.
+        cond_dim: size of the conditioning vector, of which `instruction_keypoints` key-points are made.
 
-    Forward takes uint8, or float in -1..1, [B, V, 3 * pictures, H, W] of all cameras, and with `asked`
-    key-points float32 [B, told]; it returns float32 [B, out_features].
+    Forward takes uint8, or float in -1..1, [B, V, 3 * pictures, H, W] of all cameras, and, with
+    `instruction_keypoints`, the conditioning vector float32 [B, cond_dim]; it returns float32
+    [B, out_features].
     """
 
     def __init__(
@@ -73,8 +75,8 @@ class MultiViewEncoder(nn.Module):
         blocks: int = 1,
         grid: int = 4,
         cameras: str | Sequence[str] = "all",
-        asked: int = 0,
-        told: int = 0,
+        instruction_keypoints: int = 0,
+        cond_dim: int = 0,
     ):
         super().__init__()
         self.chosen = list(spec.embodiment.views_of(cameras))
@@ -87,27 +89,33 @@ class MultiViewEncoder(nn.Module):
         self.view = nn.Parameter(0.02 * torch.randn(views, width))
         self.norm = nn.GroupNorm(8, width)
         self.down = nn.Conv2d(width, deep, 3, stride=2, padding=1)
-        self.blocks = nn.ModuleList(ResidualBlock(deep, told if asked else 0) for _ in range(blocks))
+        self.blocks = nn.ModuleList(
+            ResidualBlock(deep, cond_dim if instruction_keypoints else 0) for _ in range(blocks)
+        )
         self.norm_out = nn.GroupNorm(8, deep)
         self.fine = nn.Conv2d(width, width, 1)
         self.lift = nn.Conv2d(deep, width, 1)
         self.heat = nn.Parameter(torch.randn(views, points, width) / width**0.5)
         # Sharp from the start: over a near-uniform softmax, key-points sit in the middle and hardly learn.
         self.temperature = nn.Parameter(torch.full((views, points, 1), 2.3))
-        self.look = nn.Parameter(torch.randn(views, points + asked, width, _LOOK) / width**0.5)
-        self.asked = Asked(views, asked, width, told) if asked else None
+        self.look = nn.Parameter(
+            torch.randn(views, points + instruction_keypoints, width, _LOOK) / width**0.5
+        )
+        self.queried = (
+            QueriedKeypoints(views, instruction_keypoints, width, cond_dim) if instruction_keypoints else None
+        )
         # Pooled before it is convolved, which is the same and sixteen times cheaper.
         self.grid = nn.Sequential(
             nn.AdaptiveAvgPool2d(grid), nn.Conv2d(deep, width, 1), nn.SiLU(), nn.Flatten()
         )
-        self.out_features = views * ((points + asked) * (2 + _LOOK) + width * grid * grid)
+        self.out_features = views * ((points + instruction_keypoints) * (2 + _LOOK) + width * grid * grid)
 
-    def forward(self, pictures: Tensor, told: Tensor | None = None) -> Tensor:
-        return self.gaze(pictures, told)[0]
+    def forward(self, pictures: Tensor, cond: Tensor | None = None) -> Tensor:
+        return self.gaze(pictures, cond)[0]
 
-    def gaze(self, pictures: Tensor, told: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def gaze(self, pictures: Tensor, cond: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """What `forward` returns, and how well every pixel fits what each key-point looks for: logits float32
-        [B, views looked through, points + asked, h, w] at the encoder's finest resolution.
+        [B, views looked through, points + instruction_keypoints, h, w] at the encoder's finest resolution.
         """
         pictures = pictures[:, self.chosen]
         batch, views = pictures.shape[:2]
@@ -115,7 +123,7 @@ class MultiViewEncoder(nn.Module):
         x = self.halve(self.stem(flat))
         x = F.silu(self.norm(x + self.view.repeat(batch, 1)[:, :, None, None]))
         y = self.down(x)
-        of_views = None if told is None else told.repeat_interleave(views, 0)
+        of_views = None if cond is None else cond.repeat_interleave(views, 0)
         for block in self.blocks:
             y = block(y, of_views)
         y = F.silu(self.norm_out(y))
@@ -124,42 +132,42 @@ class MultiViewEncoder(nn.Module):
         height, width = x.shape[-2:]
         places = x.flatten(2).unflatten(0, (batch, views)).float()  # [B, V, C, H * W]
         found = (self.heat @ places) * self.temperature.exp()  # [B, V, P, H * W]
-        if self.asked is not None:
-            found = torch.cat((found, self.asked(places, told, (height, width))), 2)
+        if self.queried is not None:
+            found = torch.cat((found, self.queried(places, cond, (height, width))), 2)
         share = found.softmax(-1)
         looks = torch.einsum("bvpc,vpcl->bvpl", share @ places.transpose(-1, -2), self.look)
-        said = (
+        features = (
             centres(share.unflatten(-1, (height, width))).flatten(1),
             looks.flatten(1),
             self.grid(y).float().unflatten(0, (batch, views)).flatten(1),
         )
-        return torch.cat(said, -1), found.unflatten(-1, (height, width))
+        return torch.cat(features, -1), found.unflatten(-1, (height, width))
 
 
-class Asked(nn.Module):
-    """Key-points that look for what they are told, by what things look like and by where they are.
+class QueriedKeypoints(nn.Module):
+    """Key-points whose queries, of features and of positions, are made of a conditioning vector.
 
     Args:
-        views: cameras; each is asked otherwise.
+        views: cameras; each has queries of its own.
         points: key-points per view.
         width: channels of the features.
-        told: numbers that say what to look for.
+        cond_dim: size of the conditioning vector.
 
-    Forward takes features float [B, V, width, H * W], what is told [B, told] and (H, W), and returns how well
+    Forward takes features float [B, V, width, H * W], `cond` [B, cond_dim] and (H, W), and returns how well
     every pixel fits, [B, V, points, H * W].
     """
 
-    def __init__(self, views: int, points: int, width: int, told: int):
+    def __init__(self, views: int, points: int, width: int, cond_dim: int):
         super().__init__()
         self.views, self.points, keys = views, points, width + 4 * _WAVES
-        self.ask = nn.Sequential(
-            nn.Linear(told, _ASKING), nn.SiLU(), nn.Linear(_ASKING, views * points * keys)
+        self.query = nn.Sequential(
+            nn.Linear(cond_dim, _QUERY), nn.SiLU(), nn.Linear(_QUERY, views * points * keys)
         )
         self.temperature = nn.Parameter(torch.full((points, 1), 1.0 - 0.5 * math.log(keys)))
 
-    def forward(self, places: Tensor, told: Tensor | None, size: tuple[int, int]) -> Tensor:
-        assert told is not None
-        sought = self.ask(told).unflatten(-1, (self.views, self.points, -1))
+    def forward(self, places: Tensor, cond: Tensor | None, size: tuple[int, int]) -> Tensor:
+        assert cond is not None
+        sought = self.query(cond).unflatten(-1, (self.views, self.points, -1))
         features, where = sought.split((places.shape[2], 4 * _WAVES), -1)
         return (features @ places + where @ waves(size, places.device)) * self.temperature.exp()
 

@@ -100,13 +100,13 @@ class Plan:
             ]
             if not fits:
                 total = {key: sum(node.get(key, 0.0) for node in nodes) for key in ("CPU", "GPU")}
-                asked = {key: sum(bundle[key] for bundle in self.bundles()) for key in ("CPU", "GPU")}
+                requested = {key: sum(bundle[key] for bundle in self.bundles()) for key in ("CPU", "GPU")}
                 where = f"launch.place.{role}" + (
                     f" (process {number + 1} of {self.counts[role]})" if self.counts[role] > 1 else ""
                 )
                 raise ConfigError(
                     f"{where} needs {_say(need)}, which no node has left: all roles together ask for"
-                    f" {_say(asked)}, the {len(nodes)} node(s) have {_say(total)}. "
+                    f" {_say(requested)}, the {len(nodes)} node(s) have {_say(total)}. "
                     "Lower launch.actors or the shares in launch.place, or add nodes"
                 )
             # Collocated fills the fullest node first, the others the emptiest.
@@ -193,31 +193,33 @@ def _our_sigterm() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before, (told, tell) = signal.getsignal(signal.SIGTERM), os.pipe()
-    for end in (told, tell):
+    before, (listen, wake) = signal.getsignal(signal.SIGTERM), os.pipe()
+    for end in (listen, wake):
         os.set_blocking(end, False)
-    listening = signal.set_wakeup_fd(tell, warn_on_full_buffer=False)  # told of signals, whoever handles them
+    listening = signal.set_wakeup_fd(
+        wake, warn_on_full_buffer=False
+    )  # it gets every signal, whoever handles it
 
-    def asked() -> bool:
+    def terminated() -> bool:
         try:
-            return signal.SIGTERM in os.read(told, 4096)
+            return signal.SIGTERM in os.read(listen, 4096)
         except BlockingIOError:  # none came
             return False
 
     try:
         yield
     except (SystemExit, Exception) as error:
-        if asked():
+        if terminated():
             raise SystemExit(128 + signal.SIGTERM) from error
         raise
     else:
-        if asked():
+        if terminated():
             raise SystemExit(128 + signal.SIGTERM)
     finally:
         signal.set_wakeup_fd(listening)
         signal.signal(signal.SIGTERM, before)
-        os.close(told)
-        os.close(tell)
+        os.close(listen)
+        os.close(wake)
 
 
 def _knock(address: str) -> None:

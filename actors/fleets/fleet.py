@@ -45,13 +45,13 @@ class Result:
 
 @dataclass
 class EpisodeLedger:
-    """Episodes and why they were lost; `asked == learned + sum(dropped.values())` once a run has ended.
+    """Episodes and why they were lost; `requested == learned + sum(dropped.values())` once a run has ended.
 
     Episodes of a job that is run again after its host died count in `rerun`: they were begun, nobody learned
     from them, and the same episodes came later.
     """
 
-    asked: int = 0
+    requested: int = 0
     learned: int = 0
     dropped: dict[str, int] = field(default_factory=dict)
     rerun: int = 0

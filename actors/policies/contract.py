@@ -15,8 +15,8 @@ Whatever else a policy has is used if it is there:
 - `normalise(chunks [N, K, A], states [N, S], commands in force [N, A])`: takes units from demonstrations;
 - `policy_features(observed)` [B, width] and `width`: through them perception is taught on all recorded
   frames;
-- `gaze(observed)`, those features and what key-points look for (vla.py), `asked` and `views`: the last
-  `asked` key-points are taught where hands go;
+- `gaze(observed)`, those features and what key-points look for (vla.py), `instruction_keypoints` and
+  `views`: the last `instruction_keypoints` key-points are taught where hands go;
 - `imitation_loss(observed, chunks [B, K, A])`: a better one than the negative log-likelihood.
 """
 

@@ -26,12 +26,12 @@ from envs.specs import CHUNK, IMAGE, INSTRUCTION_UTF8, LOG_PROB, WorldSpec
 from envs.targets import build
 
 _TEXT_FEATURES = 32
-_WORDS = 64  # numbers of the instruction that say what key-points shall look for
-_BLOCKS = 2  # residual blocks of an encoder whose features hang on what it is told
+_WORDS = 64  # of the conditioning vector, the part that encodes the instruction
+_BLOCKS = 2  # residual blocks of a conditioned encoder
 
 
 class Query(nn.Module):
-    """What key-points are asked to look for: the instruction and proprioception, as numbers.
+    """The conditioning vector of the encoder, from instruction and proprioception.
 
     Args:
         robot: whose.
@@ -54,13 +54,12 @@ class Query(nn.Module):
 
 
 class Perception(nn.Module):
-    """Encodes pictures and the instruction; key-points that are asked look where instruction and
-    proprioception say.
+    """Encodes pictures and the instruction; some key-points look where instruction and proprioception say.
 
     Args:
         spec: what the world shows.
-        points, width, cameras, asked: of MultiViewEncoder.
-        command: see proprioception_keys; no proprioception is read without `asked` key-points.
+        points, width, cameras, instruction_keypoints: of MultiViewEncoder.
+        command: see proprioception_keys; without `instruction_keypoints` no proprioception is read.
     """
 
     def __init__(
@@ -69,16 +68,22 @@ class Perception(nn.Module):
         points: int,
         width: int,
         cameras: str | Sequence[str],
-        asked: int,
+        instruction_keypoints: int,
         command: bool,
     ):
         super().__init__()
-        told, blocks = (Query.size, _BLOCKS) if asked else (0, 1)
+        cond_dim, blocks = (Query.size, _BLOCKS) if instruction_keypoints else (0, 1)
         self.views = MultiViewEncoder(
-            spec, points, width, blocks=blocks, cameras=cameras, asked=asked, told=told
+            spec,
+            points,
+            width,
+            blocks=blocks,
+            cameras=cameras,
+            instruction_keypoints=instruction_keypoints,
+            cond_dim=cond_dim,
         )
         self.text = TextEncoder(_TEXT_FEATURES)
-        self.query = Query(spec.embodiment, command) if asked else None
+        self.query = Query(spec.embodiment, command) if instruction_keypoints else None
         self.out_features = self.views.out_features + _TEXT_FEATURES
         further = self.query.proprioception.keys if self.query is not None else ()
         self.in_keys = [IMAGE, INSTRUCTION_UTF8, *further]
@@ -92,8 +97,8 @@ class Perception(nn.Module):
 
     def gaze(self, image: Tensor, text: Tensor, *values: Tensor) -> tuple[Tensor, Tensor]:
         """Features of observations [B], and what each key-point looks for, as MultiViewEncoder.gaze."""
-        told = None if self.query is None else self.query(text, *values)
-        seen, found = self.views.gaze(image, told)
+        cond = None if self.query is None else self.query(text, *values)
+        seen, found = self.views.gaze(image, cond)
         return torch.cat((seen, self.text(text)), -1), found
 
 
@@ -130,7 +135,8 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         width: of the hidden vector.
         points, channels: key-points per view and width of the encoder.
         cameras: which it looks through: "all", "main", or names.
-        asked: key-points per view that look for what the instruction says, with an encoder that is told it.
+        instruction_keypoints: key-points per view that look for what the instruction names; the encoder is
+            then conditioned on instruction and proprioception.
         command: whether the command in force is read, of robots whose commands say places.
 
     Reads image, the instruction's bytes, state and, if asked to, the command in force; writes
@@ -149,10 +155,10 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         points: Count,
         channels: Count,
         cameras: str | Sequence[str],
-        asked: Natural,
+        instruction_keypoints: Natural,
         command: bool,
     ):
-        eyes = Perception(spec, points, channels, cameras, asked, command)
+        eyes = Perception(spec, points, channels, cameras, instruction_keypoints, command)
         perception = TensorDictModule(eyes, in_keys=eyes.in_keys, out_keys=[VISUAL_FEATURES])
         fusion = TensorDictModule(
             Fusion(eyes.out_features, spec.embodiment, command, width),
@@ -160,10 +166,10 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
             out_keys=[POLICY_FEATURES],
         )
         action_head: Head = build(head, "policy.head", width=width, chunk=spec.chunk, actions=spec.action_dim)
-        says = (action_head.chunk, action_head.actions)
-        if says != (spec.chunk, spec.action_dim):
+        size = (action_head.chunk, action_head.actions)
+        if size != (spec.chunk, spec.action_dim):
             raise ValueError(
-                f"policy.head says chunks of {says[0]} x {says[1]} numbers, but {spec.embodiment.robot} takes"
+                f"policy.head says chunks of {size[0]} x {size[1]} numbers, but {spec.embodiment.robot} takes"
                 f" {spec.chunk} x {spec.action_dim}; a head must use the chunk and actions that it is given"
             )
         parameters = TensorDictModule(
@@ -216,9 +222,10 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         return self.fusion(seen, *(observed[key] for key in self.fusion.proprioception.keys))
 
     @property
-    def asked(self) -> int:
-        """Key-points per view, the last ones, that look for what perception is told."""
-        return self.perception.views.asked.points if self.perception.views.asked is not None else 0
+    def instruction_keypoints(self) -> int:
+        """Key-points per view, the last ones, that look for what the instruction names."""
+        queried = self.perception.views.queried
+        return queried.points if queried is not None else 0
 
     @property
     def views(self) -> list[int]:

@@ -206,16 +206,16 @@ class Server:
         session = self._session(request, meta)
         actions = floats(values, shape_in(meta, "action_shape", "L,A"), "actions")
         async with session.lock:
-            asked = meta.get("chunk")
+            requested = meta.get("chunk")
             if (
-                asked is not None
+                requested is not None
                 and session.reply is not None
-                and asked == session.reply[0]
+                and requested == session.reply[0]
                 and body == session.reply[1]
             ):
                 return web.Response(body=session.reply[2], content_type="application/octet-stream")
-            if asked is not None and asked != session.chunk:
-                raise ProtocolError(f"chunk {asked} was asked for, this session is at {session.chunk}")
+            if requested is not None and requested != session.chunk:
+                raise ProtocolError(f"chunk {requested} was requested, this session is at {session.chunk}")
             frames, states = await self.host.step(session, actions)
             answer, session.preview = await asyncio.to_thread(_answer, frames, states)
             session.reply = (session.chunk - 1, body, answer)

@@ -76,15 +76,15 @@ def next_chunk(session: Session, commands: Tensor, spec: WorldSpec) -> TensorDic
     The last command is repeated up to a chunk; of pose maps and cameras it is the part of the trajectory that
     belongs to the chunk.
     """
-    asked, chunk = len(commands), spec.chunk
-    last = commands[-1:].expand(chunk - asked, -1)
+    commanded, chunk = len(commands), spec.chunk
+    last = commands[-1:].expand(chunk - commanded, -1)
     future = {"commands": torch.cat([commands, last])[None]}
     if needs_cameras(spec):
         assert session.traj is not None and session.c2w is not None
         # a whole recording, or all of what was sent for this step
         total = len(session.traj)
         begin = session.chunk * chunk if total >= 2 * chunk else 0
-        rows = np.minimum(np.minimum(np.arange(begin, begin + chunk), begin + asked - 1), total - 1)
+        rows = np.minimum(np.minimum(np.arange(begin, begin + chunk), begin + commanded - 1), total - 1)
         future["c2w"] = torch.from_numpy(session.c2w[rows])[None]
         if spec.pose_map:
             future["pose_map"] = torch.from_numpy(session.traj[rows])[None]

@@ -247,15 +247,17 @@ class SessionHost:
             self.passes, self.steps = self.passes + 1, self.steps + len(jobs)
             out = []
             for row, job in enumerate(jobs):
-                asked = len(job.commands)
+                commanded = len(job.commands)
                 mine = state[row : row + 1].clone()
                 # what was generated beyond the actions did not happen
-                mine["length"] = mine["length"] - (chunk - asked)
+                mine["length"] = mine["length"] - (chunk - commanded)
                 job.session.state = mine
                 job.session.chunk += 1
-                job.session.frames += asked
-                shown = frames[row, :asked].cpu().numpy()
-                out.append((shown, None if decoded is None else decoded[row, :asked].float().cpu().numpy()))
+                job.session.frames += commanded
+                shown = frames[row, :commanded].cpu().numpy()
+                out.append(
+                    (shown, None if decoded is None else decoded[row, :commanded].float().cpu().numpy())
+                )
             return out
 
     def _begin(self, session: Session, future: TensorDict) -> TensorDict:

@@ -31,7 +31,7 @@ class LearnedJudge(FrameJudge):
         width: channels of the encoder at half resolution.
         points: soft key-points of the encoder.
         hidden: width of the last layers.
-        asked: key-points per view that look for what the instruction says.
+        instruction_keypoints: key-points per view that look for what the instruction says.
     """
 
     def __init__(
@@ -44,14 +44,20 @@ class LearnedJudge(FrameJudge):
         points: Count,
         hidden: Count,
         cameras: str | Sequence[str],
-        asked: Natural,
+        instruction_keypoints: Natural,
     ):
         super().__init__(hold, margin, discount)
         self.spec = spec
         self.encoder = MultiViewEncoder(
-            spec, points, width, pictures=2, cameras=cameras, asked=asked, told=_TEXT
+            spec,
+            points,
+            width,
+            pictures=2,
+            cameras=cameras,
+            instruction_keypoints=instruction_keypoints,
+            cond_dim=_TEXT,
         )
-        self.asked = asked
+        self.instruction_keypoints = instruction_keypoints
         self.words = TextEncoder(_TEXT)
         self.head = nn.Sequential(
             nn.Linear(self.encoder.out_features + _TEXT, hidden),
@@ -67,6 +73,6 @@ class LearnedJudge(FrameJudge):
         bytes_alone = frames.dtype == first.dtype == torch.uint8  # the encoder converts what it looks at
         both = (frames, first) if bytes_alone else (to_signed(frames), to_signed(first))
         words = self.words(data["text"])
-        seen = self.encoder(torch.cat(both, 2), words if self.asked else None)
+        seen = self.encoder(torch.cat(both, 2), words if self.instruction_keypoints else None)
         logits: Tensor = self.head(torch.cat((seen, words), -1))
         return logits.float()

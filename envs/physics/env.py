@@ -127,9 +127,9 @@ class PhysicsEnv(ChunkedEnv):
                     " spec from this suite's embodiment, with task.size equal to task.suite.size"
                 )
 
-    def _take(self, observed: dict[int, dict[str, Any]], asked: Sequence[int]) -> None:
-        """Keep what the pool says of the slots that it was `asked` for."""
-        for slot in asked:
+    def _take(self, observed: dict[int, dict[str, Any]], slots: Sequence[int]) -> None:
+        """Keep what the pool says of these slots."""
+        for slot in slots:
             self._lost[slot] = slot not in observed
         for slot, values in observed.items():
             track = values.pop("track", None)

@@ -162,10 +162,10 @@ class TaskPool:
             shares.setdefault(self.owner[slot], {})[self.local[slot]] = item
         for index, share in shares.items():
             self._remotes[index].send(name, share, *extra)
-        count, asked = len(self._remotes), list(shares)
+        count, indices = len(self._remotes), list(shares)
         out = {}
-        for number, index in enumerate(asked):
-            others = [self._remotes[other] for other in asked[number + 1 :]]
+        for number, index in enumerate(indices):
+            others = [self._remotes[other] for other in indices[number + 1 :]]
             for local, value in self._answer(self._remotes[index], others).items():
                 out[local * count + index] = value
         return out

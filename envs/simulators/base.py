@@ -45,14 +45,14 @@ class Simulator(nn.Module):
         hidden: names of the layers that optimisers may take for hidden ones (training/optimisers.py);
             none for all.
         recent_memory: whether memory is the newest frames instead of some that are spread over the past.
-        told_in_steps: whether absolute commands are told as moves since the frame before, instead of since
+        per_frame_moves: whether absolute commands are told as moves since the frame before, instead of since
             the chunk began.
     """
 
     feature_shape: tuple[int, ...]
     hidden: tuple[str, ...] = ()
     recent_memory: bool = False
-    told_in_steps: bool = False
+    per_frame_moves: bool = False
 
     def __init__(self, spec: WorldSpec, memory_frames: int):
         super().__init__()
@@ -129,7 +129,7 @@ class Simulator(nn.Module):
         Args:
             commands: [N, A].
             moves: [N, A], changes of absolute commands within a chunk, or from frame to frame where the
-                engine is told_in_steps; zeros of delta actions.
+                engine is per_frame_moves; zeros of delta actions.
             states: [N, S].
         """
 

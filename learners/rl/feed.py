@@ -76,7 +76,7 @@ class Feed:
         return iteration
 
     def _submit(self, job: Job) -> None:
-        self.fleet.ledger.asked += self.fleet.episodes
+        self.fleet.ledger.requested += self.fleet.episodes
         self.fleet.submit(job)
 
     def _take(self) -> Result:
@@ -96,9 +96,9 @@ class Feed:
             FleetError: with the ledger, and the `last` cause.
         """
         ledger = self.fleet.ledger
-        if ledger.lost > self.max_dropped * max(ledger.asked, 20 * self.fleet.episodes):
+        if ledger.lost > self.max_dropped * max(ledger.requested, 20 * self.fleet.episodes):
             raise FleetError(
-                f"{ledger.lost} of {ledger.asked} episodes were lost ({ledger.dropped}), more than"
+                f"{ledger.lost} of {ledger.requested} episodes were lost ({ledger.dropped}), more than"
                 f" rl.max_dropped={self.max_dropped}; the last: {last}"
             )
 

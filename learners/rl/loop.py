@@ -101,7 +101,7 @@ def train_rl(
         figures = facts["last"]
         alarms = Alarms(**facts["alarms"])
         ledger = EpisodeLedger(**facts["ledger"])
-        ledger.drop("learner died", ledger.asked - ledger.learned - sum(ledger.dropped.values()))
+        ledger.drop("learner died", ledger.requested - ledger.learned - sum(ledger.dropped.values()))
         over = facts["over"]
     if leads():
         truncate_log(log, first)
@@ -149,7 +149,7 @@ def train_rl(
     with (
         (log if leads() else nowhere).open("a") as rows,
         (learned if leads() else nowhere).open("a") as jobs,
-        deferred_signals() as asked,
+        deferred_signals() as stop_requested,
     ):
         for iteration in range(first, first if over else config.iterations):
             began = time.perf_counter()
@@ -205,7 +205,7 @@ def train_rl(
                     f" {config.iterations - first - 1} more iterations"
                 )
             over = enough or iteration + 1 == config.iterations
-            stop = from_leader(asked)
+            stop = from_leader(stop_requested)
             if (iteration + 1) % config.checkpoint_every == 0 or over or stop:
                 save(iteration + 1)
             if stop:
@@ -220,7 +220,7 @@ def train_rl(
     bar.close()
     trainee.release()
     # What was submitted ahead and never learned from is no loss, but it was asked for.
-    ledger.drop("unused", ledger.asked - ledger.learned - sum(ledger.dropped.values()))
+    ledger.drop("unused", ledger.requested - ledger.learned - sum(ledger.dropped.values()))
     return {
         **{f"{k}_seconds": v for k, v in spent.items()},
         "episodes": episodes,

@@ -88,9 +88,9 @@ def _loss(
     loss = config.imagined * loss
     if known is not None:  # by itself, for its likelihood ratios do not say how far the policy has come
         pick = torch.randint(len(known), (len(minibatch),), generator=generator)
-        beside, told = algorithm.loss(known[pick])
-        loss = loss + beside
-        row["recorded_clip_fraction"] = told.get("clip_fraction", 0.0)
+        recorded_loss, recorded_figures = algorithm.loss(known[pick])
+        loss = loss + recorded_loss
+        row["recorded_clip_fraction"] = recorded_figures.get("clip_fraction", 0.0)
     if true is not None and true.anchor is not None and config.anchor:
         drawn = true.anchor.sample(config.anchor_batch // config.microbatches, generator)
         pull = true.anchor.loss(drawn, generator)

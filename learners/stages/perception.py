@@ -68,25 +68,25 @@ class PerceptionTasks(nn.Module):
             progress: [B] discounted time to success, 0 in episodes that failed, NaN where nobody labelled.
             hands: of Hands.ahead, of a policy that can `gaze`.
         """
-        said: dict[str, Tensor] = {}
+        figures: dict[str, Tensor] = {}
         if hands is None:
             hidden = self.policy.policy_features(observed)  # type: ignore[operator]
         else:
             hidden, found = self.policy.gaze(observed)  # type: ignore[operator]
-            said["traces"] = trace_loss(found[:, :, -self.policy.asked :], hands)  # type: ignore[operator]
+            figures["traces"] = trace_loss(found[:, :, -self.policy.instruction_keypoints :], hands)  # type: ignore[operator]
         known = torch.isfinite(progress)
         won = (torch.nan_to_num(progress) > 0).float() - 0.5
-        told = hidden + self.outcome(torch.where(known, won, 0.0)[:, None])
-        guess = self.acted(F.silu(told)).unflatten(-1, tuple(self.centre.shape))
+        conditioned = hidden + self.outcome(torch.where(known, won, 0.0)[:, None])
+        guess = self.acted(F.silu(conditioned)).unflatten(-1, tuple(self.centre.shape))
         active = self.spread > _SPREAD
         wanted = (chunks - self.centre) / self.spread.clamp(min=_SPREAD)
         acted = ((guess - wanted).abs() * active).sum() / (active.sum().clamp(min=1) * len(chunks))
         logits = self.soon(hidden)[:, 0].float()
         soon = F.binary_cross_entropy_with_logits(logits, torch.nan_to_num(progress), reduction="none")
         soon = (soon * known).sum() / known.sum().clamp(min=1)
-        total = acted + soon + _TRACES * said.get("traces", 0.0)
-        said |= {"action_error": acted, "time_to_success": soon}
-        return total, {name: value.detach() for name, value in said.items()}
+        total = acted + soon + _TRACES * figures.get("traces", 0.0)
+        figures |= {"action_error": acted, "time_to_success": soon}
+        return total, {name: value.detach() for name, value in figures.items()}
 
 
 def train_perception(
@@ -105,7 +105,7 @@ def train_perception(
     Args:
         episodes: all that may be learned from, whoever acted, int64 [N].
         discount: of the time to success, per frame.
-        hands: by which key-points that are told what to look for learn where hands will be.
+        hands: from which instruction key-points learn where hands will be.
         fresh: whether the policy has no units yet; it then takes them from these chunks first.
     """
     if not hasattr(policy, "policy_features") or not options.steps:
@@ -120,8 +120,8 @@ def train_perception(
     tasks.to(next(policy.parameters()).device)
     tasks.normalise(frames.targets)
 
-    asked: int = getattr(policy, "asked", 0)  # type: ignore[assignment]
-    traces = hands.ahead(store, frames.rows, policy.views) if asked else None  # type: ignore[arg-type]
+    keypoints: int = getattr(policy, "instruction_keypoints", 0)  # type: ignore[assignment]
+    traces = hands.ahead(store, frames.rows, policy.views) if keypoints else None  # type: ignore[arg-type]
 
     def batch(step: int, generator: torch.Generator) -> TensorDict:
         pick = torch.randint(len(frames.rows), (options.part,), generator=generator)

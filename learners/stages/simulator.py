@@ -80,7 +80,7 @@ def train_simulator(
             " nothing to learn from them (GE-Sim 2.0's bundles are such: they say where a rollout begins)"
         )
     if fresh:
-        simulator.normalise(*units(store, episodes, 1 if simulator.told_in_steps else store.spec.chunk))
+        simulator.normalise(*units(store, episodes, 1 if simulator.per_frame_moves else store.spec.chunk))
         order = torch.randperm(len(episodes), generator=step_generator(options.seed, options.steps))
         simulator.fit_camera_statistics(store.frames(store.start[episodes[order[:_FIRST_FRAMES]]]))
 

@@ -173,7 +173,7 @@ def fit(
     steps = range(first, config.steps)
     with (
         (log if leads() else Path(os.devnull)).open("a") as stream,
-        deferred_signals() as asked_to_leave,
+        deferred_signals() as stop_requested,
         BatchesAhead(batch, config.seed, steps, mine, device) as batches,
     ):
         for step in steps:
@@ -184,9 +184,9 @@ def fit(
                 optimiser.zero_grad(set_to_none=True)
             rows = []
             for _ in mine:
-                asked = time.perf_counter()
+                waiting_since = time.perf_counter()
                 data, generator = batches.take()
-                waited += time.perf_counter() - asked
+                waited += time.perf_counter() - waiting_since
                 with mixed_precision(device, config.bf16):
                     value, more = trainee(loss, data, generator)
                 (value / len(mine)).backward()
@@ -219,7 +219,7 @@ def fit(
             if step - first == 2 and leads():
                 _announce(name, config.steps - step - 1, took)
             bar.set_postfix_str(f"{watch} {figures.get(watch, smooth):.4g}", refresh=False)
-            stop = from_leader(asked_to_leave)
+            stop = from_leader(stop_requested)
             due = (step + 1) % config.checkpoint_every == 0 or step + 1 == config.steps
             if stop or due:
                 stream.flush()

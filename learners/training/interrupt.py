@@ -24,12 +24,12 @@ def clean_ending() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    asked = 0
+    received = 0
     before: dict[int, Any] = {number: signal.getsignal(number) for number in _SIGNALS}
 
     def end(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        asked = number
+        nonlocal received
+        received = number
         signal.signal(number, signal.SIG_DFL if number == signal.SIGTERM else before[number])
         leave(number)
 
@@ -39,8 +39,8 @@ def clean_ending() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if asked:
-            leave(asked, error)
+        if received:
+            leave(received, error)
         raise
     finally:
         for number, handler in before.items():
@@ -55,7 +55,7 @@ def deferred_signals() -> Iterator[Callable[[], int]]:
 
     Outside the main thread, where Python handles no signals, it changes nothing.
     """
-    asked = 0
+    received = 0
     if threading.current_thread() is not threading.main_thread():
         yield lambda: 0
         return
@@ -66,18 +66,18 @@ def deferred_signals() -> Iterator[Callable[[], int]]:
             signal.signal(number, handler)
 
     def note(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        asked = number
+        nonlocal received
+        received = number
         restore()
 
     for number in _SIGNALS:
         signal.signal(number, note)
     try:
-        yield lambda: asked
+        yield lambda: received
     finally:
         restore()
-    if asked:
-        leave(asked)
+    if received:
+        leave(received)
 
 
 def leave(number: int, cause: Exception | None = None) -> NoReturn:

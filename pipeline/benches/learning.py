@@ -47,7 +47,14 @@ def build(seed: int, envs: int) -> tuple[ChunkPolicy, LocalFleet]:
     env = ToyTrackingEnv(envs, seed=seed)
     head = {"_target_": "actors.policies.chunk_tokens.ChunkTokenHead", "bins": 64}
     policy = ChunkPolicy(
-        env.spec, head, width=128, points=8, channels=16, cameras="all", asked=0, command=False
+        env.spec,
+        head,
+        width=128,
+        points=8,
+        channels=16,
+        cameras="all",
+        instruction_keypoints=0,
+        command=False,
     )
     return policy, LocalFleet(Host(env, policy, bootstrap=False))
 

@@ -145,7 +145,7 @@ def _check(folder: Path, before: set[str]) -> dict[str, Any]:
     steps = [row["step"] for row in rows]
     jobs = [job for row in rows for job in row["jobs"]]
     versions = [max(row["versions"]) for row in rows]
-    under_way = ledger.asked - ledger.learned - sum(ledger.dropped.values())
+    under_way = ledger.requested - ledger.learned - sum(ledger.dropped.values())
     events = (
         [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
         if (folder / "events.jsonl").exists()
@@ -163,7 +163,7 @@ def _check(folder: Path, before: set[str]) -> dict[str, Any]:
         )
     if under_way < 0:
         wrong.append(
-            f"{ledger.asked} episodes asked are fewer than {ledger.learned} learned and"
+            f"{ledger.requested} requested episodes are fewer than {ledger.learned} learned and"
             f" {ledger.dropped} dropped"
         )
     if any(later < sooner for sooner, later in itertools.pairwise(versions)):
@@ -183,7 +183,7 @@ def _check(folder: Path, before: set[str]) -> dict[str, Any]:
     kinds = [event["event"] for event in events]
     return {
         "iterations": saved["iteration"],
-        "asked": ledger.asked,
+        "requested": ledger.requested,
         "learned": ledger.learned,
         "dropped": dict(ledger.dropped),
         "under_way_at_the_end": under_way,

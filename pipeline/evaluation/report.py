@@ -143,7 +143,7 @@ def _hosts(inputs: Inputs) -> list[list[str]]:
             continue
         ledger = finished[name]["result"]["ledger"]
         dropped = ", ".join(f"{count} {reason}" for reason, count in ledger["dropped"].items()) or "none"
-        cells = [name.replace("rl-", "round "), str(ledger["asked"]), str(ledger["learned"]), dropped]
+        cells = [name.replace("rl-", "round "), str(ledger["requested"]), str(ledger["learned"]), dropped]
         for figure, factor, form in _HOSTS:
             values = [row[f"rl/{figure}"] for row in rows if f"rl/{figure}" in row]
             cells.append(form.format(factor * sum(values) / len(values)) if values else "-")

@@ -89,7 +89,7 @@ def test_rollouts_and_learned_weights_are_the_same_bits_for_any_number_of_actors
         finally:
             fleet.close()
         assert all(torch.equal(value, learned[name]) for name, value in weights.items())
-        assert stats["ledger"]["learned"] == stats["ledger"]["asked"] == 32
+        assert stats["ledger"]["learned"] == stats["ledger"]["requested"] == 32
 
 
 def test_hosts_get_a_core_as_soon_as_the_learner_does(cluster: None) -> None:
@@ -140,7 +140,7 @@ def test_async_keeps_lag_bounded_and_books_balanced(cluster: None, recipe: Recip
         fleet.close()
     ledger = stats["ledger"]
     assert ledger["learned"] == 4 * 16
-    assert ledger["asked"] == ledger["learned"] + sum(ledger["dropped"].values())
+    assert ledger["requested"] == ledger["learned"] + sum(ledger["dropped"].values())
     assert stats["last"]["policy_lag_max"] <= 1
 
 

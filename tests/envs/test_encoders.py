@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from envs.embodiment import Embodiment
-from envs.encoders import Asked, MultiViewEncoder, centres, to_signed
+from envs.encoders import MultiViewEncoder, QueriedKeypoints, centres, to_signed
 from envs.specs import IMAGE
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, EMBODIMENTS, observations, world_spec
 
@@ -37,9 +37,9 @@ def test_two_pictures_of_a_view_are_seen_as_one() -> None:
 def test_some_key_points_look_for_what_the_encoder_is_told() -> None:
     torch.manual_seed(0)
     spec = world_spec(ARM_DELTAS)
-    encoder = MultiViewEncoder(spec, points=4, width=8, asked=2, told=6)
-    pictures, told = torch.randn(2, spec.views, 3, 32, 32), torch.randn(2, 6)
-    out, other = encoder(pictures, told), encoder(pictures, torch.stack((told[0], told[0])))
+    encoder = MultiViewEncoder(spec, points=4, width=8, instruction_keypoints=2, cond_dim=6)
+    pictures, cond = torch.randn(2, spec.views, 3, 32, 32), torch.randn(2, 6)
+    out, other = encoder(pictures, cond), encoder(pictures, torch.stack((cond[0], cond[0])))
     assert out.shape == (2, encoder.out_features)
     assert torch.allclose(out[0], other[0]) and not torch.allclose(out[1], other[1])
     places = spec.views * 6 * 2  # of key-points stand first; those of the last two of each view hang on it
@@ -50,29 +50,29 @@ def test_some_key_points_look_for_what_the_encoder_is_told() -> None:
 def test_features_hang_on_what_the_encoder_is_told_once_it_has_learned_to() -> None:
     torch.manual_seed(0)
     spec = world_spec(ARM_DELTAS)
-    encoder = MultiViewEncoder(spec, points=4, width=8, asked=2, told=6)
-    pictures, told = torch.randn(2, spec.views, 3, 32, 32), torch.randn(2, 6)
-    encoder(pictures, told).square().sum().backward()
+    encoder = MultiViewEncoder(spec, points=4, width=8, instruction_keypoints=2, cond_dim=6)
+    pictures, cond = torch.randn(2, spec.views, 3, 32, 32), torch.randn(2, 6)
+    encoder(pictures, cond).square().sum().backward()
     film = encoder.blocks[0].film
     assert film is not None and film.weight.grad.abs().sum() > 0
     torch.nn.init.normal_(film.weight)
-    out, other = encoder(pictures, told), encoder(pictures, told.flip(0))
+    out, other = encoder(pictures, cond), encoder(pictures, cond.flip(0))
     grid = out.shape[1] - spec.views * 8 * 4 * 4  # stands last
     assert not torch.allclose(out[:, grid:], other[:, grid:])
 
 
 def test_asked_for_places_are_found_whatever_they_look_like() -> None:
     torch.manual_seed(0)
-    asked, told = Asked(views=1, points=1, width=8, told=3), torch.eye(3)
+    queried, cond = QueriedKeypoints(views=1, points=1, width=8, cond_dim=3), torch.eye(3)
     aims = torch.tensor([[0, 0], [5, 12], [14, 3]])  # rows and columns
-    optimiser = torch.optim.Adam(asked.parameters(), 0.02)
+    optimiser = torch.optim.Adam(queried.parameters(), 0.02)
     for _ in range(200):
-        found = asked(torch.rand(3, 1, 8, 16 * 16), told, (16, 16))[:, 0, 0]
+        found = queried(torch.rand(3, 1, 8, 16 * 16), cond, (16, 16))[:, 0, 0]
         loss = torch.nn.functional.cross_entropy(found, aims[:, 0] * 16 + aims[:, 1])
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    best = asked(torch.rand(3, 1, 8, 16 * 16), told, (16, 16))[:, 0, 0].argmax(-1)
+    best = queried(torch.rand(3, 1, 8, 16 * 16), cond, (16, 16))[:, 0, 0].argmax(-1)
     assert ((torch.stack((best // 16, best % 16), -1) - aims).abs() <= 1).all()
 
 

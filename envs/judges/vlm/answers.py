@@ -58,14 +58,14 @@ class Tally:
         return said is not None
 
     @property
-    def asked(self) -> int:
+    def votes(self) -> int:
         """Votes so far."""
         return self.yes + self.no + self.unusable + self.unanswered
 
     @property
     def missing(self) -> int:
         """Votes by which the leading answer may have its majority; 0 if it has, or if none can have one."""
-        short, left = self.count // 2 + 1 - max(self.yes, self.no), self.count - self.asked
+        short, left = self.count // 2 + 1 - max(self.yes, self.no), self.count - self.votes
         return short if 0 < short <= left else 0
 
     @property

@@ -169,8 +169,8 @@ class VLMJudge(Judge):
     async def _tally(self, question: Question) -> Tally:
         """The votes on a question: all if the threshold is to be set, else those that may decide."""
         tally = Tally(self.votes.count)
-        while more := tally.count - tally.asked if self.calibrates else tally.missing:
-            votes = range(tally.asked, tally.asked + more)
+        while more := tally.count - tally.votes if self.calibrates else tally.missing:
+            votes = range(tally.votes, tally.votes + more)
             for reply in await _all([self.asker.ask(question, vote) for vote in votes]):
                 usable = tally.add(reply)
                 if reply is not None:

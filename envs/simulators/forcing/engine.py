@@ -59,7 +59,7 @@ class ForcingSimulator(Blockwise):
     """
 
     recent_memory = True
-    told_in_steps = True
+    per_frame_moves = True
     hidden = ("attn", "ff")
 
     def __init__(

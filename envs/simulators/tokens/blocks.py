@@ -54,7 +54,7 @@ class Memory:
 
 
 class STBlock(nn.Module):
-    """Attention over the places of a frame, over the frames at a place, what is told, and feed-forward.
+    """Attention over the places of a frame, over the frames at a place, what is cond, and feed-forward.
 
     Args:
         width, heads, ratio: of its layers.
@@ -69,20 +69,20 @@ class STBlock(nn.Module):
         self.space, self.time = TokenAttention(width, heads), TokenAttention(width, heads)
         self.ff = FeedForward(width, ratio)
 
-    def observe(self, x: Tensor, told: Tensor, cache: FrameCache, first: int) -> tuple[Tensor, Keys]:
+    def observe(self, x: Tensor, cond: Tensor, cache: FrameCache, first: int) -> tuple[Tensor, Keys]:
         """Known frames [B, T, P, width], the first of which has number `first`, after the block; and the keys
         and values of time [B, P, heads, n, head_dim] of those in the cache and of these, which go into it.
         """
-        x, count = self._look_around(x, told, None), x.shape[1]
+        x, count = self._look_around(x, cond, None), x.shape[1]
         rope = time_rope(first, count, self.size, x.device)
-        h = self.reader.norm(_TIME, x, told).transpose(1, 2)
+        h = self.reader.norm(_TIME, x, cond).transpose(1, 2)
         known = joined(cache.time, self.time.keys_of(h, rope))
         mask = self._before(known[0].shape[-2] - count, count, count, x.device, itself=True)
-        x = x + self.reader.gate(_TIME, self.time(h, known, mask, rope).transpose(1, 2), told)
+        x = x + self.reader.gate(_TIME, self.time(h, known, mask, rope).transpose(1, 2), cond)
         cache.time = newest(known, self.window - 1)
-        return self._finish(x, told), known
+        return self._finish(x, cond), known
 
-    def ask(self, y: Tensor, told: Tensor, known: Keys, causal: bool) -> Tensor:
+    def predict(self, y: Tensor, cond: Tensor, known: Keys, causal: bool) -> Tensor:
         """Frames asked for [B, T - 1, P, width], after the block: all but the first of T frames that are
         known.
 
@@ -92,28 +92,28 @@ class STBlock(nn.Module):
         """
         places = y.shape[2]
         order = torch.ones(places, places, dtype=torch.bool, device=y.device).tril() if causal else None
-        return self._finish(self._look_back(self._look_around(y, told, order), told, known, 1, 1), told)
+        return self._finish(self._look_back(self._look_around(y, cond, order), cond, known, 1, 1), cond)
 
-    def ask_next(self, y: Tensor, told: Tensor, cache: FrameCache, number: int) -> Tensor:
+    def predict_next(self, y: Tensor, cond: Tensor, cache: FrameCache, number: int) -> Tensor:
         """Frame `number` [B, 1, P, width], the one after those in the cache, after the block."""
-        y = self._look_around(y, told, None)
-        return self._finish(self._look_back(y, told, cache.time, number, _frames(cache.time)), told)
+        y = self._look_around(y, cond, None)
+        return self._finish(self._look_back(y, cond, cache.time, number, _frames(cache.time)), cond)
 
-    def ask_place(self, y: Tensor, told: Tensor, cache: FrameCache, place: int, number: int) -> Tensor:
+    def predict_place(self, y: Tensor, cond: Tensor, cache: FrameCache, place: int, number: int) -> Tensor:
         """One place [B, 1, 1, width] of that frame; the cache holds those before it, and takes it in."""
-        h = self.reader.norm(_SPACE, y, told)
+        h = self.reader.norm(_SPACE, y, cond)
         cache.space = joined(cache.space, self.space.keys_of(h))
-        y = y + self.reader.gate(_SPACE, self.space(h, cache.space), told)
+        y = y + self.reader.gate(_SPACE, self.space(h, cache.space), cond)
         known = cache.time
         here = None if known is None else (known[0][:, place : place + 1], known[1][:, place : place + 1])
-        return self._finish(self._look_back(y, told, here, number, _frames(here)), told)
+        return self._finish(self._look_back(y, cond, here, number, _frames(here)), cond)
 
-    def _look_around(self, y: Tensor, told: Tensor, mask: Tensor | None) -> Tensor:
+    def _look_around(self, y: Tensor, cond: Tensor, mask: Tensor | None) -> Tensor:
         """Attention over space."""
-        h = self.reader.norm(_SPACE, y, told)
-        return y + self.reader.gate(_SPACE, self.space(h, self.space.keys_of(h), mask), told)
+        h = self.reader.norm(_SPACE, y, cond)
+        return y + self.reader.gate(_SPACE, self.space(h, self.space.keys_of(h), mask), cond)
 
-    def _look_back(self, y: Tensor, told: Tensor, known: Keys | None, number: int, past: int) -> Tensor:
+    def _look_back(self, y: Tensor, cond: Tensor, known: Keys | None, number: int, past: int) -> Tensor:
         """Attention over time of frames asked for: each to the known ones before it, and to itself.
 
         Args:
@@ -121,11 +121,11 @@ class STBlock(nn.Module):
         """
         count, more = y.shape[1], _frames(known) - past
         rope = time_rope(number, count, self.size, y.device)
-        h = self.reader.norm(_TIME, y, told).transpose(1, 2)
+        h = self.reader.norm(_TIME, y, cond).transpose(1, 2)
         keys = joined(known, self.time.keys_of(h, rope))
         itself = torch.eye(count, dtype=torch.bool, device=y.device)
         mask = torch.cat((self._before(past, count, more, y.device, itself=False), itself), 1)
-        return y + self.reader.gate(_TIME, self.time(h, keys, mask, rope).transpose(1, 2), told)
+        return y + self.reader.gate(_TIME, self.time(h, keys, mask, rope).transpose(1, 2), cond)
 
     def _before(self, past: int, count: int, more: int, device: torch.device, itself: bool) -> Tensor:
         """Which of `past` + `more` frames those from number `past` on see, bool [count, past + more]."""
@@ -134,9 +134,9 @@ class STBlock(nn.Module):
         latest = number if itself else number - 1
         return (other <= latest) & (other > number - self.window)
 
-    def _finish(self, x: Tensor, told: Tensor) -> Tensor:
-        x = self.reader.read(x, told)
-        return x + self.reader.gate(_FORWARD, self.ff(self.reader.norm(_FORWARD, x, told)), told)
+    def _finish(self, x: Tensor, cond: Tensor) -> Tensor:
+        x = self.reader.read(x, cond)
+        return x + self.reader.gate(_FORWARD, self.ff(self.reader.norm(_FORWARD, x, cond)), cond)
 
 
 def _frames(known: Keys | None) -> int:

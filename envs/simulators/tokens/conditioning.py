@@ -22,15 +22,15 @@ PARTS = 3  # of a block that are modulated: attention over space, over time, fee
 class Reader(nn.Module):
     """The part of a block that reads what is told; x are tokens [B, T, P, width]."""
 
-    def norm(self, part: int, x: Tensor, told: Tensor) -> Tensor:
+    def norm(self, part: int, x: Tensor, cond: Tensor) -> Tensor:
         """The input of one of the block's parts."""
         raise NotImplementedError
 
-    def gate(self, part: int, update: Tensor, told: Tensor) -> Tensor:
+    def gate(self, part: int, update: Tensor, cond: Tensor) -> Tensor:
         """What one of the block's parts adds."""
         return update
 
-    def read(self, x: Tensor, told: Tensor) -> Tensor:
+    def read(self, x: Tensor, cond: Tensor) -> Tensor:
         """The tokens after they have read what is told; here nothing is read directly."""
         return x
 
@@ -82,11 +82,11 @@ class _Attending(Reader):
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(PARTS + 1))
         self.attn = TokenAttention(width, heads)
 
-    def norm(self, part: int, x: Tensor, told: Tensor) -> Tensor:
+    def norm(self, part: int, x: Tensor, cond: Tensor) -> Tensor:
         return self.norms[part](x)
 
-    def read(self, x: Tensor, told: Tensor) -> Tensor:
-        return x + self.attn(self.norms[PARTS](x), self.attn.keys_of(told))
+    def read(self, x: Tensor, cond: Tensor) -> Tensor:
+        return x + self.attn(self.norms[PARTS](x), self.attn.keys_of(cond))
 
 
 class _Modulated(Reader):
@@ -99,13 +99,13 @@ class _Modulated(Reader):
         for parameter in self.maps.parameters():
             nn.init.zeros_(parameter)
 
-    def norm(self, part: int, x: Tensor, told: Tensor) -> Tensor:
-        shift, scale, _ = self._values(part, told)
+    def norm(self, part: int, x: Tensor, cond: Tensor) -> Tensor:
+        shift, scale, _ = self._values(part, cond)
         return F.layer_norm(x, (self.width,)) * (1 + scale) + shift
 
-    def gate(self, part: int, update: Tensor, told: Tensor) -> Tensor:
-        return update * self._values(part, told)[2]
+    def gate(self, part: int, update: Tensor, cond: Tensor) -> Tensor:
+        return update * self._values(part, cond)[2]
 
-    def _values(self, part: int, told: Tensor) -> tuple[Tensor, ...]:
+    def _values(self, part: int, cond: Tensor) -> tuple[Tensor, ...]:
         """Shift, scale and gate of a part, each [B, T, 1, width]."""
-        return self.maps[part](F.silu(told.mean(2, keepdim=True))).chunk(3, -1)
+        return self.maps[part](F.silu(cond.mean(2, keepdim=True))).chunk(3, -1)

@@ -30,8 +30,8 @@ class Draws:
         return torch.stack([torch.rand(shape, generator=each) for each in self.generators]).to(self.device)
 
 
-class Asker(Protocol):
-    """A frame that tokens are asked of."""
+class NextFrame(Protocol):
+    """A frame whose tokens are to be predicted."""
 
     def all(self, shown: Tensor) -> Tensor:
         """Logits [B, P, F, codes] of all places, of which `shown` [B, P, F] is given, elsewhere MASKED."""
@@ -50,13 +50,13 @@ class Decoding(Protocol):
     def shown(self, tokens: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """What training gives of frames int64 [B, T, P, F], and where answers count, bool [B, T, P]."""
 
-    def decide(self, ask: Asker, places: int, factors: int, draws: Draws) -> Tensor:
+    def decide(self, frame: NextFrame, places: int, factors: int, draws: Draws) -> Tensor:
         """Tokens int64 [B, P, F] of a frame."""
 
 
 @dataclass(frozen=True)
 class MaskGIT:
-    """All places at once, in steps: of what is said of them the surest stays, by a cosine schedule (Chang et
+    """All places at once, in steps: of the sampled ones the surest stays, by a cosine schedule (Chang et
     al. 2022).
 
     Args:
@@ -76,18 +76,18 @@ class MaskGIT:
         masked = (rank < (share * places).ceil().clamp(min=1)).to(tokens.device)
         return torch.where(masked[..., None], MASKED, tokens), masked
 
-    def decide(self, ask: Asker, places: int, factors: int, draws: Draws) -> Tensor:
+    def decide(self, frame: NextFrame, places: int, factors: int, draws: Draws) -> Tensor:
         """See Decoding."""
         batch = len(draws.generators)
         tokens = torch.full((batch, places, factors), MASKED, device=draws.device)
         for step in range(1, self.steps + 1):
-            said, sure = sample(ask.all(tokens), self.temperature, draws)
+            sampled, sure = sample(frame.all(tokens), self.temperature, draws)
             open_still = (tokens == MASKED).any(-1)
             known = places - math.floor(places * math.cos(math.pi / 2 * step / self.steps) + 1e-6)
             sure = torch.where(open_still, sure.sum(-1), torch.inf)  # what stays, stays
             rank = sure.argsort(dim=-1, descending=True, stable=True).argsort(dim=-1)
             take = open_still & (rank < known)
-            tokens = torch.where(take[..., None], said, tokens)
+            tokens = torch.where(take[..., None], sampled, tokens)
         return tokens
 
 
@@ -107,12 +107,12 @@ class Raster:
         shifted = torch.cat((torch.full_like(tokens[:, :, :1], MASKED), tokens[:, :, :-1]), 2)
         return shifted, torch.ones_like(tokens[..., 0], dtype=torch.bool)
 
-    def decide(self, ask: Asker, places: int, factors: int, draws: Draws) -> Tensor:
+    def decide(self, frame: NextFrame, places: int, factors: int, draws: Draws) -> Tensor:
         """See Decoding."""
         last = torch.full((len(draws.generators), factors), MASKED, device=draws.device)
         decided = []
         for place in range(places):
-            last, _ = sample(ask.place(place, last), self.temperature, draws)
+            last, _ = sample(frame.place(place, last), self.temperature, draws)
             decided.append(last)
         return torch.stack(decided, 1)
 

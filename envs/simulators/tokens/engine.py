@@ -65,7 +65,7 @@ class TokensSimulator(Simulator):
 
     hidden = ("blocks",)
     recent_memory = True
-    told_in_steps = True
+    per_frame_moves = True
 
     def __init__(
         self,
@@ -89,9 +89,9 @@ class TokensSimulator(Simulator):
         self.action_embed = nn.Sequential(
             RowLinear(self.action_vector.size, width),
             nn.SiLU(),
-            RowLinear(width, self.video.told_tokens * width),
+            RowLinear(width, self.video.cond_tokens * width),
         )
-        self.pace = Pace(self.video.told_tokens * width)
+        self.pace = Pace(self.video.cond_tokens * width)
         self.pose_embed = RowLinear(pose_map_channels(stride), width) if spec.pose_map else None
         self.ray_embed = RowLinear(6, width) if spec.ray_map else None
         self.feature_shape = ((spec.chunk + spec.views) * width,)
@@ -122,17 +122,17 @@ class TokensSimulator(Simulator):
     @torch.no_grad()
     def generate(self, inputs: TensorDict) -> Made:
         """The chunk after some inputs of `predict`, as tokens."""
-        told, beside = self._told(inputs), self._beside(inputs)
+        cond, beside = self._cond(inputs), self._beside(inputs)
         tokens, past = self.video.encode(inputs["memory", "frames"]), self.memory_frames
         known = self.video.net.memory()
-        self.video.net.observe(tokens, told[:, :past], _of(beside, slice(past)), known)
+        self.video.net.observe(tokens, cond[:, :past], _of(beside, slice(past)), known)
         pairs = zip(inputs["seed"].tolist(), inputs["chunk_index"].tolist(), strict=True)
         draws = Draws([noise_generator(seed, chunk) for seed, chunk in pairs], tokens.device)
         made, seen = [tokens[:, -1]], []
-        for frame in range(past, told.shape[1]):
+        for frame in range(past, cond.shape[1]):
             at = slice(frame, frame + 1)
-            made.append(self.video.next_frame(known, told[:, at], _of(beside, at), draws))
-            seen.append(self.video.net.observe(made[-1][:, None], told[:, at], _of(beside, at), known))
+            made.append(self.video.next_frame(known, cond[:, at], _of(beside, at), draws))
+            seen.append(self.video.net.observe(made[-1][:, None], cond[:, at], _of(beside, at), known))
         features = torch.cat(seen, 1).float()
         return Made(torch.stack(made, 1), self._pooled(features))
 
@@ -151,7 +151,7 @@ class TokensSimulator(Simulator):
             counted=torch.cat((true[:, 1:], valid), 1),
             success=torch.cat((unknown, torch.where(valid, success, torch.nan)), 1),
         )
-        return self.video.loss(lesson, self._told(inputs), self._beside(inputs), generator)
+        return self.video.loss(lesson, self._cond(inputs), self._beside(inputs), generator)
 
     # -- parts
     def _frames(self, made: Made, inputs: TensorDict) -> Tensor:
@@ -160,7 +160,7 @@ class TokensSimulator(Simulator):
         last = inputs["memory", "frames"][:, -1:].float() / 255
         return to_bytes(restore_detail(decoded[:, 1:], decoded[:, :1], last))
 
-    def _told(self, inputs: TensorDict) -> Tensor:
+    def _cond(self, inputs: TensorDict) -> Tensor:
         """Commands of memory and chunk as tokens [B, T, N, width]: each beside the one before it, so that a
         frame is told the same wherever it stands in a chunk.
         """
@@ -169,7 +169,7 @@ class TokensSimulator(Simulator):
         vectors = self.action_vector(commands.unsqueeze(-2), before).squeeze(-2)
         embedded = self.action_embed(vectors)
         embedded = embedded + self.pace(inputs["stride"])[:, None].to(embedded.dtype)
-        return embedded.unflatten(-1, (self.video.told_tokens, -1))
+        return embedded.unflatten(-1, (self.video.cond_tokens, -1))
 
     def _beside(self, inputs: TensorDict) -> Tensor | None:
         """Pose maps and rays of all frames as [B, T, P, width]; None where there are none."""

@@ -94,7 +94,7 @@ class TextWorld(nn.Module):
         self.register_buffer("threshold", torch.tensor(self.ending.threshold))
         self.video = TokenVideo(spec, window, codec, net, conditioning, decoding, training, _KEY)
         encoder: WordEncoder = build(words, f"{_KEY}.words")
-        self.reader = WordReader(encoder, self.video.trunk.width, self.video.told_tokens)
+        self.reader = WordReader(encoder, self.video.trunk.width, self.video.cond_tokens)
 
     @property
     def codec(self) -> LookupFreeTokenizer:
@@ -118,8 +118,8 @@ class TextWorld(nn.Module):
         """
         tokens, valid = self.video.encode(clip["frames"]), clip["valid"]
         success = torch.where(valid, clip["success"], torch.nan)
-        told = self.reader(bytes_to_text(clip["text"])).expand(-1, tokens.shape[1], -1, -1)
-        return self.video.loss(Lesson(tokens, valid[:, 1:], success), told, None, generator)
+        cond = self.reader(bytes_to_text(clip["text"])).expand(-1, tokens.shape[1], -1, -1)
+        return self.video.loss(Lesson(tokens, valid[:, 1:], success), cond, None, generator)
 
     @torch.no_grad()
     def imagine(self, first: Tensor, instruction: Sequence[str], seed: Tensor) -> GoldenTrajectory:
@@ -131,21 +131,21 @@ class TextWorld(nn.Module):
             seed: int64 [B]; an episode is the same in any batch.
         """
         device = next(self.parameters()).device
-        told, known = self.reader(instruction), self.video.net.memory()
-        self.video.net.observe(self.video.encode(first[:, None].to(device)), told, None, known)
+        cond, known = self.reader(instruction), self.video.net.memory()
+        self.video.net.observe(self.video.encode(first[:, None].to(device)), cond, None, known)
         draws = Draws([noise_generator(row + _STREAM, 0) for row in seed.tolist()], device)
         ended = torch.zeros(len(first), dtype=torch.bool, device=device)
         tokens: list[Tensor] = []
         done: list[Tensor] = []
         while True:
-            new = self.video.next_frame(known, told, None, draws)
-            said = self.video.done(self.video.net.observe(new[:, None], told, None, known).float())[:, 0]
+            new = self.video.next_frame(known, cond, None, draws)
+            done_now = self.video.done(self.video.net.observe(new[:, None], cond, None, known).float())[:, 0]
             if tokens:  # those that have ended rest
                 new = torch.where(ended[:, None, None], tokens[-1], new)
-                said = torch.where(ended, done[-1], said)
+                done_now = torch.where(ended, done[-1], done_now)
             tokens.append(new)
-            done.append(said)
-            ended = ended | (said > self.threshold)
+            done.append(done_now)
+            ended = ended | (done_now > self.threshold)
             if len(tokens) == self.ending.max_frames or ended.all():
                 break
         every = torch.stack(done, 1)
@@ -159,10 +159,10 @@ class TextWorld(nn.Module):
         """What `imagine` would say of frames uint8 [B, T, V, 3, H, W] if it had made them: whether the task
         is done, float32 [B, T], by each frame and those before it in the window.
         """
-        told, known = self.reader(instruction), self.video.net.memory()
-        tokens = self.video.encode(frames.to(told.device))
-        said = [self.video.net.observe(one, told, None, known) for one in tokens.split(1, 1)]
-        return torch.cat([self.video.done(seen.float()) for seen in said], 1).to(frames.device)
+        cond, known = self.reader(instruction), self.video.net.memory()
+        tokens = self.video.encode(frames.to(cond.device))
+        features = [self.video.net.observe(one, cond, None, known) for one in tokens.split(1, 1)]
+        return torch.cat([self.video.done(seen.float()) for seen in features], 1).to(frames.device)
 
     @torch.no_grad()
     def done(self, frames: Tensor, instruction: Sequence[str]) -> Tensor:
@@ -171,6 +171,6 @@ class TextWorld(nn.Module):
         """
         device = next(self.parameters()).device
         tokens = self.video.encode(frames.to(device))
-        told = self.reader(instruction).expand(-1, tokens.shape[1], -1, -1)
-        seen = self.video.net.observe(tokens, told, None, self.video.net.memory())
+        cond = self.reader(instruction).expand(-1, tokens.shape[1], -1, -1)
+        seen = self.video.net.observe(tokens, cond, None, self.video.net.memory())
         return self.video.done(seen.float()).to(frames.device)

@@ -1,4 +1,4 @@
-"""The spatio-temporal transformer of RoboScape-R: from tokens so far, and what is told, to the next frame's.
+"""The spatio-temporal transformer of RoboScape-R: from tokens so far, and what is cond, to the next frame's.
 
 The action world and the text world are this one class, each with weights of its own.
 """
@@ -111,7 +111,7 @@ class TokenHead(nn.Module):
 
 
 class SpatioTemporalTransformer(nn.Module):
-    """See the module's docstring. P are places, F factors; `told` are tokens [B, T, N, width], and `beside`
+    """See the module's docstring. P are places, F factors; `cond` are tokens [B, T, N, width], and `beside`
     what else is known of every place, [B, T, P, width], or None.
 
     Args:
@@ -135,7 +135,7 @@ class SpatioTemporalTransformer(nn.Module):
         self.view, self.row, self.column = (
             nn.Parameter(_SMALL * torch.randn(count, width)) for count in (v.views, v.rows, v.columns)
         )
-        self.asked = nn.Parameter(_SMALL * torch.randn(width))
+        self.query = nn.Parameter(_SMALL * torch.randn(width))
         self.blocks = nn.ModuleList(
             STBlock(width, trunk.heads, trunk.ratio, window, conditioning) for _ in range(trunk.layers)
         )
@@ -143,7 +143,7 @@ class SpatioTemporalTransformer(nn.Module):
         self.head = TokenHead(width, v, signs)
 
     def forward(
-        self, tokens: Tensor, shown: Tensor, told: Tensor, beside: Tensor | None, causal: bool
+        self, tokens: Tensor, shown: Tensor, cond: Tensor, beside: Tensor | None, causal: bool
     ) -> tuple[Tensor, Tensor]:
         """All frames of a clip but the first, each asked for after those before it.
 
@@ -156,10 +156,10 @@ class SpatioTemporalTransformer(nn.Module):
             logits [B, T - 1, P, F, codes], and features [B, T, P, width] of the frames as they are known.
         """
         x = self._input(tokens, beside)
-        y = self._input(shown, None if beside is None else beside[:, 1:]) + self.asked
+        y = self._input(shown, None if beside is None else beside[:, 1:]) + self.query
         for block, cache in self._each(self.memory()):
-            x, known = block.observe(x, told, cache, 0)
-            y = block.ask(y, told[:, 1:], known, causal)
+            x, known = block.observe(x, cond, cache, 0)
+            y = block.predict(y, cond[:, 1:], known, causal)
         return self._logits(y, tokens[:, :-1]), self.norm_seen(x)
 
     # -- rollouts, frame by frame
@@ -167,37 +167,37 @@ class SpatioTemporalTransformer(nn.Module):
         """Of no frame so far."""
         return Memory([FrameCache() for _ in self.blocks])
 
-    def observe(self, tokens: Tensor, told: Tensor, beside: Tensor | None, memory: Memory) -> Tensor:
+    def observe(self, tokens: Tensor, cond: Tensor, beside: Tensor | None, memory: Memory) -> Tensor:
         """Features [B, T, P, width] of frames that go on from a memory, which takes them in."""
         x = self._input(tokens, beside)
         for block, cache in self._each(memory):
-            x, _ = block.observe(x, told, cache, memory.frames)
+            x, _ = block.observe(x, cond, cache, memory.frames)
             cache.space = None
         memory.frames += tokens.shape[1]
         memory.last = tokens[:, -1]
         return self.norm_seen(x)
 
-    def ask(self, shown: Tensor, told: Tensor, beside: Tensor | None, memory: Memory) -> Tensor:
+    def predict(self, shown: Tensor, cond: Tensor, beside: Tensor | None, memory: Memory) -> Tensor:
         """Logits float32 [B, P, F, codes] of the frame after those of a memory; `shown` [B, P, F] is given of
         it.
         """
-        y = self._input(shown[:, None], beside) + self.asked
+        y = self._input(shown[:, None], beside) + self.query
         for block, cache in self._each(memory):
-            y = block.ask_next(y, told, cache, memory.frames)
+            y = block.predict_next(y, cond, cache, memory.frames)
         return self._logits(y, memory.newest()[:, None])[:, 0]
 
-    def ask_place(
-        self, place: int, shown: Tensor, told: Tensor, beside: Tensor | None, memory: Memory
+    def predict_place(
+        self, place: int, shown: Tensor, cond: Tensor, beside: Tensor | None, memory: Memory
     ) -> Tensor:
         """Logits [B, F, codes] of one place of that frame, where `shown` [B, F] is given there. Places are
         asked for in order, from 0 on.
         """
         here = self._places()[place : place + 1]
-        y = self._embed(shown[:, None, None]) + here + self.asked
+        y = self._embed(shown[:, None, None]) + here + self.query
         if beside is not None:
             y = y + beside[:, :, place : place + 1]
         for block, cache in self._each(memory):
-            y = block.ask_place(y, told, cache, place, memory.frames)
+            y = block.predict_place(y, cond, cache, place, memory.frames)
         return self._logits(y, memory.newest()[:, None, place : place + 1])[:, 0, 0]
 
     # -- parts

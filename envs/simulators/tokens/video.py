@@ -62,7 +62,7 @@ class Lesson:
 
 
 class TokenVideo(nn.Module):
-    """See the module's docstring. `told` and `beside` are those of SpatioTemporalTransformer.
+    """See the module's docstring. `cond` and `beside` are those of SpatioTemporalTransformer.
 
     Args:
         spec: what the pictures show; sizes must be multiples of the tokenizer's stride.
@@ -103,9 +103,9 @@ class TokenVideo(nn.Module):
         self.trunk = options(Trunk, net, f"{key}.net")
         self.training_options = options(TokenTraining, training, f"{key}.training")
         self.decoding: Decoding = build(decoding, f"{key}.decoding")
-        told: Conditioning = build(conditioning, f"{key}.conditioning")
-        self.told_tokens = told.tokens
-        self.net = SpatioTemporalTransformer(self.vocabulary, self.trunk, window, told)
+        cond: Conditioning = build(conditioning, f"{key}.conditioning")
+        self.cond_tokens = cond.tokens
+        self.net = SpatioTemporalTransformer(self.vocabulary, self.trunk, window, cond)
         width = self.trunk.width
         self.done_head = nn.Sequential(
             nn.LayerNorm(width), RowLinear(width, width), nn.SiLU(), RowLinear(width, 1)
@@ -128,10 +128,10 @@ class TokenVideo(nn.Module):
         return torch.cat([self.codec.decode(part) for part in flat]).unflatten(0, grids.shape[:3])
 
     # -- frames to come
-    def next_frame(self, memory: Memory, told: Tensor, beside: Tensor | None, draws: Draws) -> Tensor:
-        """Tokens int64 [B, P, F] of the frame after those of a memory; told and beside are of that frame."""
+    def next_frame(self, memory: Memory, cond: Tensor, beside: Tensor | None, draws: Draws) -> Tensor:
+        """Tokens int64 [B, P, F] of the frame after those of a memory; cond and beside are of that frame."""
         v = self.vocabulary
-        return self.decoding.decide(_NextFrame(self.net, memory, told, beside), v.places, v.factors, draws)
+        return self.decoding.decide(_NextFrame(self.net, memory, cond, beside), v.places, v.factors, draws)
 
     def done(self, features: Tensor) -> Tensor:
         """Whether the task is done, float32 [B, T] in 0..1, by features [B, T, P, width]."""
@@ -139,16 +139,16 @@ class TokenVideo(nn.Module):
 
     # -- training
     def loss(
-        self, lesson: Lesson, told: Tensor, beside: Tensor | None, generator: torch.Generator
+        self, lesson: Lesson, cond: Tensor, beside: Tensor | None, generator: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Cross-entropy of the tokens of frames asked for, plus the root mean square error of done."""
         how, tokens = self.training_options, lesson.tokens
-        shown, asked = self.decoding.shown(tokens[:, 1:], generator)
+        shown, masked = self.decoding.shown(tokens[:, 1:], generator)
         known = self._corrupted(tokens, generator)
-        logits, features = self.net(known, shown, told, beside, self.decoding.causal)
+        logits, features = self.net(known, shown, cond, beside, self.decoding.causal)
         error = F.cross_entropy(logits.flatten(0, 3), tokens[:, 1:].flatten(), reduction="none")
         error = error.view(tokens[:, 1:].shape).sum(-1)
-        weight = (1 + how.motion * self._stirred(tokens)) * (asked & lesson.counted[..., None])
+        weight = (1 + how.motion * self._stirred(tokens)) * (masked & lesson.counted[..., None])
         value = (error * weight).sum() / weight.sum().clamp(min=1)
         labelled = torch.isfinite(lesson.success)
         gap = torch.where(labelled, self.done(features) - torch.nan_to_num(lesson.success), 0.0)
@@ -180,11 +180,11 @@ class _NextFrame:
 
     net: SpatioTemporalTransformer
     memory: Memory
-    told: Tensor
+    cond: Tensor
     beside: Tensor | None
 
     def all(self, shown: Tensor) -> Tensor:
-        return self.net.ask(shown, self.told, self.beside, self.memory)
+        return self.net.predict(shown, self.cond, self.beside, self.memory)
 
     def place(self, number: int, shown: Tensor) -> Tensor:
-        return self.net.ask_place(number, shown, self.told, self.beside, self.memory)
+        return self.net.predict_place(number, shown, self.cond, self.beside, self.memory)

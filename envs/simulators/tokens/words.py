@@ -146,5 +146,5 @@ class WordReader(nn.Module):
         different = sorted(set(texts))  # a batch holds few, each many times
         self.check(different)
         rows = self.map(self.words.encode(different, self.device))
-        told = rows.unflatten(-1, (self.each, -1)).flatten(1, 2)
-        return told[[different.index(text) for text in texts]][:, None]
+        cond = rows.unflatten(-1, (self.each, -1)).flatten(1, 2)
+        return cond[[different.index(text) for text in texts]][:, None]

@@ -45,7 +45,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "chunk_gaussian": {"width": 32},
     "chunk_tokens": {
         "width": 32,
-        "asked": 3,
+        "instruction_keypoints": 3,
         "channels": 8,
     },  # with an encoder that is told what is asked for
 }

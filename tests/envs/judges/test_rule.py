@@ -22,7 +22,9 @@ def test_physics_own_judgement_passes_through_and_pictures_are_refused() -> None
 
 def test_near_its_threshold_a_judge_abstains() -> None:
     spec = world_spec(ARM_DELTAS)
-    judge = LearnedJudge(spec, 2, 0.1, 0.9, width=8, points=4, hidden=8, cameras="all", asked=0).eval()
+    judge = LearnedJudge(
+        spec, 2, 0.1, 0.9, width=8, points=4, hidden=8, cameras="all", instruction_keypoints=0
+    ).eval()
     frames = torch.zeros(1, 2, spec.views, 3, *spec.size, dtype=torch.uint8)
     best = judge.score(frames, frames[:, 0], ["x"]).success.max()
     for away, status in ((0.05, Status.ABSTAIN), (0.2, Status.OK)):

@@ -196,7 +196,15 @@ def test_rl_runs_inside_a_joint_world(tmp_path: Path) -> None:
     spec = WorldSpec(robot, (32, 48), 5, pose_map=True, ray_map=True)
     world = build(None, spec)
     judge = LearnedJudge(
-        spec, hold=99, margin=0.0, discount=0.9, width=8, points=8, hidden=16, cameras="all", asked=0
+        spec,
+        hold=99,
+        margin=0.0,
+        discount=0.9,
+        width=8,
+        points=8,
+        hidden=16,
+        cameras="all",
+        instruction_keypoints=0,
     )
     starts = InitialStates(first_of(spec, clip(spec, 3, 4)), ["pour"] * 3)
     base = WorldEnv(world, starts, 2, 10, ActionMode.RELATIVE, shared_noise=False, bf16=False)

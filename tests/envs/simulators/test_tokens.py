@@ -72,12 +72,12 @@ def test_kept_keys_give_what_is_computed_anew(way: Conditioning, window: int) ->
             given = shown[:, begin - 1]
             if order.causal:
                 said = [
-                    model.ask_place(place, given[:, place], told[:, at], beside[:, at], known)
+                    model.predict_place(place, given[:, place], told[:, at], beside[:, at], known)
                     for place in range(VOCABULARY.places)
                 ]
                 asked = torch.stack(said, 1)
             else:
-                asked = model.ask(given, told[:, at], beside[:, at], known)
+                asked = model.predict(given, told[:, at], beside[:, at], known)
             assert torch.allclose(asked, logits[:, begin - 1], atol=1e-5)
         assert max(cache.time[0].shape[-2] for cache in known.blocks if cache.time) <= window - 1
 

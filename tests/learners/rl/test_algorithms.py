@@ -97,7 +97,7 @@ def test_trains_every_policy_and_repeats_itself(name: str, policy_name: str, tmp
         folder = tmp_path / str(number)
         stats = train_rl(fleet, policy, algorithm, settings(), folder, Starts(range(4)))
         fleet.close()
-        assert stats["ledger"]["learned"] == stats["ledger"]["asked"] == 16
+        assert stats["ledger"]["learned"] == stats["ledger"]["requested"] == 16
         assert stats["last"]["updates"] > 0
         assert any(not torch.equal(value, before[key]) for key, value in policy.named_parameters())
         assert all(bool(value.isfinite().all()) for value in policy.parameters())
@@ -316,7 +316,7 @@ def test_killed_and_resumed_rl_equals_the_uninterrupted(
         plan = settings(iterations=3, shards=2, checkpoint_every=1)
         stats = train_rl(fleet, policy, algorithm, plan, folder, Starts(range(4)))
         fleet.close()
-        assert stats["ledger"]["learned"] == stats["ledger"]["asked"] == 24
+        assert stats["ledger"]["learned"] == stats["ledger"]["requested"] == 24
         return rows_of(folder), {
             key: value.clone() for key, value in algorithm.modules().state_dict().items()
         }

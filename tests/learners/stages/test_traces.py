@@ -72,7 +72,7 @@ def test_key_points_that_are_told_what_to_look_for_learn_where_hands_will_be(
 ) -> None:
     store = tiny_store(BIMANUAL_POSES)
     torch.manual_seed(0)
-    small = {"width": 32, "channels": 8, "points": 4, "asked": len(CHUNKS) * 2}
+    small = {"width": 32, "channels": 8, "points": 4, "instruction_keypoints": len(CHUNKS) * 2}
     policy = build(section("policy/chunk_gaussian", "relative", **small), "policy", spec=store.spec)
     assert isinstance(policy, ChunkPolicy)
     rows = torch.arange(int(store.length[0]))
@@ -82,7 +82,7 @@ def test_key_points_that_are_told_what_to_look_for_learn_where_hands_will_be(
     def loss() -> float:
         with torch.no_grad():
             found = policy.gaze(observe(store, rows))[1]
-        return float(trace_loss(found[:, :, -policy.asked :], hands))
+        return float(trace_loss(found[:, :, -policy.instruction_keypoints :], hands))
 
     before = loss()
     options = FitConfig(steps=60, batch=16, lr=3e-3, warmup=5, bf16=False)

@@ -126,7 +126,7 @@ def inputs(tmp_path: Path) -> Inputs:
     for one in shown:
         (videos / "media" / one["file"]).write_bytes(one["file"].encode())
     (videos / "videos.json").write_text(json.dumps(shown))
-    ledger = {"asked": 256, "learned": 256, "dropped": {"judge": 2}}
+    ledger = {"requested": 256, "learned": 256, "dropped": {"judge": 2}}
     for folder, stage, made in ((rl, "rl-1", {"ledger": ledger, "alarms": []}), (videos, "videos", {})):
         manifest = {"stage": stage, "seconds": 1.0, "result": made}
         (folder / "manifest.json").write_text(json.dumps(manifest))

@@ -19,7 +19,13 @@ from pipeline.stages.given import mode_of
 STARTS = [11, 12, 13, 14]
 WORDS = [
     *("task=tabletop", "task.name=push", "task.suite.phrasings=[plain]", "task.suite.cameras=[head]"),
-    *("cameras=main", "policy.asked=8", "policy.command=true", "launch.workers=1", "threads=1"),
+    *(
+        "cameras=main",
+        "policy.instruction_keypoints=8",
+        "policy.command=true",
+        "launch.workers=1",
+        "threads=1",
+    ),
 ]
 
 

@@ -23,7 +23,7 @@ SMALL = (
     *("experiment=soak", "track=disabled", "task=tabletop", "task.name=[push,pull]", "task.horizon=20"),
     *("task.suite.cameras=[head]", "study.columns=[success,out_of_domain]", f"study.rows=[{','.join(ROWS)}]"),
     *("evaluate.episodes=4", "evaluate.envs=4", "extra_starts.variants=[out_of_domain]"),
-    *("extra_starts.episodes=4", "policy.asked=2", "judge.asked=2"),
+    *("extra_starts.episodes=4", "policy.instruction_keypoints=2", "judge.instruction_keypoints=2"),
 )
 
 
