@@ -54,7 +54,7 @@ class Memory:
 
 
 class STBlock(nn.Module):
-    """Attention over the places of a frame, over the frames at a place, what is cond, and feed-forward.
+    """Attention over the places of a frame, over the frames at a place, its conditioning, and feed-forward.
 
     Args:
         width, heads, ratio: of its layers.

@@ -1,4 +1,4 @@
-"""The spatio-temporal transformer of RoboScape-R: from tokens so far, and what is cond, to the next frame's.
+"""The spatio-temporal transformer of RoboScape-R: from tokens so far, and conditioning, to the next frame's.
 
 The action world and the text world are this one class, each with weights of its own.
 """

@@ -103,9 +103,9 @@ class TokenVideo(nn.Module):
         self.trunk = options(Trunk, net, f"{key}.net")
         self.training_options = options(TokenTraining, training, f"{key}.training")
         self.decoding: Decoding = build(decoding, f"{key}.decoding")
-        cond: Conditioning = build(conditioning, f"{key}.conditioning")
-        self.cond_tokens = cond.tokens
-        self.net = SpatioTemporalTransformer(self.vocabulary, self.trunk, window, cond)
+        conditioner: Conditioning = build(conditioning, f"{key}.conditioning")
+        self.cond_tokens = conditioner.tokens
+        self.net = SpatioTemporalTransformer(self.vocabulary, self.trunk, window, conditioner)
         width = self.trunk.width
         self.done_head = nn.Sequential(
             nn.LayerNorm(width), RowLinear(width, width), nn.SiLU(), RowLinear(width, 1)
