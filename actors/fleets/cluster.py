@@ -196,9 +196,8 @@ def _our_sigterm() -> Iterator[None]:
     before, (listen, wake) = signal.getsignal(signal.SIGTERM), os.pipe()
     for end in (listen, wake):
         os.set_blocking(end, False)
-    listening = signal.set_wakeup_fd(
-        wake, warn_on_full_buffer=False
-    )  # it gets every signal, whoever handles it
+    # It gets every signal, whoever handles it.
+    listening = signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
 
     def terminated() -> bool:
         try:
