@@ -48,7 +48,7 @@ def test_the_stage_hands_on_the_policy_and_what_is_known_of_it(
     roles = {"candidate": new, "tried": new, "incumbent": old, "known": old}
     first = graph.add("keep-2", keep, roles)
     # What was kept is known by the deployment that it had.
-    again = graph.add("keep-3", keep, {"candidate": old, "tried": old, "incumbent": first, "known": first})
+    graph.add("keep-3", keep, {"candidate": old, "tried": old, "incumbent": first, "known": first})
     results = {name: row["result"] for name, row in graph.run().items()}
     assert results["keep-2"] == {
         "kept": kept,
@@ -58,4 +58,4 @@ def test_the_stage_hands_on_the_policy_and_what_is_known_of_it(
     }
     assert results["keep-3"]["kept"]
     chosen = (graph.folder(first) / "weights.safetensors").read_text()
-    assert chosen == str(success if kept else 0.44) and again
+    assert chosen == str(success if kept else 0.44)
