@@ -213,7 +213,7 @@ def _sentences(found: Iterable[Mapping[str, Any]], value: Any, key: str) -> list
             if named or (isinstance(part, int) and _has(inner, part)):
                 path, inner = f"{path}.{part}", inner[part]
         places.setdefault(path, (inner, []))[1].append(_allowed(error))
-    return [f"{path}={wrong!r} should {' or '.join(said)}" for path, (wrong, said) in places.items()]
+    return [f"{path}={wrong!r} should {' or '.join(allowed)}" for path, (wrong, allowed) in places.items()]
 
 
 def _allowed(error: Mapping[str, Any]) -> str:
@@ -221,9 +221,9 @@ def _allowed(error: Mapping[str, Any]) -> str:
     if error["type"] == "missing":
         last = error["loc"][-1]
         return "be longer" if isinstance(last, int) else f"have {last}"
-    said = str(error["msg"]).replace("an instance of Sequence", "a list")
-    wanted = re.sub(r"^\w+ should ", "", said)
-    return wanted if wanted != said else f"be something else: {said}"
+    message = str(error["msg"]).replace("an instance of Sequence", "a list")
+    wanted = re.sub(r"^\w+ should ", "", message)
+    return wanted if wanted != message else f"be something else: {message}"
 
 
 def _place(error: Exception, module: str) -> str:

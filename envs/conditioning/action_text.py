@@ -41,8 +41,8 @@ class ActionText(nn.Module):
 
     def describe(self, numbers: list[float]) -> str:
         """Signs, digits and points as words of their own, number by number."""
-        said = []
+        words = []
         for number in numbers:
             digits = f"{abs(number):.{self.decimals}f}"
-            said += ["minus" if number < 0 else "plus", *("point" if c == "." else c for c in digits)]
-        return " ".join(said)
+            words += ["minus" if number < 0 else "plus", *("point" if c == "." else c for c in digits)]
+        return " ".join(words)

@@ -103,9 +103,9 @@ def _places(folder: Path, chosen: Path | None) -> list[Path]:
     """Folders for caches of a data set, the most wanted first."""
     real = folder.resolve()
     own = f"{real.name}-{hashlib.sha256(str(real).encode()).hexdigest()[:12]}"
-    said = chosen or os.environ.get("WORLDLOOP_CACHE")
-    if said:
-        return [Path(said) / own]
+    configured = chosen or os.environ.get("WORLDLOOP_CACHE")
+    if configured:
+        return [Path(configured) / own]
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return [real.parent / f".cache-{real.name}", home / "worldloop" / own]
 

@@ -83,9 +83,9 @@ class GoldenGoalJudge(GoalJudge):
     def remedy(cls, options: Mapping[str, Any]) -> str:
         """See Judge.remedy."""
         ending, fallback = options["text_world"].get("ending", {}), options["fallback"]
-        said = ", ".join(f"judge.text_world.ending.{key}={value}" for key, value in ending.items())
+        settings = ", ".join(f"judge.text_world.ending.{key}={value}" for key, value in ending.items())
         return (
-            f"its text world does not say in the goals it imagines that the task is done ({said}), and"
+            f"its text world does not say in the goals it imagines that the task is done ({settings}), and"
             f" judge.fallback={fallback}: train it longer (text_world_fit), change these, or set"
             f" judge.fallback={Fallback.LAST_FRAME.value} or {Fallback.PROGRESS_ONLY.value}"
         )
@@ -123,11 +123,11 @@ class GoldenGoalJudge(GoalJudge):
             return progress
         count = frames.shape[1]
         texts = [text for text in instruction for _ in range(count)]
-        rows, said = frames.flatten(0, 1)[:, None], []
+        rows, done = frames.flatten(0, 1)[:, None], []
         for begin in range(0, len(rows), _AT_ONCE):
             some = slice(begin, begin + _AT_ONCE)
-            said.append(self.text_world.done(rows[some], texts[some])[:, 0])
-        return torch.cat(said).unflatten(0, (-1, count))
+            done.append(self.text_world.done(rows[some], texts[some])[:, 0])
+        return torch.cat(done).unflatten(0, (-1, count))
 
     def unknown(self, success: Tensor, status: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
         """See GoalJudge.unknown; as `fallback` says."""
@@ -141,11 +141,11 @@ class GoldenGoalJudge(GoalJudge):
         """See Judge.facts: also by what success is told, how many goals were imagined here, in how many of
         them the text world never said done, and above what they end.
         """
-        told = "done" if hasattr(self.text_world, "done") else "likeness"
+        source = "done" if hasattr(self.text_world, "done") else "likeness"
         ending = getattr(self.text_world, "threshold", None)
         ending = None if ending is None else float(ending)
         counted = {"goals": self.imagined, "goals_unfinished": self.unfinished, "ending_threshold": ending}
-        return {**super().facts(), "success_by": told, "fallback": self.fallback.value, **counted}
+        return {**super().facts(), "success_by": source, "fallback": self.fallback.value, **counted}
 
     def train(self, mode: bool = True) -> GoldenGoalJudge:
         """As of any module, but the text world stays as it is used."""

@@ -136,11 +136,11 @@ class TaskPool:
 
     def picture(self, seed: int, size: tuple[int, int]) -> NDArray[np.uint8]:
         """Pictures for people of an episode's start, uint8 [V, 3, H, W]."""
-        return self._ask("picture", seed, size)
+        return self._request("picture", seed, size)
 
     def modules(self) -> list[str]:
         """Names of the modules that a worker has imported."""
-        return self._ask("modules")
+        return self._request("modules")
 
     def processes(self) -> list[int]:
         """Ids of the worker processes."""
@@ -152,7 +152,7 @@ class TaskPool:
             remote.close(5.0)
         self._remotes = []
 
-    def _ask(self, name: str, *arguments: Any) -> Any:
+    def _request(self, name: str, *arguments: Any) -> Any:
         self._remotes[0].send(name, *arguments)
         return self._remotes[0].answer()
 

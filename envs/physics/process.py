@@ -87,12 +87,12 @@ class WorkerProcess:
             self._replace(died)
         name, (work, *extra) = self._request[0], self._request[1] or (None,)
         if name == "script":
-            said = [self._insist((name, ([job], *extra)), job[0]) for job in work]
-            return [track for some in said for track in some or []]
+            answers = [self._insist((name, ([job], *extra)), job[0]) for job in work]
+            return [track for some in answers for track in some or []]
         if name in ("reset", "step"):
             seeds = work if name == "reset" else {slot: self._episodes[slot].seed for slot in work}
-            said = [self._insist((name, ({slot: work[slot]}, *extra)), seeds[slot], slot) for slot in work]
-            return {slot: value for some in said for slot, value in (some or {}).items()}
+            answers = [self._insist((name, ({slot: work[slot]}, *extra)), seeds[slot], slot) for slot in work]
+            return {slot: value for some in answers for slot, value in (some or {}).items()}
         return self._insist(self._request)
 
     def _insist(self, request: Request, seed: int | None = None, slot: int | None = None) -> Any:

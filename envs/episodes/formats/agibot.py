@@ -91,20 +91,20 @@ def _targets(file: Any, length: int) -> Targets | None:
     for key, size in (("joint", 14), ("effector", 2)):
         group = file.get(f"action/{key}")
         if group is None or "position" not in group:
-            return _say_measured(f"there is no action/{key}/position")
+            return _warn_measured(f"there is no action/{key}/position")
         values = np.asarray(group["position"], np.float32)
         if values.shape != (length, size):
-            return _say_measured(f"action/{key}/position is not {size} numbers for every frame")
+            return _warn_measured(f"action/{key}/position is not {size} numbers for every frame")
         if "index" in group and not set(range(length)) <= set(np.asarray(group["index"]).tolist()):
-            return _say_measured(f"action/{key}/index says that no target was sent in some frames")
+            return _warn_measured(f"action/{key}/index says that no target was sent in some frames")
         targets.append(values)
     joints, closed = targets
     if not np.isfinite(joints).all() or not ((closed > -0.1) & (closed < 1.1)).all():
-        return _say_measured("action/* holds NaN, or grippers that are no share of 0 open .. 1 closed")
+        return _warn_measured("action/* holds NaN, or grippers that are no share of 0 open .. 1 closed")
     return joints, readings_of(closed)
 
 
-def _say_measured(reason: str) -> Targets | None:
+def _warn_measured(reason: str) -> Targets | None:
     warnings.warn(
         f"AgiBot: {reason}; measured joints stand in for commands, so `action` says where the robot was a"
         " frame later and not where it was sent",

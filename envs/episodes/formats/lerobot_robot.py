@@ -53,11 +53,11 @@ def alike_calibrated(robot: Embodiment, other: Embodiment) -> Embodiment:
 
 def cameras_without_columns(info: dict[str, Any]) -> list[str]:
     """Names of the cameras that info.json says are calibrated, if the columns that tell how are gone."""
-    said = from_info(info)
-    known = _known_cameras(said, info["features"])
+    described = from_info(info)
+    known = _known_cameras(described, info["features"])
     return [
         mine.name
-        for mine, seen in zip(said.cameras, known.cameras, strict=True)
+        for mine, seen in zip(described.cameras, known.cameras, strict=True)
         if mine.calibrated and not seen.calibrated
     ]
 

@@ -50,12 +50,12 @@ class Tally:
 
     def add(self, reply: Reply | None) -> bool:
         """Count an answer, None if there is none; whether it says yes or no."""
-        said = None if reply is None else parse(reply.text)
+        vote = None if reply is None else parse(reply.text)
         self.unanswered += reply is None
-        self.unusable += reply is not None and said is None
-        self.yes += said is True
-        self.no += said is False
-        return said is not None
+        self.unusable += reply is not None and vote is None
+        self.yes += vote is True
+        self.no += vote is False
+        return vote is not None
 
     @property
     def votes(self) -> int:

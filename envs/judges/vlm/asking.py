@@ -142,11 +142,11 @@ class Asker:
             await asyncio.sleep(min(options.longest_pause_s, options.pause_s * 2**attempt))
             attempt += 1
 
-    def heard(self, usable: bool, text: str, asked_by: str) -> None:
+    def heard(self, usable: bool, text: str, option: str) -> None:
         """Count an answer that its asker could use, or could not.
 
         Args:
-            asked_by: the key that says how to answer, and its value.
+            option: the config key of the prompt, and its value.
 
         Raises:
             JudgeError: where too many in a row were of no use; remembered ones count, too.
@@ -157,7 +157,7 @@ class Asker:
             end = text.strip()[-_SHOWN:]
             self._over = JudgeError(
                 f"{self._unusable} answers in a row say nothing usable (judge.asking.stop_after="
-                f"{self.options.stop_after}): they must end as {asked_by} asks, and the last ends with"
+                f"{self.options.stop_after}): they must end as {option} asks, and the last ends with"
                 f" {end!r}. Choose another prompt or another model (judge.chat), or raise"
                 " judge.chat.max_tokens where answers are cut off"
             )

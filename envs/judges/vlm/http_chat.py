@@ -24,7 +24,7 @@ from envs.targets import ConfigError, nearest
 _GREETING_S = 20.0  # for a list of models
 _QUALITY = 95
 _LATER = (408, 409, 425, 429)  # refusals that may end by themselves, as those from 500 on
-_SAID = 300  # characters of a server's words that are passed on
+_SHOWN = 300  # characters of a server's words that are passed on
 
 
 class HTTPChat:
@@ -97,7 +97,7 @@ class HTTPChat:
     def _words(self, text: str) -> str:
         """The first words of an answer, or of its error message if it is JSON with one, without the key."""
         found = " ".join(self._hidden(_message(self._hidden(text))).split())
-        return found[:_SAID] or "nothing"
+        return found[:_SHOWN] or "nothing"
 
     def _session(self, seconds: float | None = None) -> aiohttp.ClientSession:
         # One for each question, which takes seconds: so nothing is left open when a run is interrupted.
@@ -156,13 +156,13 @@ class HTTPChat:
         """What to raise for an answer that is none."""
         if status in (401, 403):
             return self._unwelcome(status, text)
-        said = f"{self.url} answered {status}: {self._words(text)}"
+        reason = f"{self.url} answered {status}: {self._words(text)}"
         if status in (404, 405) or 300 <= status < 400:
             return JudgeError(
-                f"{said}. It knows no judge.chat.model={self.model}, or judge.chat.url is not the address up"
-                " to its version"
+                f"{reason}. It knows no judge.chat.model={self.model}, or judge.chat.url is not the address"
+                " up to its version"
             )
-        return Unanswered(said, wait, paid=False, again=status in _LATER or status >= 500)
+        return Unanswered(reason, wait, paid=False, again=status in _LATER or status >= 500)
 
     def _unwelcome(self, status: int, text: str) -> JudgeError:
         key = "null" if self.key is None else self.key
@@ -180,12 +180,12 @@ class HTTPChat:
         try:
             found = json.loads(text)
             message = found["choices"][0]["message"]
-            said, usage = message.get("content"), found.get("usage") or {}
+            content, usage = message.get("content"), found.get("usage") or {}
             tokens = [int(usage.get(name) or 0) for name in ("prompt_tokens", "completion_tokens")]
         except (ValueError, KeyError, IndexError, TypeError, AttributeError):
             raise Unanswered(f"{self.url} answered no chat completion: {self._words(text)}") from None
         # A refusal has no content: an answer that is neither yes nor no.
-        return Reply(self._hidden(said) if isinstance(said, str) else "", *tokens)
+        return Reply(self._hidden(content) if isinstance(content, str) else "", *tokens)
 
 
 def _content(question: Question) -> list[dict[str, Any]]:

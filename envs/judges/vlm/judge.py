@@ -88,7 +88,7 @@ class VLMJudge(Judge):
         self.pictures = options_of(Pictures, pictures, "judge.pictures")
         self.votes = options_of(Votes, votes, "judge.votes")
         self.calibrates = self.votes.calibrate
-        self._asks = prompt
+        self._prompt_option = prompt
         self.prompt = Prompt(prompt, [spec.embodiment.views[view] for view in self.views])
         limits = options_of(Budget, budget, "judge.budget")
         self.asker = Asker(build(chat, "judge.chat"), options_of(Asking, asking, "judge.asking"), limits)
@@ -174,7 +174,7 @@ class VLMJudge(Judge):
             for reply in await _all([self.asker.ask(question, vote) for vote in votes]):
                 usable = tally.add(reply)
                 if reply is not None:
-                    self.asker.heard(usable, reply.text, f"judge.prompt={self._asks}")
+                    self.asker.heard(usable, reply.text, f"judge.prompt={self._prompt_option}")
         self.asker.ledger.add("unusable", tally.unusable)
         return tally
 

@@ -85,10 +85,10 @@ class LocalChat:
 
         processor, model = self._load()
         shown = [{"type": "image", "image": Image.fromarray(picture)} for picture in question.pictures]
-        said = [{"role": "user", "content": [{"type": "text", "text": question.text}, *shown]}]
+        messages = [{"role": "user", "content": [{"type": "text", "text": question.text}, *shown]}]
         with self._lock, torch.no_grad():
             inputs = processor.apply_chat_template(
-                said, add_generation_prompt=True, tokenize=True, return_dict=True, return_tensors="pt"
+                messages, add_generation_prompt=True, tokenize=True, return_dict=True, return_tensors="pt"
             ).to(model.device, model.dtype)
             # Samples by noise on the logits (Gumbel-max) from a generator of its own: torch's global numbers
             # belong to whoever rolls out policies meanwhile.

@@ -170,8 +170,8 @@ class ForcingDiT(nn.Module):
         shift, scale = self.last(F.silu(condition)).unflatten(0, x.shape[:2])[:, :, None].chunk(2, -1)
         normed = F.layer_norm(x, (self.net.width,), eps=1e-6)
         features = normed.unflatten(2, (z.shape[2], -1)).mean(3)
-        said = self.out(torch.addcmul(shift, normed, 1 + scale))
-        return self._pictures(said, z.shape[2], grid), features.float(), kept
+        patches = self.out(torch.addcmul(shift, normed, 1 + scale))
+        return self._pictures(patches, z.shape[2], grid), features.float(), kept
 
     def _tokens(self, z: Tensor) -> tuple[Tensor, tuple[int, int]]:
         """Tokens [B, T, V * N, width] and their rows and columns in a view."""
@@ -182,9 +182,9 @@ class ForcingDiT(nn.Module):
         flat = parts.permute(0, 1, 2, 4, 6, 3, 5, 7).flatten(5).flatten(3, 4)  # [B, T, V, N, C * patch^2]
         return (self.embed(flat) + self.views).flatten(2, 3), grid
 
-    def _pictures(self, said: Tensor, views: int, grid: tuple[int, int]) -> Tensor:
+    def _pictures(self, patches: Tensor, views: int, grid: tuple[int, int]) -> Tensor:
         patch = self.net.patch
-        parts = said.unflatten(-1, (-1, patch, patch)).unflatten(2, (views, *grid))
+        parts = patches.unflatten(-1, (-1, patch, patch)).unflatten(2, (views, *grid))
         return parts.permute(0, 1, 2, 5, 3, 6, 4, 7).flatten(6, 7).flatten(4, 5).float()
 
     def _conditions(self, level: Tensor, actions: Tensor) -> Tensor:

@@ -121,12 +121,12 @@ class Connection:
         if answer.status_code == 200:
             return answer.content
         try:
-            said = parse(answer.content).get("error", "")
+            reason = parse(answer.content).get("error", "")
         except ProtocolError:
-            said = answer.content[:200].decode("utf-8", "replace")
+            reason = answer.content[:200].decode("utf-8", "replace")
         if answer.status_code == 403 and self.client_id:
-            said = f"{said}; the session was ended by the server or by another client's /init"
-        raise RemoteError(f"{self.url}{path} answered {answer.status_code}: {said or 'nothing'}")
+            reason = f"{reason}; the session was ended by the server or by another client's /init"
+        raise RemoteError(f"{self.url}{path} answered {answer.status_code}: {reason or 'nothing'}")
 
     def _send(self, path: str, body: bytes | dict[str, Any] | None) -> requests.Response:
         timeout = (self.options.connect_s, self.options.deadline_s)
@@ -216,14 +216,14 @@ class Connection:
         blocks = unpack(answer)
         if not blocks:
             raise ProtocolError("the answer is empty")
-        said = parse(blocks[0])
-        count, _, views, height, width = shape_in(said, "frame_shape", "T,3,V,H,W")
+        meta = parse(blocks[0])
+        count, _, views, height, width = shape_in(meta, "frame_shape", "T,3,V,H,W")
         if len(blocks) != count + 2:
             raise ProtocolError(f"{count} frames were announced, {len(blocks) - 2} pictures came")
         frames = np.stack([decode_frame(block, views, height, width) for block in blocks[1:-1]])
-        if said.get("state_shape") is None:
+        if meta.get("state_shape") is None:
             return Made(self.url, frames, None)
-        return Made(self.url, frames, floats(blocks[-1], shape_in(said, "state_shape", "T,S"), "state"))
+        return Made(self.url, frames, floats(blocks[-1], shape_in(meta, "state_shape", "T,S"), "state"))
 
     def close(self) -> None:
         """End the session; a server that is gone has ended it already."""

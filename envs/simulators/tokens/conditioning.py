@@ -1,6 +1,6 @@
-"""How every block of a world of tokens is told what happens: commands, or an instruction.
+"""How commands, or an instruction, condition every block of a world of tokens.
 
-What is told are a few tokens per frame, [B, T, N, width]. They are read by cross-attention, as in
+They come as a few tokens per frame, `cond` [B, T, N, width], which are read by cross-attention, as in
 RoboScape-R, or modulate the norms (adaLN, Peebles & Xie 2023).
 """
 
@@ -20,7 +20,7 @@ PARTS = 3  # of a block that are modulated: attention over space, over time, fee
 
 
 class Reader(nn.Module):
-    """The part of a block that reads what is told; x are tokens [B, T, P, width]."""
+    """The part of a block that reads `cond`; x are tokens [B, T, P, width]."""
 
     def norm(self, part: int, x: Tensor, cond: Tensor) -> Tensor:
         """The input of one of the block's parts."""
@@ -31,12 +31,12 @@ class Reader(nn.Module):
         return update
 
     def read(self, x: Tensor, cond: Tensor) -> Tensor:
-        """The tokens after they have read what is told; here nothing is read directly."""
+        """The tokens after they have read `cond`; here nothing is read directly."""
         return x
 
 
 class Conditioning(Protocol):
-    """A way to tell; a config names its class.
+    """A way to condition blocks; a config names its class.
 
     Attributes:
         tokens: per frame that commands become.
@@ -47,15 +47,15 @@ class Conditioning(Protocol):
         """See the class."""
 
     def reader(self, width: int, heads: int) -> Reader:
-        """The part of a new block that reads what is told."""
+        """The part of a new block that reads `cond`."""
 
 
 @dataclass(frozen=True)
 class CrossAttention:
-    """Every token attends to what its frame is told.
+    """Every token attends to the `cond` tokens of its frame.
 
     Args:
-        tokens: per frame that commands become: of one alone every place would be told the same.
+        tokens: per frame that commands become: of one alone every place would read the same.
     """
 
     tokens: Count
@@ -67,7 +67,7 @@ class CrossAttention:
 
 @dataclass(frozen=True)
 class AdaLN:
-    """What a frame is told shifts, scales and gates all its tokens alike."""
+    """The mean of a frame's `cond` shifts, scales and gates all its tokens alike."""
 
     tokens: int = 1
 

@@ -162,7 +162,7 @@ class TokensSimulator(Simulator):
 
     def _cond(self, inputs: TensorDict) -> Tensor:
         """Commands of memory and chunk as tokens [B, T, N, width]: each beside the one before it, so that a
-        frame is told the same wherever it stands in a chunk.
+        frame has the same wherever it stands in a chunk.
         """
         commands = torch.cat([inputs["memory", "commands"], inputs["future", "commands"]], 1)
         before = torch.cat((commands[:, :1], commands[:, :-1]), 1)

@@ -1,4 +1,4 @@
-"""Instructions as tokens that a text world is told: by frozen encoders behind a learned map."""
+"""Instructions as tokens that condition a text world: by frozen encoders behind a learned map."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class T5Words:
 
 
 class WordReader(nn.Module):
-    """Texts as tokens [B, 1, N, width] that a transformer is told.
+    """Texts as tokens [B, 1, N, width] that condition a transformer.
 
     Args:
         words: the frozen encoder.

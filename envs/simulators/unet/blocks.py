@@ -113,9 +113,9 @@ class ActionEncoder(nn.Module):
         """[B, cond] and [B, width, *cells] of commands [B, K, A], the one in force [B, A], the state [B, S],
         and the robot's frames from one shown frame to the next [B].
         """
-        told = self.vector(commands, now).flatten(1)
+        actions = self.vector(commands, now).flatten(1)
         joints = ((state - self.state_mean) / self.state_std).clamp(-5, 5)
-        cond = self.layers(torch.cat((told, joints), 1))
+        cond = self.layers(torch.cat((actions, joints), 1))
         cond = cond + self.pace(stride).to(cond.dtype)
         return cond, self.lift(self.map(cond))
 

@@ -182,9 +182,11 @@ class UNetSimulator(Simulator):
         for view, (shrink, edge, head, flow) in enumerate(
             zip(self.shrink, self.edges, self.heads, self.flows, strict=True)
         ):
-            said, still = (x, y) if shrink == 1 else (z, z)
-            drawn = unfold(head(said).permute(0, 2, 3, 1).float(), edge).unflatten(1, (chunk, self.maps))
-            moves = F.interpolate(flow(still).float(), scale_factor=self.deep_edge // 2, mode="bilinear")
+            head_input, flow_input = (x, y) if shrink == 1 else (z, z)
+            drawn = unfold(head(head_input).permute(0, 2, 3, 1).float(), edge).unflatten(
+                1, (chunk, self.maps)
+            )
+            moves = F.interpolate(flow(flow_input).float(), scale_factor=self.deep_edge // 2, mode="bilinear")
             moves = moves.unflatten(1, (chunk, 2))
             known = at_detail(frames[:, :, view].flatten(0, 1), shrink).unflatten(0, frames.shape[:2])
             views.append(compose(drawn, moves, known))
