@@ -27,8 +27,8 @@ class ShiftingWorld(Simulator):
     def __init__(self, spec: WorldSpec, memory_frames: int):
         super().__init__(spec, memory_frames)
         self.vector = ActionVector(spec.embodiment)
-        self.says = nn.Linear(spec.chunk * self.vector.size, spec.chunk * spec.views * 3)
-        nn.init.normal_(self.says.weight, std=1e-2)
+        self.head = nn.Linear(spec.chunk * self.vector.size, spec.chunk * spec.views * 3)
+        nn.init.normal_(self.head.weight, std=1e-2)
         self.feature_shape = (spec.chunk * self.vector.size,)
 
     def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
@@ -43,7 +43,7 @@ class ShiftingWorld(Simulator):
     def _draw(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """Frames float [B, K, V, 3, H, W] in about 0..1, and features."""
         actions = self.vector(inputs["future", "commands"], inputs["now", "command"]).flatten(1)
-        moves = self.says(actions).unflatten(1, (self.spec.chunk, self.spec.views, 3))
+        moves = self.head(actions).unflatten(1, (self.spec.chunk, self.spec.views, 3))
         last = inputs["memory", "frames"][:, -1:].expand(-1, self.spec.chunk, -1, -1, -1, -1).float() / 255
         flat, shift = last.flatten(0, 2), moves.flatten(0, 2)
         theta = torch.eye(2, 3, device=flat.device).repeat(len(flat), 1, 1)

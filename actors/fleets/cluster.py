@@ -105,8 +105,8 @@ class Plan:
                     f" (process {number + 1} of {self.counts[role]})" if self.counts[role] > 1 else ""
                 )
                 raise ConfigError(
-                    f"{where} needs {_say(need)}, which no node has left: all roles together ask for"
-                    f" {_say(requested)}, the {len(nodes)} node(s) have {_say(total)}. "
+                    f"{where} needs {_listed(need)}, which no node has left: all roles together ask for"
+                    f" {_listed(requested)}, the {len(nodes)} node(s) have {_listed(total)}. "
                     "Lower launch.actors or the shares in launch.place, or add nodes"
                 )
             # Collocated fills the fullest node first, the others the emptiest.
@@ -124,7 +124,7 @@ class Plan:
         return {"num_cpus": self.cpus[role], "num_gpus": self.gpus[role], "scheduling_strategy": spread}
 
 
-def _say(need: Mapping[str, float]) -> str:
+def _listed(need: Mapping[str, float]) -> str:
     return " and ".join(f"{value:g} {key}" for key, value in need.items() if value or key == "CPU")
 
 
@@ -235,18 +235,22 @@ def _knock(address: str) -> None:
 
 
 def _advice(address: str, error: Exception) -> str:
-    said = str(error).splitlines()[0] if str(error) else ""
-    if "version" in said.lower():
-        return f"launch.address={address}: {said}; install the versions of constraints.txt on every node"
-    if isinstance(error, ConnectionError) or "token" in said.lower() or "unauthenticated" in said.lower():
+    message = str(error).splitlines()[0] if str(error) else ""
+    if "version" in message.lower():
+        return f"launch.address={address}: {message}; install the versions of constraints.txt on every node"
+    if (
+        isinstance(error, ConnectionError)
+        or "token" in message.lower()
+        or "unauthenticated" in message.lower()
+    ):
         # Ray logs InvalidAuthToken and then only says that it could not connect.
         return (
             f"launch.address={address} listens, but does not let us in; most often it refused our token: copy"
             " ~/.ray/auth_token of the head node to this machine and set RAY_AUTH_MODE=token, "
             f"or set RAY_AUTH_MODE=disabled everywhere on a network you trust ({type(error).__name__}:"
-            f" {said})"
+            f" {message})"
         )
-    return f"launch.address={address}: {type(error).__name__}: {said}; see /tmp/ray/session_latest/logs"
+    return f"launch.address={address}: {type(error).__name__}: {message}; see /tmp/ray/session_latest/logs"
 
 
 def _compare(nodes: int, patience: float) -> None:
@@ -285,7 +289,7 @@ def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str]) -> None:
     """
     wrong = {key: (theirs.get(key), value) for key, value in mine.items() if theirs.get(key) != value}
     if wrong:
-        says = ", ".join(f"{key} {other} instead of {own}" for key, (other, own) in wrong.items())
+        differences = ", ".join(f"{key} {other} instead of {own}" for key, (other, own) in wrong.items())
         raise ConfigError(
-            f"a node of the cluster has {says}; install the versions of constraints.txt on every node"
+            f"a node of the cluster has {differences}; install the versions of constraints.txt on every node"
         )

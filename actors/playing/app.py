@@ -34,11 +34,11 @@ class PlayServer:
 
     Args:
         make: builds the game, in that thread.
-        said: is printed once the game can be played.
+        greeting: is printed once the game can be played.
     """
 
-    def __init__(self, make: Callable[[], Game], said: str = ""):
-        self._make, self._said = make, said
+    def __init__(self, make: Callable[[], Game], greeting: str = ""):
+        self._make, self._greeting = make, greeting
         self._thread = ThreadPoolExecutor(1, "game")
         self._turn = asyncio.Lock()
 
@@ -62,8 +62,8 @@ class PlayServer:
 
         try:
             self.game, self._last = await self._in_turn(first)
-            if self._said:
-                print(self._said, flush=True)
+            if self._greeting:
+                print(self._greeting, flush=True)
             yield
         finally:
             self._thread.shutdown()
@@ -109,7 +109,7 @@ class PlayServer:
     async def about(self, request: web.Request) -> web.Response:
         """The robot, what can be chosen, and the last frames."""
 
-        def told() -> dict[str, Any]:
+        def description() -> dict[str, Any]:
             game, robot = self.game, self.game.robot
             last = Shown(self._last.true[-1:], self._last.imagined[-1:])
             return {
@@ -126,49 +126,49 @@ class PlayServer:
                 "frames": _pictures(last),
             }
 
-        return json_answer(200, await self._in_turn(told))
+        return json_answer(200, await self._in_turn(description))
 
     async def reset(self, request: web.Request) -> web.Response:
         """Lay out an episode: {"seed": n, "task": name or ""}."""
-        said = parse(await request.read())
-        seed = _whole(said, "seed", 0, _SEEDS)
-        return await self._play(lambda: self.game.reset(seed, str(said.get("task") or "")))
+        body = parse(await request.read())
+        seed = _whole(body, "seed", 0, _SEEDS)
+        return await self._play(lambda: self.game.reset(seed, str(body.get("task") or "")))
 
     async def hand_over(self, request: web.Request) -> web.Response:
         """Let somebody else drive: {"to": "expert", "noise_level": x} or {"to": "recorded", "number": n}."""
-        said = parse(await request.read())
-        number = _whole(said, "number", 0, _SEEDS, 0)
-        noise = _number(said, "noise_level", 0.0, 1.0, 0.0)
-        return await self._play(lambda: self.game.hand_over(str(said.get("to")), number, noise))
+        body = parse(await request.read())
+        number = _whole(body, "number", 0, _SEEDS, 0)
+        noise = _number(body, "noise_level", 0.0, 1.0, 0.0)
+        return await self._play(lambda: self.game.hand_over(str(body.get("to")), number, noise))
 
     async def step(self, request: web.Request) -> web.Response:
         """Some actions: {"actions": n, "held": {position: -1..1}, "speed": x}; without "held" of whoever
         drives.
         """
-        said = parse(await request.read())
-        count = _whole(said, "actions", 1, self.game.chunk, 1)
-        if said.get("held") is None:
+        body = parse(await request.read())
+        count = _whole(body, "actions", 1, self.game.chunk, 1)
+        if body.get("held") is None:
             return await self._play(lambda: self.game.go_on(count))
-        speed, width = _number(said, "speed", 0.0, 10.0, 1.0), self.game.robot.action_dim
-        if not isinstance(said["held"], dict):
+        speed, width = _number(body, "speed", 0.0, 10.0, 1.0), self.game.robot.action_dim
+        if not isinstance(body["held"], dict):
             raise ProtocolError('held must be an object such as {"0": 1, "6": -1}')
         known = {str(number): number for number in range(width)}
-        strange = sorted(said["held"].keys() - known.keys())
+        strange = sorted(body["held"].keys() - known.keys())
         if strange:
             raise ProtocolError(f"held names {strange[:4]}; the numbers of an action are 0..{width - 1}")
-        held = {known[key]: _number(said["held"], key, -1.0, 1.0) for key in said["held"]}
+        held = {known[key]: _number(body["held"], key, -1.0, 1.0) for key in body["held"]}
         return await self._play(lambda: self.game.press(held, speed, count))
 
 
-def _whole(said: dict[str, Any], name: str, low: int, high: int, default: int | None = None) -> int:
-    value = said.get(name, default)
+def _whole(body: dict[str, Any], name: str, low: int, high: int, default: int | None = None) -> int:
+    value = body.get(name, default)
     if type(value) is not int or not low <= value <= high:
         raise ProtocolError(f"{name}={str(value)[:40]} must be a whole number in {low}..{high}")
     return value
 
 
-def _number(said: dict[str, Any], name: str, low: float, high: float, default: float | None = None) -> float:
-    value = said.get(name, default)
+def _number(body: dict[str, Any], name: str, low: float, high: float, default: float | None = None) -> float:
+    value = body.get(name, default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
         raise ProtocolError(f"{name}={str(value)[:40]} must be a number in {low:g}..{high:g}")
     return float(value)
@@ -185,6 +185,8 @@ def _url(views: NDArray[np.uint8]) -> str:
     return f"data:image/png;base64,{base64.b64encode(data.tobytes()).decode()}"
 
 
-def play(make: Callable[[], Game], server: socket.socket, said: str) -> None:
+def play(make: Callable[[], Game], server: socket.socket, greeting: str) -> None:
     """Serve a game on a bound socket until interrupted; see PlayServer."""
-    web.run_app(PlayServer(make, said).app(), sock=server, print=None, access_log=None, shutdown_timeout=2.0)
+    web.run_app(
+        PlayServer(make, greeting).app(), sock=server, print=None, access_log=None, shutdown_timeout=2.0
+    )

@@ -59,12 +59,12 @@ class ChunkTokens(Distribution):
             return self._decode(drawn.movedim(-1, 0).reshape(*sample_shape, *share.shape[:-1]))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        said = (
+        log_probs = (
             self.log_share.expand(*value.shape, self.bins)
             .gather(-1, bins_of(value, self.low, self.high, self.bins).unsqueeze(-1))
             .squeeze(-1)
         )
-        return (said * self.active).sum((-2, -1))
+        return (log_probs * self.active).sum((-2, -1))
 
     def entropy(self) -> Tensor:
         return -((self.log_share.exp() * self.log_share).sum(-1) * self.active).sum((-2, -1))

@@ -132,8 +132,8 @@ def disagreement(policy: TensorDictModuleBase, one: TensorDictBase, other: Tenso
     if own is not None:
         return own(with_text(one, policy), with_text(other, policy))  # type: ignore[no-any-return]
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        said = [policy(inputs_for(side, policy))[CHUNK] for side in (one, other)]
-    return (imitation_loss(policy, one, said[1]) + imitation_loss(policy, other, said[0])) / 2
+        chunks = [policy(inputs_for(side, policy))[CHUNK] for side in (one, other)]
+    return (imitation_loss(policy, one, chunks[1]) + imitation_loss(policy, other, chunks[0])) / 2
 
 
 def with_fixed_spread(dist: Any) -> Any:

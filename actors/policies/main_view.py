@@ -44,15 +44,15 @@ class MainViewPolicy(TensorDictModuleBase):
         shown = TensorDict({IMAGE: torch.zeros(1, spec.views, 3, *spec.size, dtype=torch.uint8)}, [1])
         shown[STATE], shown[INSTRUCTION] = torch.zeros(1, spec.state_dim), ""
         with torch.no_grad():
-            said = self(shown)  # layers that take their size from the first input take it here
-        if CHUNK not in said.keys(True, True):
+            output = self(shown)  # layers that take their size from the first input take it here
+        if CHUNK not in output.keys(True, True):
             raise ValueError("policy.policy must say chunks beside tokens; set its output_mode to both")
 
     def forward(self, observed: TensorDictBase) -> TensorDictBase:
         """Writes tokens int64 [B, K, A], chunk float32 [B, K, A] and log-probability [B]."""
-        said = self.policy(self._main_view(observed))
+        output = self.policy(self._main_view(observed))
         for key in self.out_keys:
-            observed[key] = said[key]
+            observed[key] = output[key]
         return observed
 
     def get_dist(self, observed: TensorDictBase) -> torch.distributions.Distribution:

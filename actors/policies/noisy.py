@@ -30,7 +30,7 @@ class GaussianNoise(TensorDictModuleBase):
 
     def forward(self, observed: TensorDictBase) -> TensorDictBase:
         """Writes the disturbed chunk float32 [B, K, A]; the draws are torch's own."""
-        said = self.policy(observed)
-        chunk = said[CHUNK]
-        said[CHUNK] = chunk + self.level * self.spread.to(chunk.device) * torch.randn_like(chunk)
-        return said
+        output = self.policy(observed)
+        chunk = output[CHUNK]
+        output[CHUNK] = chunk + self.level * self.spread.to(chunk.device) * torch.randn_like(chunk)
+        return output

@@ -84,13 +84,14 @@ class OpenPIPolicy(TensorDictModuleBase):
         """Writes the chunk float32 [B, K, A]."""
         words = bytes_to_text(tensordict[INSTRUCTION_UTF8])
         rows = [
-            self._ask(tensordict[IMAGE][row], tensordict[STATE][row], text) for row, text in enumerate(words)
+            self._infer(tensordict[IMAGE][row], tensordict[STATE][row], text)
+            for row, text in enumerate(words)
         ]
         commands = torch.stack(rows).to(tensordict[IMAGE].device)
         tensordict[CHUNK] = to_chunk(commands, tensordict[COMMAND], self.mode)
         return tensordict
 
-    def _ask(self, image: Tensor, state: Tensor, words: str) -> Tensor:
+    def _infer(self, image: Tensor, state: Tensor, words: str) -> Tensor:
         """Commands [K, A] of one episode, image uint8 [V, 3, H, W], state [S]."""
         seen: dict[str, Any] = {
             f"observation.images.{view}": image[k].permute(1, 2, 0).contiguous().cpu().numpy()
@@ -102,16 +103,16 @@ class OpenPIPolicy(TensorDictModuleBase):
             answer = self._client.infer(seen)
         except Exception as error:  # the client raises whatever the socket or the server did
             raise PolicyServerError(f"{self.url}: {type(error).__name__}: {error}") from error
-        said = np.asarray(answer.get("actions") if isinstance(answer, dict) else None, dtype=np.float32)
-        said = said[0] if said.ndim == 3 and len(said) == 1 else said
+        actions = np.asarray(answer.get("actions") if isinstance(answer, dict) else None, dtype=np.float32)
+        actions = actions[0] if actions.ndim == 3 and len(actions) == 1 else actions
         chunk = self.spec.chunk
-        fits = said.ndim == 2 and said.shape[1] == self.width and len(said) >= chunk
-        if not fits or not np.isfinite(said).all():
+        fits = actions.ndim == 2 and actions.shape[1] == self.width and len(actions) >= chunk
+        if not fits or not np.isfinite(actions).all():
             raise PolicyServerError(
-                f"{self.url} answered actions of shape {said.shape}, wanted at least {chunk} finite rows of"
-                f" {self.width} numbers"
+                f"{self.url} answered actions of shape {actions.shape}, wanted at least {chunk} finite rows"
+                f" of {self.width} numbers"
             )
-        rows = compress(torch.from_numpy(np.array(said)), chunk, self.grippers)
+        rows = compress(torch.from_numpy(np.array(actions)), chunk, self.grippers)
         return rows if self.to_poses is None else self.to_poses(rows)
 
 

@@ -39,9 +39,9 @@ class SafePolicyWrapper(TensorDictModuleBase):
         Raises:
             ConfigError: if the policy's chunks are of another size than the world takes.
         """
-        said = self.policy(inputs_for(observed, self.policy))
+        output = self.policy(inputs_for(observed, self.policy))
         for key in self.policy.out_keys:
-            value = said.get(key, None)
+            value = output.get(key, None)
             if value is not None:
                 observed[key] = value.to(observed[COMMAND].device)
         chunk = observed[CHUNK]

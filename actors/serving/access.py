@@ -68,8 +68,8 @@ async def writes(request: web.Request, handler: Handler) -> web.StreamResponse:
         return json_answer(403, {"error": f"a page of {origin[:80]} may not drive this simulator"})
     token = os.environ.get(TOKEN)
     if token:
-        said = request.headers.get("Authorization", "")
-        if not hmac.compare_digest(said.encode(), f"Bearer {token}".encode()):
+        authorization = request.headers.get("Authorization", "")
+        if not hmac.compare_digest(authorization.encode(), f"Bearer {token}".encode()):
             return json_answer(401, {"error": f"this server wants a token; set {TOKEN} to its own"})
     return await handler(request)
 

@@ -80,9 +80,9 @@ class Server:
         yield
         task.cancel()
 
-    def _session(self, request: web.Request, said: dict[str, Any]) -> Session:
+    def _session(self, request: web.Request, meta: dict[str, Any]) -> Session:
         """The session that a request names, reached by the request's connection from now on."""
-        session = self.host.get(said.get("client_id"))
+        session = self.host.get(meta.get("client_id"))
         session.connection = request.transport
         return session
 
@@ -150,8 +150,8 @@ class Server:
     # -- binary endpoints
     async def set_episode_data(self, request: web.Request) -> web.Response:
         """The first frame; whatever came of an earlier one is forgotten."""
-        picture, said = unpack(await self._body(request), 2)
-        meta = parse(said)
+        picture, header = unpack(await self._body(request), 2)
+        meta = parse(header)
         session = self._session(request, meta)
         _, views, height, width = shape_in(meta, "frame_shape", f"3,{self.host.spec.views},H,W")
         frame = await asyncio.to_thread(
@@ -175,8 +175,8 @@ class Server:
 
     async def set_episode_traj(self, request: web.Request) -> web.Response:
         """Pose maps and cameras of a whole recording, or of the chunk to come."""
-        pictures, poses, said = unpack(await self._body(request), 3)
-        meta = parse(said)
+        pictures, poses, header = unpack(await self._body(request), 3)
+        meta = parse(header)
         session = self._session(request, meta)
         _, views, count, height, width = shape_in(meta, "traj_shape", f"3,{self.host.spec.views},T,H,W")
         shape_in(meta, "c2w_shape", f"{views},{count},4,4")
@@ -201,8 +201,8 @@ class Server:
     async def step(self, request: web.Request) -> web.Response:
         """One chunk: frames as JPEGs, and joint states."""
         body = await self._body(request)
-        values, said = unpack(body, 2)
-        meta = parse(said)
+        values, header = unpack(body, 2)
+        meta = parse(header)
         session = self._session(request, meta)
         actions = floats(values, shape_in(meta, "action_shape", "L,A"), "actions")
         async with session.lock:
