@@ -58,8 +58,8 @@ class RecordedDecisions:
     def _usual(self, some: TensorDict) -> torch.Tensor:
         """Whether the policy might well have said the chunks of decisions [N]: bool [N]."""
         seen = distribution(self.policy, inputs_for(self._seen(some), self.policy))
-        said = torch.stack([seen.log_prob(seen.sample()) for _ in range(_SAMPLES)]).mean(0)
-        return (seen.log_prob(some[CHUNK].to(said.device)) > said - _UNLIKELY).cpu()
+        expected = torch.stack([seen.log_prob(seen.sample()) for _ in range(_SAMPLES)]).mean(0)
+        return (seen.log_prob(some[CHUNK].to(expected.device)) > expected - _UNLIKELY).cpu()
 
     def _seen(self, some: TensorDict) -> TensorDict:
         """Decisions [N] with what the policy reads: no pictures if it was left its features alone."""

@@ -104,8 +104,8 @@ def outcome(batch: TensorDict) -> dict[str, float]:
     something has.
     """
     done, success = batch["next", "done"].squeeze(-1), batch["next", SUCCESS].squeeze(-1)
-    mine, stood, said = first_episode(done), whole(batch)[:, 0], finite(batch)[:, 0]
-    kept = stood & said & judged(batch)[:, 0]
+    mine, stood, finite_actions = first_episode(done), whole(batch)[:, 0], finite(batch)[:, 0]
+    kept = stood & finite_actions & judged(batch)[:, 0]
     reward = (batch["next", "reward"].squeeze(-1) * mine).sum(1)[kept]
     there = bool(kept.any())
     return {
@@ -113,6 +113,6 @@ def outcome(batch: TensorDict) -> dict[str, float]:
         "return": float(reward.mean()) if there else 0.0,
         "reward_std": float(reward.std(unbiased=False)) if there else 0.0,
         "dropped_by_physics": float((~stood).sum()),
-        "dropped_nan": float((stood & ~said).sum()),
-        "dropped_by_judge": float((stood & said & ~kept).sum()),
+        "dropped_nan": float((stood & ~finite_actions).sum()),
+        "dropped_by_judge": float((stood & finite_actions & ~kept).sum()),
     }

@@ -122,13 +122,13 @@ def calibrate_ending(
     known = (ahead - stride < last) & store.arrays["present"][rows] & torch.isfinite(done)
     if not known.any():
         return False
-    said = []
+    predicted = []
     for some in torch.arange(len(episodes)).split(batch):
         first = store.start[episodes[some]][:, None]
         frames = store.frames(torch.cat((first, rows[some]), 1))
         texts = [store.instructions[number] for number in episodes[some].tolist()]
-        said.append(world.done_along(frames, texts)[:, 1:])
-    found = as_likely_as_not(torch.cat(said)[known].double(), done[known] > 0)
+        predicted.append(world.done_along(frames, texts)[:, 1:])
+    found = as_likely_as_not(torch.cat(predicted)[known].double(), done[known] > 0)
     if found is not None:
         world.threshold.fill_(found)
     return found is not None

@@ -47,18 +47,18 @@ class CodecAlarm:
     codec: TrainableCodec
     patience: int = 100
     bad: int = 0
-    said: str = ""
+    message: str = ""
 
     def check(self, figures: Mapping[str, float]) -> None:
         """Look at one step's figures."""
         warning = self.codec.warning(figures)
         self.bad = self.bad + 1 if warning else 0
-        if self.bad == self.patience and not self.said:
-            self.say(warning)
+        if self.bad == self.patience and not self.message:
+            self.give(warning)
 
-    def say(self, warning: str) -> None:
+    def give(self, warning: str) -> None:
         """Give the alarm."""
-        self.said = warning
+        self.message = warning
         tqdm.write(f"ALARM tokenizer: {warning}")
 
 
@@ -104,5 +104,5 @@ def train_tokenizer(
     codec.normalise(sample)
     last = codec.figures(sample)
     if warning := codec.warning(last):
-        alarm.say(warning)
-    return {**stats, **last, "alarm": alarm.said}
+        alarm.give(warning)
+    return {**stats, **last, "alarm": alarm.message}

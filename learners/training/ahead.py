@@ -39,7 +39,7 @@ class BatchesAhead:
         self._next: Future[Drawn] | None = None
 
     def __enter__(self) -> BatchesAhead:
-        self._ask()
+        self._submit_next()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -53,10 +53,10 @@ class BatchesAhead:
         """
         assert self._next is not None, "there are no more batches"
         drawn = self._next.result()
-        self._ask()
+        self._submit_next()
         return drawn
 
-    def _ask(self) -> None:
+    def _submit_next(self) -> None:
         following = next(self._order, None)
         self._next = None if following is None else self._thread.submit(self._make, *following)
 

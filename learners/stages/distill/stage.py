@@ -70,7 +70,7 @@ def check_pair(teacher: Simulator, student: Simulator) -> None:
         "simulator.pose_map": (teacher.spec.pose_map, student.spec.pose_map),
         "simulator.ray_map": (teacher.spec.ray_map, student.spec.ray_map),
         "simulator.memory_frames": (teacher.memory_frames, student.memory_frames),
-        "simulator.actions": (_told(teacher), _told(student)),
+        "simulator.actions": (_actions_of(teacher), _actions_of(student)),
         "simulator._target_": (type(teacher).__name__, type(student).__name__),
     }
     odd = [f"{key}: {a!r} and {b!r}" for key, (a, b) in pairs.items() if a != b]
@@ -91,10 +91,10 @@ def check_pair(teacher: Simulator, student: Simulator) -> None:
         )
 
 
-def _told(world: Simulator) -> str:
-    """How an engine that may be told of actions in several ways is, with its numbers; "" of others."""
-    told = getattr(world, "actions", None)
-    if not isinstance(told, nn.Module):
+def _actions_of(world: Simulator) -> str:
+    """Class and numbers of the action encoder of an engine that offers several; "" of others."""
+    actions = getattr(world, "actions", None)
+    if not isinstance(actions, nn.Module):
         return ""
-    numbers = {key: value for key, value in vars(told).items() if type(value) in (int, float, str)}
-    return f"{type(told).__name__} {numbers}"
+    numbers = {key: value for key, value in vars(actions).items() if type(value) in (int, float, str)}
+    return f"{type(actions).__name__} {numbers}"

@@ -117,11 +117,11 @@ def test_a_collapsed_codebook_gives_one_alarm_that_says_what_to_do(
         for _ in range(8):
             _, figures = codec.loss(pictures(2))
             alarm.check({name: float(value) for name, value in figures.items()})
-    assert "simulator.codec.entropy" in alarm.said and "collapsed" in alarm.said
-    assert capsys.readouterr().err.count("ALARM tokenizer") + alarm.said.count("ALARM") <= 1
+    assert "simulator.codec.entropy" in alarm.message and "collapsed" in alarm.message
+    assert capsys.readouterr().err.count("ALARM tokenizer") + alarm.message.count("ALARM") <= 1
     healthy = CodecAlarm(codec, patience=1)
     healthy.check({"psnr": 20.0, "perplexity": 9.0})
-    assert not healthy.said and codec.warning(codec.figures(pictures(2)))
+    assert not healthy.message and codec.warning(codec.figures(pictures(2)))
 
 
 @pytest.mark.parametrize("name", ENGINES)
