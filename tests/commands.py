@@ -13,7 +13,7 @@ class Ended:
     """What came of a command: its exit status, and all that it printed."""
 
     status: int
-    said: str
+    output: str
 
 
 def worldloop(folder: Path, *words: str) -> Ended:

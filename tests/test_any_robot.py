@@ -29,7 +29,7 @@ SMALL = (
 def loop(command: str, folder: Path, *words: str) -> None:
     """Run a command of the loop in a process of its own: `run`, or `rl` up to the last policy."""
     out = worldloop(folder, command, *SMALL, f"runs={folder}", *words)
-    assert out.status == 0, out.said[-4000:]
+    assert out.status == 0, out.output[-4000:]
     assert list((folder / "smoke/stages").glob("rl-1-*/weights.safetensors"))
 
 

@@ -107,9 +107,9 @@ def _recovery(fleet: RayFleet) -> None:
     deadline = time.monotonic() + 60
     while not fleet.recoveries and time.monotonic() < deadline:
         time.sleep(0.05)
-    said = f"{fleet.recoveries[0]:.1f} s" if fleet.recoveries else "not within a minute"
+    recovery = f"{fleet.recoveries[0]:.1f} s" if fleet.recoveries else "not within a minute"
     print(
-        f"a killed host was replaced after {said} (goal 10); the four jobs under way were done after"
+        f"a killed host was replaced after {recovery} (goal 10); the four jobs under way were done after"
         f" {time.monotonic() - began:.1f} s"
     )
 

@@ -115,7 +115,7 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
     warm = graph.add("tokenizer", world.tokenizer, {"data": data}) if "codec" in cfg["simulator"] else ""
     teacher = graph.add("simulator", world.simulator, {"data": data, "warm": warm}, phase="first")
     rows = {}
-    asks: Any = target(cfg["judge"], "judge")
+    judge_class: Any = target(cfg["judge"], "judge")
     golden = (
         graph.add("text_world", world.text_world, {"data": data}, phase="first")
         if "text_world" in cfg["judge"]
@@ -124,7 +124,7 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
 
     def judged(own: Graph, name: str, simulator: str) -> str:
         """The judge of a simulator; one that sees pictures alone is the same for all."""
-        if not asks.reads_features:
+        if not judge_class.reads_features:
             own, name, simulator = graph, "all", teacher
         if f"judge-{name}" in own.nodes:
             return f"judge-{name}"

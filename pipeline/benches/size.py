@@ -207,13 +207,13 @@ def size(cfg: Mapping[str, Any]) -> None:
     spec = world_spec(cfg)
     found, batch = size_of(cfg["simulator"], spec), int(cfg["simulator_fit"]["first"]["fit"]["batch"])
     name = str(cfg["simulator"]["_target_"]).rpartition(".")[2]
-    print(_said(name, f"chunks of {spec.chunk}", "one chunk", spec, found, batch))
+    print(_summary(name, f"chunks of {spec.chunk}", "one chunk", spec, found, batch))
     if text_world := cfg["judge"].get("text_world"):
         found, batch = text_world_size(text_world, spec), int(cfg["text_world_fit"]["first"]["batch"])
-        print(_said("TextWorld", f"clips of {text_world['window']}", "one frame", spec, found, batch))
+        print(_summary("TextWorld", f"clips of {text_world['window']}", "one frame", spec, found, batch))
 
 
-def _said(name: str, what: str, made: str, spec: WorldSpec, found: Size, batch: int) -> str:
+def _summary(name: str, what: str, made: str, spec: WorldSpec, found: Size, batch: int) -> str:
     weights, state = (_FLOAT * n / 1e9 for n in (found.trained + found.frozen, _STATE * found.trained))
     kept = found.activations / 1e9
     return (

@@ -101,7 +101,7 @@ class Soak:
         workers = 2 if chance.random() < _WITH_WORKERS else 1
         with self.log.open("a") as log:
             log.write(f"\n##### life {self.books.lives} of {name} on {self.launch}, {workers} workers\n")
-        self.said_from, self.began = self.log.stat().st_size, time.time()
+        self.log_start, self.began = self.log.stat().st_size, time.time()
         words = ["run", *self.words, f"runs={self.folder}", f"name={name}", "track=disabled"]
         words += [f"launch={self.launch}", f"launch.workers={workers}"]
         words += ["launch.cpus=4"] if self.launch == "ray" else []
@@ -121,14 +121,14 @@ class Soak:
         nothing_left(self.mark, process.pid, self._failure, self.patience)
         return int(process.exitcode)
 
-    def _said(self) -> str:
+    def _output(self) -> str:
         with self.log.open("rb") as log:
-            log.seek(self.said_from)
+            log.seek(self.log_start)
             return log.read().decode(errors="replace")
 
     def _failure(self, what: str) -> ChaosFailure:
         return ChaosFailure(
-            f"life {self.books.lives} said: ...{self._said()[-1500:]}\n"
+            f"life {self.books.lives} said: ...{self._output()[-1500:]}\n"
             f"event {self.books.count}, life {self.books.lives}: {what}. See {self.log}; the same command"
             " goes on from there"
         )
@@ -237,13 +237,13 @@ class Soak:
             answers.add(-number)
         if status not in answers:
             raise self._failure(f"it ended with {status} after {kind}")
-        if kind != "SIGKILL" and "Traceback" in self._said():
+        if kind != "SIGKILL" and "Traceback" in self._output():
             raise self._failure(f"{kind} was answered by a traceback")
         self.books.note(met, kind, self.launch, "ended as asked")
 
     def _has_come_to(self, stage: str) -> bool:
         """Whether a life has, or is beyond; of "", whether it has said anything."""
-        return self._at_work() == stage or stage not in self._left() if stage else bool(self._said())
+        return self._at_work() == stage or stage not in self._left() if stage else bool(self._output())
 
     def _ended_well(self, status: int) -> None:
         """A life that ended before its disturbance, because all is done."""
@@ -260,13 +260,13 @@ class Soak:
         if status == 0:
             self._ended_well(status)
             return
-        said, met = self._said(), self._at_work()
+        output, met = self._output(), self._at_work()
         if kind != "disk full":
             if status != -signal.SIGKILL:
                 raise self._failure(f"it ended with {status} before it was killed at a write")
             self.books.note(met, kind, self.launch, "ended as asked")
             return
-        if status != 1 or "Traceback" in said or "No space left" not in said:
+        if status != 1 or "Traceback" in output or "No space left" not in output:
             raise self._failure(f"a full disk was answered by exit status {status}")
         self.books.note(met, kind, self.launch, "told in a line")
 
@@ -279,10 +279,10 @@ class Soak:
             return
         folder, what = done
         status = self._end(self._begin(chance, self.name))
-        said = self._said()
+        output = self._output()
         if status == 0:
             raise self._failure(f"{what} was not noticed")
-        if status != 1 or "Traceback" in said or folder.name not in said:
+        if status != 1 or "Traceback" in output or folder.name not in output:
             raise self._failure(f"{what} was answered by exit status {status}")
         place = folder.relative_to(run / "stages").parts[0]
         shutil.rmtree(folder)

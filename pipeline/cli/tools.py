@@ -61,8 +61,8 @@ def play(words: Words) -> None:
     with listening(config) as server:
         sides = " and ".join([*["physics"] * bool(cfg["task"]["suite"]), *["imagination"] * bool(world)])
         where = f"http://{config.host}:{server.getsockname()[1]}"
-        said = f"{sides} of {cfg['task']['name']}: open {where} in a browser, end with Ctrl-C"
-        run_game(lambda: build_game(cfg, world, Path(chosen[-1]) if chosen else None), server, said)
+        greeting = f"{sides} of {cfg['task']['name']}: open {where} in a browser, end with Ctrl-C"
+        run_game(lambda: build_game(cfg, world, Path(chosen[-1]) if chosen else None), server, greeting)
 
 
 def convert(words: Words) -> None:

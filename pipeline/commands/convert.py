@@ -115,15 +115,15 @@ def inspect(
     """
     target.mkdir(parents=True, exist_ok=True)
     made: list[Path] = []
-    said: set[str] = set()
+    warned: set[str] = set()
     cut = cut if cut.size else replace(cut, size=_common_size(source))
     for number, episode in enumerate(islice(read_any(source, cut), episodes)):
         shown = np.flatnonzero(episode.present)
         shown = shown[np.linspace(0, len(shown) - 1, min(rows, len(shown))).round().astype(int)]
         part, bare = episode.take(shown), why_bare(episode)
-        if bare and bare not in said:
+        if bare and bare not in warned:
             tqdm.write(f"{source.name}, from episode {number} on: {bare}")
-            said.add(bare)
+            warned.add(bare)
         maps = np.full_like(part.frames, CANVAS) if bare else _pose_maps(part, style)
         sheet = np.concatenate(
             [

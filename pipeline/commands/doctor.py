@@ -30,27 +30,27 @@ def examine() -> int:
     """Print the findings; returns 0 if quickstart would run."""
     fine = True
 
-    def say(good: bool, what: str, fix: str = "") -> None:
+    def report(good: bool, what: str, fix: str = "") -> None:
         nonlocal fine
         fine &= good
         print(f"[{'ok' if good else 'NO'}] {what}" + (f"\n     {fix}" if fix and not good else ""))
 
-    say(
+    report(
         True,
         f"{platform.system()} {platform.release()}, Python {platform.python_version()},"
         f" {os.cpu_count()} cores",
     )
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    say(memory >= 6, f"{memory:.0f} GiB of memory", "quickstart needs about 6 GiB")
+    report(memory >= 6, f"{memory:.0f} GiB of memory", "quickstart needs about 6 GiB")
     free = shutil.disk_usage(".").free / 2**30
-    say(free >= 4, f"{free:.0f} GiB of disk free here", "quickstart needs about 4 GiB")
+    report(free >= 4, f"{free:.0f} GiB of disk free here", "quickstart needs about 4 GiB")
     for package in _NEEDED:
         try:
-            say(True, f"{package} {version(package)}")
+            report(True, f"{package} {version(package)}")
         except PackageNotFoundError:
-            say(False, f"{package} is missing", "make setup")
+            report(False, f"{package} is missing", "make setup")
     if torch.cuda.is_available():
-        say(True, f"GPU: {torch.cuda.get_device_name()}")
+        report(True, f"GPU: {torch.cuda.get_device_name()}")
     else:
         print("[--] no GPU; everything runs on the CPU")
     try:
@@ -60,12 +60,12 @@ def examine() -> int:
         task = load_config([])["task"]
         suite = build_suite(task["suite"])
         suite.reset(task["name"], 0)
-        say(
+        report(
             int(suite.render().max()) > 0,
             f"OpenGL renders (MUJOCO_GL={os.environ.get('MUJOCO_GL', 'egl')})",
             "the picture is black: try MUJOCO_GL=osmesa",
         )
     except Exception as error:  # whatever is wrong with the driver, the doctor's work is to say so
-        say(False, "OpenGL", str(error))
+        report(False, "OpenGL", str(error))
     print("\nready: make quickstart" if fine else "\nnot ready: see the lines marked NO")
     return 0 if fine else 1

@@ -131,13 +131,13 @@ def carry_out(
             chunk[mine] = chunks[number, mine].to(chunk.device)
         acted[CHUNK] = chunk
         after = physics.step(acted)
-        told = judge.score(after["next", IMAGE].unsqueeze(1), first, texts).progress[:, 0].cpu()
+        progress = judge.score(after["next", IMAGE].unsqueeze(1), first, texts).progress[:, 0].cpu()
         won |= ~over & after["next", SUCCESS].squeeze(-1)
         lost |= after["next", LOST].squeeze(-1)
-        told = torch.where(won, 1.0, told)
+        progress = torch.where(won, 1.0, progress)
         for number in range(depth):
             at = since == number
-            seen[number, at] = told[at]
+            seen[number, at] = progress[at]
         over |= after["next", "done"].squeeze(-1)
         now = step_mdp(after)
     return seen[:, :count], won.float().masked_fill(lost, torch.nan)[:count]

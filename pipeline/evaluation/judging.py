@@ -120,5 +120,5 @@ def facts_text(facts: Mapping[str, Any]) -> str:
 
 def cost_text(cost: Mapping[str, float]) -> str:
     """What a judge was asked for and paid, in a line."""
-    said = (f"{name.replace('_', ' ')} {value:.6g}" for name, value in cost.items() if value)
-    return ", ".join(said) or ("all remembered" if cost else "free")
+    parts = (f"{name.replace('_', ' ')} {value:.6g}" for name, value in cost.items() if value)
+    return ", ".join(parts) or ("all remembered" if cost else "free")

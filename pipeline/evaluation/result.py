@@ -125,11 +125,12 @@ def _why(result: Mapping[str, Any], points: float, imagined: float) -> str:
             " per round"
         )
     if gap > _BLIND:
-        true, said = (100 * rate(result["rounds"][-1][key]) for key in ("true", "imagined"))
+        true, predicted = (100 * rate(result["rounds"][-1][key]) for key in ("true", "imagined"))
         return (
-            f"the imagined world is no guide: in the last round it says {said:.0f}% of a policy that succeeds"
-            f" in {true:.0f}%, so RL has little to learn from; see by `worldloop trust` and the judge's table"
-            " whether simulator or judge mistakes failures for successes, and train it longer"
+            f"the imagined world is no guide: in the last round it says {predicted:.0f}% of a policy that"
+            f" succeeds in {true:.0f}%, so RL has little to learn from; see by `worldloop trust` and"
+            " the judge's table whether simulator or judge mistakes failures for successes, and train it"
+            " longer"
         )
     tried = ("physics_before", "physics_after", "imagined_before", "imagined_after")
     if not any(result[key]["successes"] for key in tried):
@@ -204,8 +205,8 @@ def _alarms(finished: Mapping[str, Mapping[str, Any]]) -> list[str]:
     out = []
     for name, entry in finished.items():
         made = entry["result"]
-        said = [*made.get("alarms", []), made.get("alarm", ""), made.get("tokenizer_alarm", "")]
-        out += [f"{name}: {text}" for text in said if text]
+        texts = [*made.get("alarms", []), made.get("alarm", ""), made.get("tokenizer_alarm", "")]
+        out += [f"{name}: {text}" for text in texts if text]
     return out
 
 

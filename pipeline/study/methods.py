@@ -185,5 +185,5 @@ def add_rl_in_physics(graph: Graph, cfg: Cfg, equal: Equal) -> str:
 
 def privileged_note(cfg: Cfg) -> str:
     """What RL in physics is rewarded by."""
-    told = "progress and success" if rewards_of(cfg).progress else "success"
-    return f"rewarded by the suite's true {told}, which are privileged, not by a judge"
+    rewarded = "progress and success" if rewards_of(cfg).progress else "success"
+    return f"rewarded by the suite's true {rewarded}, which are privileged, not by a judge"

@@ -28,7 +28,7 @@ def best_of(table: Mapping[str, Any], columns: Columns) -> list[str]:
     out = []
     for place in places:
         mine = {title: cells for title, cells in _rows(table).items() if titles[title] == place}
-        said = []
+        winners = []
         for name, column in columns.items():
             merits = {
                 title: merit
@@ -37,9 +37,9 @@ def best_of(table: Mapping[str, Any], columns: Columns) -> list[str]:
                 if (merit := column.merit(cell)) is not None
             }
             if len(merits) > 1 and len(set(merits.values())) > 1:
-                said.append(f"{column.title}: {max(merits, key=merits.__getitem__)}")
-        if said:
-            out.append(f"Best{f' in {place}' if place else ''}, of what was run: {'; '.join(said)}.")
+                winners.append(f"{column.title}: {max(merits, key=merits.__getitem__)}")
+        if winners:
+            out.append(f"Best{f' in {place}' if place else ''}, of what was run: {'; '.join(winners)}.")
     return out
 
 

@@ -34,7 +34,7 @@ def test_two_pictures_of_a_view_are_seen_as_one() -> None:
     assert encoder(torch.randn(3, spec.views, 6, 32, 32)).shape == (3, encoder.out_features)
 
 
-def test_some_key_points_look_for_what_the_encoder_is_told() -> None:
+def test_some_key_points_are_queried_by_the_conditioning() -> None:
     torch.manual_seed(0)
     spec = world_spec(ARM_DELTAS)
     encoder = MultiViewEncoder(spec, points=4, width=8, instruction_keypoints=2, cond_dim=6)
@@ -47,7 +47,7 @@ def test_some_key_points_look_for_what_the_encoder_is_told() -> None:
     assert moved[:, 4:].all() and not moved[:, :4].any()
 
 
-def test_features_hang_on_what_the_encoder_is_told_once_it_has_learned_to() -> None:
+def test_features_depend_on_the_conditioning_once_the_encoder_has_learned_to() -> None:
     torch.manual_seed(0)
     spec = world_spec(ARM_DELTAS)
     encoder = MultiViewEncoder(spec, points=4, width=8, instruction_keypoints=2, cond_dim=6)

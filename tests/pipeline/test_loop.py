@@ -25,7 +25,7 @@ LEARNED = ("imitation", "simulator-1", "state-1", "judge-1", "clone-1", "rl-1")
 def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     words = ("experiment=smoke", f"runs={tmp_path}", "track=offline")
     out = worldloop(tmp_path, "run", *words)
-    assert out.status == 0, out.said[-3000:]
+    assert out.status == 0, out.output[-3000:]
     run = tmp_path / "smoke"
     result = json.loads((run / "result.json").read_text())
     assert result["physics_before"]["episodes"] == 20 and len(result["rounds"]) == 2
@@ -37,18 +37,18 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     last = {f"evaluate-imagined/{label}.mp4" for label in ("before", "after")}
     assert shown and shown | during | last <= set(tracked["videos"])
     assert "data:video/mp4" in (run / "report.html").read_text()
-    table = worldloop(tmp_path, "compare", str(run), str(run)).said
+    table = worldloop(tmp_path, "compare", str(run), str(run)).output
     assert "| algorithm; seed | PPO; 0 | PPO; 0 |" in table
     again = worldloop(tmp_path, "run", *words)
-    assert again.said.count("is finished, reused") == 24
+    assert again.output.count("is finished, reused") == 24
     controls = worldloop(tmp_path, "controls", *words)
-    assert controls.status == 0, controls.said[-3000:]
+    assert controls.status == 0, controls.output[-3000:]
     rows = json.loads((run / "controls.json").read_text())
     assert set(rows) > {"before", "loop", "loop without imagined decisions", "filtered BC"}
     note = "rewarded by the suite's true progress and success, which are privileged, not by a judge"
     noted = {title for title, row in rows.items() if row.get("note") == note}
     assert noted == {"RL in physics, equal episodes", "RL in physics, equal steps"}
-    assert "equal steps" in (run / "report.html").read_text() and controls.said.count(note) == 2
+    assert "equal steps" in (run / "report.html").read_text() and controls.output.count(note) == 2
     later = json.loads((run / "wandb.json").read_text())["rows"]
     assert {"rl-in-physics-equal-episodes", "filtered-bc"} <= later.keys() - tracked["rows"].keys()
 

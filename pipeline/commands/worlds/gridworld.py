@@ -1,4 +1,4 @@
-"""worldloop gridworld: how to tell a world of actions (WPE, figure 3), by squares that move as they say."""
+"""worldloop gridworld: how to encode actions for a world (WPE, figure 3), by squares that they move."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from pipeline.stages import collect, world
 from pipeline.stages.given import open_store
 from pipeline.track import Tracker
 
-# How actions are told, and by which class.
-TOLD = {
+# How actions are encoded, and by which class.
+REPRESENTATIONS = {
     "numbers": "envs.conditioning.ActionVector",
     "digits": "envs.conditioning.ActionText",
 }
 STEPS = (1, 5, 10, 25, 50)
 
 
-def variant(cfg: Mapping[str, Any], squares: int, told: str) -> dict[str, Any]:
-    """The config of a world of so many squares whose actions are told as TOLD names it."""
+def variant(cfg: Mapping[str, Any], squares: int, representation: str) -> dict[str, Any]:
+    """The config of a world of so many squares whose actions are encoded as REPRESENTATIONS names it."""
     suite, task = {**cfg["task"]["suite"], "squares": squares}, cfg["task"]
-    simulator = {**cfg["simulator"], "actions": {TARGET: TOLD[told]}}
+    simulator = {**cfg["simulator"], "actions": {TARGET: REPRESENTATIONS[representation]}}
     return {**cfg, "task": {**task, "suite": suite}, "simulator": simulator}
 
 
 def gridworld(cfg: Mapping[str, Any], root: Path, squares: Sequence[int], tracker: Tracker | None) -> str:
-    """Train a world for each number of squares and each way to tell actions, and measure it; a table.
+    """Train a world for each number of squares and each way to encode actions, and measure it; a table.
 
     Finished stages are reused, interrupted ones resume; what is measured is written to gridworld.json as soon
     as it is known.
@@ -45,11 +45,15 @@ def gridworld(cfg: Mapping[str, Any], root: Path, squares: Sequence[int], tracke
     """
     rows: list[dict[str, Any]] = []
     for count in squares:
-        for told in TOLD:
-            row = {"squares": count, "told": told, **_measured(variant(cfg, count, told), root, tracker)}
+        for representation in REPRESENTATIONS:
+            row = {
+                "squares": count,
+                "representation": representation,
+                **_measured(variant(cfg, count, representation), root, tracker),
+            }
             rows.append(row)
             write_text(root / "gridworld.json", json.dumps(rows, indent=1))
-            print(f"{count} squares, actions as {told}: {row['errors']}", flush=True)
+            print(f"{count} squares, actions as {representation}: {row['errors']}", flush=True)
     return table(rows)
 
 
@@ -91,7 +95,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
             f"{e['error']['median']:.1f} ({e['error']['p90']:.1f}), {100 * e['lost']:.0f}%" for e in found
         ]
         lines.append(
-            f"| {row['squares']} | {row['told']} | {row['parameters'] / 1e6:.1f} | {' | '.join(cells)} |"
-            f" {found[-1]['still']:.0f} |"
+            f"| {row['squares']} | {row['representation']} | {row['parameters'] / 1e6:.1f} |"
+            f" {' | '.join(cells)} | {found[-1]['still']:.0f} |"
         )
     return "\n".join(lines)

@@ -31,8 +31,8 @@ def summary(root: Path) -> str:
         )
     weights = {name: result["weights"]["simulator"] for name, result in there.items()}
     if len(set(weights.values())) > 1:
-        said = "; ".join(f"{name}: {path}" for name, path in weights.items())
-        raise ConfigError(f"different weights were measured ({said}); measure anew, by equal options")
+        measured = "; ".join(f"{name}: {path}" for name, path in weights.items())
+        raise ConfigError(f"different weights were measured ({measured}); measure anew, by equal options")
     first = next(iter(there.values()))
     parts = parts_of(*found.values())
     page = build_page(first["name"], first["simulator"], first["weights"]["simulator"], parts)

@@ -188,8 +188,8 @@ class ClipTexts(TextExtractor):
                         " ask for shorter steps (ewmbench.prompts.steps), or compare words"
                         f" (ewmbench.texts._target_={__name__}.WordGrams)"
                     )
-            asked = {name: words[name] for name in ("input_ids", "attention_mask")}
-            sides.append(functional.normalize(_embedding(self._network.get_text_features(**asked)), dim=-1))
+            inputs = {name: words[name] for name in ("input_ids", "attention_mask")}
+            sides.append(functional.normalize(_embedding(self._network.get_text_features(**inputs)), dim=-1))
         return (sides[0] @ sides[1].T).clamp(0, 1)
 
 

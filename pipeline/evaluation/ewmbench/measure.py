@@ -49,8 +49,8 @@ class Instruments:
         if self.reader is not None:
             read = self.reader.read([video.numpy() for video in videos])
         return [
-            Record(self._scene(video), self._embedding(video), self.tracks(video), said)
-            for video, said in zip(videos, read, strict=True)
+            Record(self._scene(video), self._embedding(video), self.tracks(video), report)
+            for video, report in zip(videos, read, strict=True)
         ]
 
     def tracks(self, video: Tensor) -> Tensor | None:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from envs.files import write_json
 from pipeline.evaluation.ewmbench.scene import Scene
-from pipeline.evaluation.ewmbench.semantics import Said
+from pipeline.evaluation.ewmbench.semantics import VideoReport
 from pipeline.graph.code_version import digest
 
 
@@ -28,18 +28,18 @@ class Record:
         embedding: float32 [D] of the whole video.
         tracks: float32 [T, V, arms, 2] pixels of the grippers that were found, V the cameras of the detector;
             None without one.
-        said: by the vision-language model; None without one.
+        report: by the vision-language model; None without one.
     """
 
     scene: tuple[Scene, ...]
     embedding: Tensor
     tracks: Tensor | None
-    said: Said | None
+    report: VideoReport | None
 
     @property
     def whole(self) -> bool:
         """Whether nothing is left to be asked."""
-        return self.said is None or self.said.whole
+        return self.report is None or self.report.whole
 
 
 class Records:
@@ -65,12 +65,14 @@ class Records:
             return None
         self.reused += 1
         kept = json.loads(path.read_text())
-        said = kept["said"]
+        report = kept["report"]
         return Record(
             tuple(Scene(**row) for row in kept["scene"]),
             torch.tensor(kept["embedding"]),
             None if kept["tracks"] is None else _read(kept["tracks"]),
-            None if said is None else Said(said["caption"], _tuple(said["steps"]), _tuple(said["errors"])),
+            None
+            if report is None
+            else VideoReport(report["caption"], _tuple(report["steps"]), _tuple(report["errors"])),
         )
 
     def put(self, name: str, about: Mapping[str, Any], record: Record) -> None:
@@ -81,7 +83,7 @@ class Records:
             "scene": [asdict(row) for row in record.scene],
             "embedding": record.embedding.tolist(),
             "tracks": None if record.tracks is None else _written(record.tracks),
-            "said": None if record.said is None else asdict(record.said),
+            "report": None if record.report is None else asdict(record.report),
         }
         write_json(self.path(name, about), kept)
 

@@ -13,7 +13,7 @@ import torch
 from pipeline.evaluation.ewmbench.features import TextExtractor
 from pipeline.evaluation.ewmbench.records import Record
 from pipeline.evaluation.ewmbench.scene import diversity, mean_scene
-from pipeline.evaluation.ewmbench.semantics import LogicalError, Said, bleu, logic, step_similarity
+from pipeline.evaluation.ewmbench.semantics import LogicalError, VideoReport, bleu, logic, step_similarity
 from pipeline.evaluation.ewmbench.trajectory import Scores, best_of, mean_scores, scores
 
 FIGURES = ("scene", "sa", "ta", "dyn", "hsd", "ndtw", "missing", "bleu", "steps", "logic", "diversity")
@@ -42,10 +42,10 @@ class Scoring:
         tracked = [self._tracked(record, true) for record in made]
         known = [found for found in tracked if found is not None]
         best = best_of(known) if len(known) == len(made) else 0
-        told = [self._told(record.said, true.said, instruction) for record in made]
+        judged = [self._semantics(record.report, true.report, instruction) for record in made]
         samples = [
-            {**_scene(record), **_track(found), **said}
-            for record, found, said in zip(made, tracked, told, strict=True)
+            {**_scene(record), **_track(found), **semantics}
+            for record, found, semantics in zip(made, tracked, judged, strict=True)
         ]
         varied = diversity(torch.stack([record.embedding for record in made]))
         return {
@@ -53,7 +53,7 @@ class Scoring:
             "samples": samples,
             "generated": {**samples[best], "diversity": varied},
             "mean": {**_means(samples), "diversity": varied},
-            "recorded": {**_scene(true), **self._told(true.said, true.said, instruction)},
+            "recorded": {**_scene(true), **self._semantics(true.report, true.report, instruction)},
             "still": {"scene": 1.0, **_track(self._tracked(held(true), true)), "diversity": 0.0},
         }
 
@@ -70,7 +70,9 @@ class Scoring:
         ]
         return mean_scores([one for one in each if one is not None])
 
-    def _told(self, made: Said | None, true: Said | None, instruction: str) -> dict[str, float | None]:
+    def _semantics(
+        self, made: VideoReport | None, true: VideoReport | None, instruction: str
+    ) -> dict[str, float | None]:
         """Semantic figures; None of what was not answered."""
         if made is None or true is None:
             return {"bleu": None, "steps": None, "logic": None}

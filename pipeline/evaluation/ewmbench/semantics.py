@@ -47,7 +47,7 @@ class LogicalError:
 
 
 @dataclass(frozen=True)
-class Said:
+class VideoReport:
     """What the model said of a video; None of what it did not answer, or not as it was asked to.
 
     Args:
@@ -108,7 +108,7 @@ class Reader:
         shown = {"every": self.pictures.every, "side": self.pictures.side, "views": list(self.views)}
         return {"model": self.asker.chat.name, **texts, **self._fields, **shown}
 
-    def read(self, videos: Sequence[NDArray[Any]]) -> list[Said]:
+    def read(self, videos: Sequence[NDArray[Any]]) -> list[VideoReport]:
         """What the model says of videos uint8 [T, V, 3, H, W].
 
         Raises:
@@ -117,13 +117,13 @@ class Reader:
         work = asyncio.run_coroutine_threadsafe(self._all(videos), background_loop())
         return work.result()
 
-    async def _all(self, videos: Sequence[NDArray[Any]]) -> list[Said]:
-        asked = [self._ask(video, key) for video in videos for key in self._templates]
-        answers = await asyncio.gather(*asked, return_exceptions=True)
+    async def _all(self, videos: Sequence[NDArray[Any]]) -> list[VideoReport]:
+        questions = [self._ask(video, key) for video in videos for key in self._templates]
+        answers = await asyncio.gather(*questions, return_exceptions=True)
         for answer in answers:  # raised when all has come to an end, so that what was paid for is kept
             if isinstance(answer, BaseException):
                 raise answer
-        return [self._said(answers[n : n + 3]) for n in range(0, len(answers), 3)]
+        return [self._report(answers[n : n + 3]) for n in range(0, len(answers), 3)]
 
     async def _ask(self, video: NDArray[Any], key: str) -> str | None:
         frames = [0, *(k for k in self.pictures.shown(range(len(video))) if k)]
@@ -132,17 +132,17 @@ class Reader:
         reply = await self.asker.ask(Question(words, drawn), 0)
         return None if reply is None else reply.text
 
-    def _said(self, answers: Sequence[Any]) -> Said:
+    def _report(self, answers: Sequence[Any]) -> VideoReport:
         caption, steps, errors = answers
-        said = Said(
+        report = VideoReport(
             None if caption is None else parse_caption(caption),
             None if steps is None else parse_steps(steps),
             None if errors is None else parse_errors(errors, self.errors),
         )
-        told = (answer for answer in (said.caption, said.steps, said.errors))
-        unusable = sum(a is not None and b is None for a, b in zip(answers, told, strict=True))
+        parsed = (answer for answer in (report.caption, report.steps, report.errors))
+        unusable = sum(a is not None and b is None for a, b in zip(answers, parsed, strict=True))
         self.asker.ledger.add("unusable", unusable)
-        return said
+        return report
 
 
 def parse_caption(text: str) -> str | None:
@@ -165,11 +165,13 @@ def parse_errors(text: str, known: Sequence[LogicalError]) -> tuple[str, ...] | 
     match = _ERRORS.fullmatch(lines[-1]) if lines else None
     if match is None:
         return None
-    said = [" ".join(words_of(part)) for part in re.split(r"[,;]", match[1]) if words_of(part)]
-    if said == ["none"]:
+    listed = [" ".join(words_of(part)) for part in re.split(r"[,;]", match[1]) if words_of(part)]
+    if listed == ["none"]:
         return ()
     names = {" ".join(words_of(error.name)): error.name for error in known}
-    return tuple(dict.fromkeys(names[one] for one in said)) if said and set(said) <= set(names) else None
+    return (
+        tuple(dict.fromkeys(names[one] for one in listed)) if listed and set(listed) <= set(names) else None
+    )
 
 
 def read_errors(name: str) -> tuple[LogicalError, ...]:
@@ -210,15 +212,15 @@ def bleu(caption: str, instruction: str, strict_parity: bool) -> float:
     """
     if strict_parity:
         return float(bleu_score([caption], [[instruction]], n_gram=_GRAMS))
-    said, wanted = words_of(caption), words_of(instruction)
-    if not set(said) & set(wanted):
+    candidate, wanted = words_of(caption), words_of(instruction)
+    if not set(candidate) & set(wanted):
         return 0.0
-    longest, total = min(_GRAMS, len(wanted), len(said)), 0.0
+    longest, total = min(_GRAMS, len(wanted), len(candidate)), 0.0
     for length in range(1, longest + 1):
-        found, due = (_grams(words, length) for words in (said, wanted))
+        found, due = (_grams(words, length) for words in (candidate, wanted))
         hits, more = sum((found & due).values()), int(length > 1)
         total += math.log((hits + more) / (sum(found.values()) + more))
-    return math.exp(total / longest + min(0.0, 1 - len(wanted) / len(said)))
+    return math.exp(total / longest + min(0.0, 1 - len(wanted) / len(candidate)))
 
 
 def _grams(words: Sequence[str], length: int) -> Counter[tuple[str, ...]]:

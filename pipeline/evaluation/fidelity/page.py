@@ -82,14 +82,14 @@ def collapse_text(long: Mapping[str, Any] | None) -> str:
     if long is None:
         return "No long rollouts were made."
     end = long["end"]
-    said = "the video has collapsed" if long["collapsed"] else "no collapse"
+    outcome = "the video has collapsed" if long["collapsed"] else "no collapse"
     short = (
         f" ({long['wanted']} were wanted; recordings are no longer)"
         if long["frames"] < long["wanted"]
         else ""
     )
     return (
-        f"After {long['frames']} frames{short} {said}: PSNR {end['psnr']:.1f} dB, sharpness"
+        f"After {long['frames']} frames{short} {outcome}: PSNR {end['psnr']:.1f} dB, sharpness"
         f" {end['sharpness']:.2f} of the truth's over the last tenth of {long['episodes']} rollouts"
     )
 
@@ -136,6 +136,6 @@ def _grid(grid: Mapping[str, Any]) -> dict[str, Any]:
         for row in grid["rows"]
     ]
     best = grid["rows"][grid["best"]]["settings"]
-    said = ", ".join(f"{key}={value}" for key, value in best.items())
+    settings = ", ".join(f"{key}={value}" for key, value in best.items())
     name = grid["figure"].replace("_mse", " MSE").replace("mse", "MSE")
-    return {"headings": headings, "rows": rows, "best": f"Least {name}: {said}"}
+    return {"headings": headings, "rows": rows, "best": f"Least {name}: {settings}"}

@@ -73,9 +73,9 @@ def figures(judge: Judge, scores: Scores, truth: Truth, seed: int) -> dict[str, 
         against true success. Each of within and auc is [value, low, high], 95% by resampling episodes; None
         where it cannot be said. dropped: how many episodes it could not judge, which are left out.
     """
-    told, dropped = scores.judged, int((~scores.judged).sum())
-    scores = Scores(*(values[told] for values in scores))
-    truth = Truth(truth.progress[told], truth.success[told], truth.valid[told], truth.source)
+    judged, dropped = scores.judged, int((~scores.judged).sum())
+    scores = Scores(*(values[judged] for values in scores))
+    truth = Truth(truth.progress[judged], truth.success[judged], truth.valid[judged], truth.source)
     over = ~truth.valid
     confidence = judge.confidence(scores.success.masked_fill(over, 0.0)).double().numpy()
     each = np.array([_rank(*pair) for pair in _episodes(scores, truth)])

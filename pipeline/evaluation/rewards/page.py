@@ -54,9 +54,9 @@ def about_of(domain: Mapping[str, Any]) -> str:
 def lines_of(domain: Mapping[str, Any]) -> Iterator[list[str]]:
     """Name, video and figures of every reward, recorded video before generated."""
     for name, row in domain["rewards"].items():
-        said = "".join(f"; {key} {value}" for key, value in row["facts"].items())
+        facts = "".join(f"; {key} {value}" for key, value in row["facts"].items())
         for video, found in row["figures"].items():
-            yield [name + said, video, *(cell(found, key) for key, _ in FIGURES)]
+            yield [name + facts, video, *(cell(found, key) for key, _ in FIGURES)]
 
 
 def _charts(domain: Mapping[str, Any]) -> list[Markup]:

@@ -67,8 +67,8 @@ def table_text(result: Mapping[str, Any]) -> str:
 def judge_lines(result: Mapping[str, Any]) -> list[str]:
     """What the judge measures by, and what it was asked for and paid."""
     facts, cost = facts_text(result["judged_by"]), result["judge_cost"]
-    said = [f"Judged by {facts}."] if facts else []
-    return [*said, f"Asking the judge: {cost_text(cost)}."] if cost else said
+    lines = [f"Judged by {facts}."] if facts else []
+    return [*lines, f"Asking the judge: {cost_text(cost)}."] if cost else lines
 
 
 def verdict(result: Mapping[str, Any]) -> str:
@@ -77,13 +77,14 @@ def verdict(result: Mapping[str, Any]) -> str:
     if not found:
         return "Estimated values alone: without true ones nobody knows how far they can be trusted."
     kept = found["order"]
-    said = ", ".join(f"{title} {value}" for title, value in zip(_titles(), _figures(found), strict=True))
+    agreement = ", ".join(f"{title} {value}" for title, value in zip(_titles(), _figures(found), strict=True))
     sides = [
         f"{100 * side['mean']:+.1f} points {_SERIES[name == 'out']}" for name, side in found["bias"].items()
     ]
     ranking = "ranking kept" if found["kept"] else "ranking not kept"
     return (
-        f"{ranking} ({kept['kept']} of {kept['pairs']} pairs); {said}; estimated less true {', '.join(sides)}"
+        f"{ranking} ({kept['kept']} of {kept['pairs']} pairs); {agreement};"
+        f" estimated less true {', '.join(sides)}"
     )
 
 

@@ -85,7 +85,7 @@ class Physics:
         policy, stochastic = candidate.build(self.cfg, self.spread), self.cfg["policy_value"]["stochastic"]
         outcome = evaluate(env, policy, seeds, stochastic, f"true {candidate.name}")
         _check_all(
-            candidate, seeds, [seed for seed, told in zip(seeds, outcome.counted, strict=True) if told]
+            candidate, seeds, [seed for seed, counted in zip(seeds, outcome.counted, strict=True) if counted]
         )
         return {"success": outcome.success}
 
@@ -108,13 +108,13 @@ class Physics:
             self._env.close()
 
 
-def _check_all(candidate: Candidate, seeds: Sequence[int], told: Sequence[int]) -> None:
+def _check_all(candidate: Candidate, seeds: Sequence[int], known: Sequence[int]) -> None:
     """Refuse a value of which some episodes are unknown, for the imagined ones would stand beside others.
 
     Raises:
         PoolError: if physics crashed in one.
     """
-    if crashed := sorted(set(seeds) - set(told)):
+    if crashed := sorted(set(seeds) - set(known)):
         raise PoolError(
             f"physics crashes again and again in the episodes of the seeds {crashed[:4]} under"
             f" {candidate.name}, so its true value on these starts is unknown; leave it out"

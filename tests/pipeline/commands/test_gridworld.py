@@ -66,7 +66,7 @@ def test_the_study_runs_and_goes_on_where_it_was(tmp_path: Path) -> None:
     assert "ActionVector" in cfg["simulator"]["actions"]["_target_"]
     out = gridworld(cfg, tmp_path, [1], None)
     rows = json.loads((tmp_path / "gridworld.json").read_text())
-    assert [row["told"] for row in rows] == ["numbers", "digits"]
+    assert [row["representation"] for row in rows] == ["numbers", "digits"]
     assert list(rows[0]["errors"]) == ["1"] and rows[0]["errors"]["1"]["finder"] < 3.0
     assert "| 1 | numbers |" in out and "| 1 | digits |" in out
     made = {path: path.stat().st_mtime_ns for path in tmp_path.glob("stages/*/weights.safetensors")}

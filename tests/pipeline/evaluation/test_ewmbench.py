@@ -20,7 +20,7 @@ from pipeline.evaluation.ewmbench.features import PyramidPatches, WordGrams
 from pipeline.evaluation.ewmbench.records import Record, Records
 from pipeline.evaluation.ewmbench.scene import Scene, diversity, scene_consistency
 from pipeline.evaluation.ewmbench.semantics import (
-    Said,
+    VideoReport,
     bleu,
     logic,
     paired_in_order,
@@ -271,15 +271,15 @@ def test_lists_of_errors_say_what_is_wrong_with_them(tmp_path: Path) -> None:
 
 def test_records_come_back_as_they_were(tmp_path: Path) -> None:
     tracks = torch.tensor([[[[1.25, 2.5], [NAN, NAN]]]])
-    said = Said("go", ("a", "b"), ())
+    said = VideoReport("go", ("a", "b"), ())
     record = Record((Scene(0.5, 0.25, 0.375),), torch.randn(3, generator=constant_generator(0)), tracks, said)
     records = Records(tmp_path, {"world": 1})
     assert records.get("7-0", {"draw": 0}) is None
     records.put("7-0", {"draw": 0}, record)
     again = records.get("7-0", {"draw": 0})
-    assert again is not None and again.scene == record.scene and again.said == said
+    assert again is not None and again.scene == record.scene and again.report == said
     assert torch.equal(again.embedding, record.embedding) and again.tracks is not None
     assert torch.equal(again.tracks.nan_to_num(-1), tracks.nan_to_num(-1)) and records.reused == 1
     assert Records(tmp_path, {"world": 2}).get("7-0", {"draw": 0}) is None
-    records.put("7-1", {}, Record(record.scene, record.embedding, None, Said("go", None, ())))
+    records.put("7-1", {}, Record(record.scene, record.embedding, None, VideoReport("go", None, ())))
     assert records.get("7-1", {}) is None  # something is left to be asked

@@ -116,7 +116,7 @@ def test_the_command_compares_judges_on_recordings(tmp_path: Path) -> None:
     words = ("experiment=smoke", "track=disabled", f"runs={tmp_path}", "task=lerobot", "task.chunk=4")
     data = (f"task.data=[{tmp_path / 'set'}]", "task.size=[32,32]", "task.horizon=12", *steps)
     out = worldloop(tmp_path, "rewards", "rewards=[proxy,embedding]", "episodes=4", *words, *data)
-    assert out.status == 0, out.said[-3000:]
+    assert out.status == 0, out.output[-3000:]
     result = json.loads((tmp_path / "smoke/rewards.json").read_text())
     seen = result["domains"]["seen"]
     assert list(result["domains"]) == ["seen"] and seen["truth"] == BY_TIME
@@ -124,7 +124,9 @@ def test_the_command_compares_judges_on_recordings(tmp_path: Path) -> None:
     for row in seen["rewards"].values():
         assert set(row["figures"]) == {"recorded", "generated"}
     assert {"true", "proxy", "embedding"} == set(seen["drawn"][0]["curves"])
-    assert "<svg" in (tmp_path / "smoke/rewards.html").read_text() and "| embedding | generated |" in out.said
+    assert (
+        "<svg" in (tmp_path / "smoke/rewards.html").read_text() and "| embedding | generated |" in out.output
+    )
     (replayed,) = (tmp_path / "smoke/rewards").iterdir()
     made = replayed.stat().st_mtime_ns
     proxy = {"proxy": load_config([*words, *data, "judge=proxy"])}

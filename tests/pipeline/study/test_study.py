@@ -31,19 +31,19 @@ SMALL = (
 def test_a_study_runs_what_is_missing_and_says_what_is_not_run(tmp_path: Path) -> None:
     words = ("study", *SMALL, f"runs={tmp_path}")
     nothing = worldloop(tmp_path / "logs", *words, "study.minutes=0")
-    assert nothing.status == 0, nothing.said[-3000:]
+    assert nothing.status == 0, nothing.output[-3000:]
     root = tmp_path / "soak"
     assert all(cell is None for row in table_of(root)["rows"] for cell in row["cells"]["success"].values())
     assert (root / "study.md").read_text().count("not run") == len(ROWS) * (2 * 3 + 2 * 2 + 2)
-    assert "8 cells were not run" in nothing.said
+    assert "8 cells were not run" in nothing.output
 
     first = worldloop(tmp_path / "logs", *words, "study.only=[imitation]")
-    assert first.status == 0, first.said[-3000:]
+    assert first.status == 0, first.output[-3000:]
     done = {row["row"] for row in table_of(root)["rows"] if row["cells"]["success"]["all"]}
     assert done == {"imitation"}
 
     rest = worldloop(tmp_path / "logs", *words)
-    assert rest.status == 0, rest.said[-3000:]
+    assert rest.status == 0, rest.output[-3000:]
     assert "not run" not in (root / "study.md").read_text()
     assert_each_shared_stage_ran_once(root)
     assert_cells_are_what_the_evaluations_left(words[1:], table_of(root))
@@ -53,7 +53,7 @@ def test_a_study_runs_what_is_missing_and_says_what_is_not_run(tmp_path: Path) -
     assert spent["ppo"] == {"scripted": 12, "own": 8, "first frames": 4}
 
     again = worldloop(tmp_path / "logs", *words)
-    assert again.status == 0 and "took" not in again.said
+    assert again.status == 0 and "took" not in again.output
     page = (root / "study.html").read_text()
     assert "against imitation on the same episodes" in page and "privileged" in page
 
