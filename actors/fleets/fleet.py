@@ -9,6 +9,7 @@ from typing import Protocol
 
 from tensordict import TensorDict
 
+from actors.rollouts.footage import Footage
 from actors.rollouts.host import Host, Job, Stopwatch, Weights, size_of
 from envs.ranges import Natural, Positive
 
@@ -31,6 +32,7 @@ class Result:
         load_seconds: of these, taking over new weights.
         forward_seconds: of these, inside the networks.
         bytes: that travelled.
+        footage: of the episodes that the job asked to be shown.
     """
 
     job: Job
@@ -41,6 +43,7 @@ class Result:
     forward_seconds: float = 0.0
     bytes: int = 0
     failure: str = ""
+    footage: tuple[Footage, ...] = ()
 
 
 @dataclass
@@ -161,7 +164,8 @@ class LocalFleet:
             self.host.load(version, weights)
         loaded, forward = watch.read(), self.host.meter.seconds
         batch = self.host.run(job)
-        return Result(job, version, batch, loaded + watch.read(), loaded, self.host.meter.seconds - forward)
+        seconds, forward = loaded + watch.read(), self.host.meter.seconds - forward
+        return Result(job, version, batch, seconds, loaded, forward, footage=self.host.footage)
 
     def close(self) -> None:
         """See Fleet.close."""

@@ -23,16 +23,21 @@ class HostActor:
         """This process's id, once built."""
         return os.getpid()
 
-    def run(self, job: Job, version: int, weights: list[Any]) -> tuple[Weights, float, float, float]:
-        """The rollout's arrays, seconds of all of it, of taking over weights and inside the networks;
-        `weights` holds a reference, fetched only if needed.
+    def run(self, job: Job, version: int, weights: list[Any]) -> tuple[Weights, dict[str, Any]]:
+        """The rollout's arrays, and by name what else a Result says; `weights` holds a reference, fetched
+        only if needed.
         """
         watch = Stopwatch()
         if self.host.version != version:
             self.host.load(version, ray.get(weights[0]))
         loaded, forward = watch.read(), self.host.meter.seconds
         arrays = pack(self.host.run(job))
-        return arrays, loaded + watch.read(), loaded, self.host.meter.seconds - forward
+        return arrays, {
+            "seconds": loaded + watch.read(),
+            "load_seconds": loaded,
+            "forward_seconds": self.host.meter.seconds - forward,
+            "footage": self.host.footage,
+        }
 
 
 @dataclass

@@ -207,12 +207,10 @@ class RayFleet:
                 if self._lost_at:
                     self.recoveries.append(time.monotonic() - self._lost_at.popleft())
                 return
-            arrays, seconds, loaded, forward = value
+            arrays, facts = value
             assert member.job is not None
-            batch = unpack(arrays)
-            self._done.append(
-                Result(member.job, member.version, batch, seconds, loaded, forward, size_of(arrays))
-            )
+            result = Result(member.job, member.version, unpack(arrays), bytes=size_of(arrays), **facts)
+            self._done.append(result)
             self.finished += 1
             for counts in (self._tries, self._deaths):
                 counts.pop(member.job.number, None)

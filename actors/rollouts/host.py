@@ -34,6 +34,7 @@ from actors.policies.contract import (
     writes_features,
 )
 from actors.policies.safe import SafePolicyWrapper
+from actors.rollouts.footage import Footage, footage
 from actors.rollouts.meter import Meter
 from envs.rng import seed_process
 from envs.specs import (
@@ -62,11 +63,13 @@ class Job:
         number: counts up over a run; rollouts are joined in this order, whenever they arrive.
         seeds: of the episodes; more than the host's batch where early endings are to be refilled.
         sampling: seed of the policy's exploration.
+        shown: imagined episodes of which the host keeps the frames, for people.
     """
 
     number: int
     seeds: tuple[int, ...]
     sampling: int
+    shown: int = 0
 
 
 def trained_weights(policy: nn.Module) -> Weights:
@@ -91,6 +94,9 @@ class Host:
             or, of a policy that writes none, the observation.
         threads: that torch computes a job with, so that it gives the same bits in any process; None for those
             of the process.
+
+    Attributes:
+        footage: of the last job, as many episodes as it asked to be shown; none in physics.
     """
 
     def __init__(
@@ -100,6 +106,7 @@ class Host:
         self.base = getattr(env, "base_env", env)
         self.steps = self.base.horizon // self.base.chunk
         self.version = -1
+        self.footage: tuple[Footage, ...] = ()
         self.actor = SafePolicyWrapper(policy, self.base.spec, self.base.mode)
         self._features = feature_part(policy) if bootstrap and writes_features(policy) else None
         transforms = list(getattr(env, "transform", None) or ())
@@ -171,6 +178,7 @@ class Host:
                 batch["next", VISUAL_FEATURES] = self._next_features(batch, ends)
             if self._judging is not None and self._judging.later:
                 self._judging.settle(batch)
+            self.footage = footage(self.base, batch, job.shown) if job.shown and self._judging else ()
         batch[VERSION] = torch.full((*batch.shape, 1), self.version)
         return batch.cpu()
 

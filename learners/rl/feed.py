@@ -15,8 +15,11 @@ import torch
 from tensordict import TensorDict
 
 from actors.fleets.fleet import Fleet, FleetError, Result
+from actors.rollouts.footage import Footage
 from actors.rollouts.host import Job, Stopwatch, Weights
 from envs.targets import ConfigError
+
+SHOWN = 6  # episodes
 
 
 @dataclass
@@ -30,6 +33,10 @@ class Feed:
         sampling: exploration seed of a job's iteration and place in it.
         max_dropped: share of the episodes asked for that may be lost before the run stops.
         first: wave of jobs to begin with; the waves of a synchronous feed are its iterations.
+        shown_every: iterations between those of which some episodes are shown to people; 0 for none.
+
+    Attributes:
+        footage: what the last rollout shows, by the version of the weights that acted.
     """
 
     fleet: Fleet
@@ -38,9 +45,11 @@ class Feed:
     sampling: Callable[[int, int], int]
     max_dropped: float = 0.05
     first: int = 0
+    shown_every: int = 0
     idle: float = field(default=0.0, init=False)
     # jobs of the last rollout, and their versions
     learned: list[tuple[int, int]] = field(default_factory=list, init=False)
+    footage: dict[int, tuple[Footage, ...]] = field(default_factory=dict, init=False)
 
     def jobs(self, iteration: int) -> list[Job]:
         """The jobs of an iteration; consecutive seeds stay together, so groups are never torn apart."""
@@ -50,11 +59,13 @@ class Feed:
             raise ValueError(
                 f"{len(seeds)} episode seeds cannot be shared out to rl.shards={self.shards} evenly"
             )
+        due = self.shown_every and iteration % self.shown_every == 0
         return [
             Job(
                 iteration * self.shards + k,
                 tuple(seeds[k * part : (k + 1) * part]),
                 self.sampling(iteration, k),
+                min(part, SHOWN) if due and k == 0 else 0,
             )
             for k in range(self.shards)
         ]
@@ -112,6 +123,7 @@ class Feed:
         if not good:
             raise FleetError(f"no job of iteration {iteration} came through; the last: {results[-1].failure}")
         self.learned = [(r.job.number, r.version) for r in good]
+        self.footage = {r.version: r.footage for r in good if r.footage}
         batch = torch.cat([r.batch for r in good if r.batch is not None])
         lag = [iteration - r.version for r in good]
         busy = sum(r.seconds for r in good)

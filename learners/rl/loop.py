@@ -30,6 +30,7 @@ from envs.targets import ConfigError
 from learners.rl.alarms import Alarms
 from learners.rl.algorithm import Algorithm, RLConfig
 from learners.rl.feed import AsyncFeed, Feed
+from learners.rl.film import film_rollouts
 from learners.rl.recorded import TrueExperience
 from learners.rl.starts import Starts
 from learners.rl.update import update
@@ -63,8 +64,8 @@ def train_rl(
         fleet: hosts of config.envs / config.shards episodes each; the policy's trained tensors are published
             to it. Of several workers only the leading one has one.
         starts: where episodes may begin.
-        folder: receives checkpoints, metrics.jsonl and learned.jsonl, the jobs that were learned from; a
-            checkpoint found there is resumed.
+        folder: receives checkpoints, metrics.jsonl and learned.jsonl, the jobs that were learned from, and
+            as often as a checkpoint a video of imagined episodes; a checkpoint found there is resumed.
         true: what RLConfig.recorded and RLConfig.anchor speak of.
         watch: looks at the policy while it learns; its figures stand in metrics.jsonl, beside the seconds of
             rollouts and updates so far (time/learning), in which it does not count.
@@ -117,7 +118,7 @@ def train_rl(
     feed: Feed | None = None
     if fleet is not None:
         fleet.ledger = ledger
-        common = (fleet, config.shards, seeds, sampling, config.max_dropped, wave)
+        common = (fleet, config.shards, seeds, sampling, config.max_dropped, wave, config.checkpoint_every)
         feed = (
             Feed(*common)
             if config.schedule == "sync"
@@ -170,6 +171,8 @@ def train_rl(
             if feed is not None:
                 causes = [what for reason, (_, what) in _SPOILED.items() if spoiled[reason]]
                 feed.check_losses(" and ".join(causes) or "none now")
+            for version, shown in feed.footage.items() if feed is not None else ():
+                film_rollouts(folder, version, shown)
             figures |= supply | {"time/rollout": collected - began, "time/update": updated - collected}
             figures["time/learning"] = sum(spent.values())
             enough = False

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from actors.world_config import embodiment_of
-from envs.episodes.video import write_video
+from envs.episodes.filming import side_by_side, write_film
 from envs.physics.pool import TaskPool, available_cores
 from envs.physics.suite import task_names
 from envs.physics.worker import Track
@@ -22,7 +22,6 @@ from pipeline.evaluation.statistics import rate, rate_entry, rate_line
 
 LEAST = 0.9  # share of episodes in which an expert must succeed
 SHOWN = 3  # failures of a task that are saved as videos
-_ZOOM = 4
 _AT_ONCE = 64  # episodes, whose frames are held in memory
 
 
@@ -103,13 +102,11 @@ def _play(cfg: Mapping[str, Any], changes: Mapping[str, Any], level: float) -> d
 def _complaint(title: str, outcomes: Outcomes, cfg: Mapping[str, Any]) -> str:
     """Which seeds fail, after their videos are saved."""
     folder = Path(cfg["runs"]) / cfg["name"] / "experts"
-    folder.mkdir(parents=True, exist_ok=True)
     name = re.sub(r"\W+", "-", title)
     paths = [folder / f"{name}-{track.seed}.mp4" for track in outcomes.failed]
     fps = embodiment_of(cfg).fps
     for path, track in zip(paths, outcomes.failed, strict=True):
-        rows = [np.concatenate(list(views.transpose(0, 2, 3, 1)), 1) for views in track.rows["frames"]]
-        write_video(path, [row.repeat(_ZOOM, 0).repeat(_ZOOM, 1) for row in rows], fps, crf=20, browser=True)
+        write_film(path, side_by_side(np.stack(track.rows["frames"])), fps)
     seeds = ", ".join(map(str, outcomes.seeds[:10])) + (", ..." if len(outcomes.seeds) > 10 else "")
     return (
         f"{title}: the expert fails in {len(outcomes.seeds)} of {len(outcomes.success)} episodes of"

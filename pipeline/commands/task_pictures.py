@@ -8,17 +8,15 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from envs.episodes.filming import Picture, side_by_side, titled, write_gif
 from envs.physics.suite import build_suite, task_names
 from envs.rng import Stream, episode_rng
-from pipeline.evaluation.media import write_gif
 
 _TILE, _COLUMNS = 112, 10  # pixels of a scene's picture, and pictures in a row
 _BAR = 13  # pixels of the line under it
 _GIF = (144, 144)  # pixels of each view
 _SEED = 9_000_000  # of the episodes that are shown
-Picture = NDArray[np.uint8]
 
 
 def draw(choice: str, task: Mapping[str, Any], folder: Path) -> Iterator[Path]:
@@ -57,7 +55,7 @@ def _sheet(task: Mapping[str, Any], groups: Mapping[str, list[str]]) -> Picture:
             suite.reset(suite.tasks[0], _SEED + number)
             picture = suite.picture((_TILE, _TILE))[suite.embodiment.main_view].transpose(1, 2, 0)
             bar = np.full((_BAR, _TILE, 3), 90 if title else 24, np.uint8)
-            _write(bar, scene, (2, 10), 0.28)
+            cv2.putText(bar, scene, (2, 10), cv2.FONT_HERSHEY_SIMPLEX, 0.28, (235, 235, 235), 1, cv2.LINE_AA)
             tiles.append(np.concatenate((picture, bar)))
     rows = -(-len(tiles) // _COLUMNS)
     tiles += [np.zeros_like(tiles[0])] * (rows * _COLUMNS - len(tiles))
@@ -67,24 +65,13 @@ def _sheet(task: Mapping[str, Any], groups: Mapping[str, list[str]]) -> Picture:
 
 
 def _episode(task: Mapping[str, Any], name: str) -> list[Picture]:
-    """All views of an expert's episode side by side, over the words."""
+    """All views of an expert's episode side by side, under the words."""
     suite = build_suite(task["suite"])
     suite.reset(name, _SEED)
     act, frames = suite.expert(0.0, episode_rng(_SEED, Stream.BEHAVIOUR)), []
     for _ in range(task["horizon"]):
-        frames.append(_frame(suite.picture(_GIF), suite.observe().instruction))
+        frames += titled(side_by_side(suite.picture(_GIF)[None]), suite.observe().instruction)
         if suite.observe().success:
             break
         suite.step(act())
     return [*frames, *[frames[-1]] * 3]
-
-
-def _frame(views: Picture, words: str) -> Picture:
-    row = np.concatenate(list(views.transpose(0, 2, 3, 1)), 1)
-    bar = np.full((20, row.shape[1], 3), 24, np.uint8)
-    _write(bar, words, (5, 14), 0.42)
-    return np.concatenate((row, bar))
-
-
-def _write(bar: Picture, words: str, at: tuple[int, int], size: float) -> None:
-    cv2.putText(bar, words, at, cv2.FONT_HERSHEY_SIMPLEX, size, (235, 235, 235), 1, cv2.LINE_AA)

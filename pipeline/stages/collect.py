@@ -19,6 +19,7 @@ from actors.rollouts.evaluate import evaluate
 from actors.world_config import world_spec
 from envs.episodes.clips import ClipStore
 from envs.episodes.episode import Episode
+from envs.episodes.filming import side_by_side, write_film
 from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.episodes.formats.lerobot_columns import SEED
 from envs.episodes.formats.lerobot_writer import LeRobotWriter
@@ -31,7 +32,6 @@ from envs.physics.worker import Track
 from envs.rng import Purpose, episode_seeds, order_generator
 from envs.targets import ConfigError
 from pipeline.evaluation.by_task import by_task, tasks_of_episodes, tasks_of_seeds
-from pipeline.evaluation.media import film
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.given import DATASETS, PHYSICS, ROBOT, Cfg
@@ -108,7 +108,7 @@ def _failures(cfg: Cfg, store: ClipStore, folder: Path) -> list[str]:
     names = [f"{task}-{store.episodes[n]['seed']}" for task, n in zip(tasks, failed.tolist(), strict=True)]
     for name, number in list(zip(names, failed.tolist(), strict=True))[:_FILMED]:
         frames = store.frames(store.rows(torch.tensor([number]))).numpy()
-        film(folder / "media" / f"expert-{name}.mp4", frames, store.fps)
+        write_film(folder / "media" / f"expert-{name}.mp4", side_by_side(frames), store.fps)
     if names:
         tqdm.write(
             f"collect: the expert failed in {len(names)} of {len(tried)} episodes, by task and seed"

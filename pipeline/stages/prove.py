@@ -14,6 +14,7 @@ from torch import Tensor
 from actors.factory import build_judge, build_physics, build_policy, build_simulator, build_state_decoder
 from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
+from envs.episodes.filming import side_by_side, write_film
 from envs.files import write_atomically, write_text
 from envs.rng import Purpose, episode_seeds
 from envs.simulators.replay import replay
@@ -28,7 +29,7 @@ from pipeline.evaluation.by_task import (
 )
 from pipeline.evaluation.disagreement import compared
 from pipeline.evaluation.judging import episode_success, judge_both, judge_frames, judge_table
-from pipeline.evaluation.media import film, paired_frames, paired_video
+from pipeline.evaluation.media import REST, paired_frames
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import PHYSICS, WORLD, Cfg, load_world, open_store
@@ -56,7 +57,7 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(mine)), mine)
     seeds = list(range(len(mine)))
     outcome = evaluate(world, policy, seeds, stochastic=True, label="gap", sampling_seed=cfg["seed"])
-    film(folder / "media/imagined.mp4", world.base_env.video(0).numpy(), store.fps)
+    write_film(folder / "media/imagined.mp4", side_by_side(world.base_env.video(0).numpy()), store.fps)
     tasks, judge = tasks_of_episodes(cfg, store, mine), world.transform[-1].judge
     result = {
         "round": number,
@@ -68,7 +69,7 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     if len(held):
         made = replay(world.base_env.simulator, store, held, bf16=cfg["simulator"]["bf16"])
         scores = judge_frames(judge, made.frames, store, held, made.features)
-        paired_video(folder / "media/held-out.mp4", paired_frames(store, held, made, 0), store.fps)
+        write_film(folder / "media/held-out.mp4", paired_frames(store, held, made, 0), store.fps, rest=REST)
         result["replayed"] = judge_table(judge, scores, made.valid, store, held)
     return {**result, "judged_by": judge.facts()}
 
@@ -135,7 +136,7 @@ def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     for label in ("before", "after"):
         policy = build_policy(cfg, inputs.weights(label))
         outcome = evaluate(world, policy, list(range(len(starts))), label=f"imagined {label}")
-        film(folder / f"media/{label}.mp4", world.base_env.video(0).numpy(), store.fps)
+        write_film(folder / f"media/{label}.mp4", side_by_side(world.base_env.video(0).numpy()), store.fps)
         out[label] = {
             **_counted(outcome.success, outcome.counted),
             "tasks": by_task(tasks, _counted, outcome.success, outcome.counted),

@@ -17,6 +17,7 @@ from actors.process import prepare_process
 from actors.world_config import world_spec
 from envs.episodes.clips import ClipStore
 from envs.episodes.episode import Episode
+from envs.episodes.filming import write_film, write_gif
 from envs.episodes.formats.lerobot_writer import LeRobotWriter
 from envs.files import write_text
 from envs.judges.base import Judge
@@ -27,7 +28,7 @@ from envs.simulators.replay import replay
 from pipeline.evaluation.by_task import evenly
 from pipeline.evaluation.disagreement import compared, curves, worst
 from pipeline.evaluation.judging import judge_both
-from pipeline.evaluation.media import paired_frames, paired_video, write_gif
+from pipeline.evaluation.media import REST, paired_frames
 from pipeline.evaluation.report import VIDEOS, build_report
 from pipeline.evaluation.result import build_result
 from pipeline.graph.stage import Inputs, stage
@@ -79,7 +80,7 @@ class Studio:
         for n, row in enumerate(rows):
             path = self.folder / "media" / f"{label}-{row['seed']}-{row['episode']}.mp4"
             frames = paired_frames(store, episodes, made, n)
-            paired_video(path, frames, store.fps)
+            write_film(path, frames, store.fps, rest=REST)
             done = store.arrays["success"][made.rows[n]][made.valid[n]].tolist() if row["success"] else []
             yield {
                 "file": path.name,

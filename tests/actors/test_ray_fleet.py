@@ -46,7 +46,7 @@ def learn(
     policy = build_policy(cfg, Path(recipe.policy))
     policy.freeze_perception()
     torch.manual_seed(3)
-    smoke = {"iterations": 2, "envs": 16, "shards": 4, "epochs": 1, "minibatch": 32}
+    smoke = {"checkpoint_every": 1, "iterations": 2, "envs": 16, "shards": 4, "epochs": 1, "minibatch": 32}
     own = {**cfg["rl"], "microbatches": 1, "seed": 0, "freeze_perception": True, **smoke, **changes}
     settings = options(RLConfig, own, "rl")
     stats = train_rl(fleet, policy, build_algorithm(cfg, policy), settings, folder, Starts(range(8)))
@@ -61,6 +61,11 @@ def rollout(fleet: Fleet, recipe: Recipe) -> list[TensorDict]:
         fleet.submit(Job(number, tuple(range(12 * number, 12 * number + 12)), 100 + number))
     results = sorted((fleet.take() for _ in range(4)), key=lambda r: r.job.number)  # type: ignore[union-attr]
     return [r.batch for r in results if r is not None and r.batch is not None]
+
+
+def films_of(folder: Path) -> dict[str, bytes]:
+    """What hosts imagined, by the names of videos."""
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("media/*"))}
 
 
 def equal(one: TensorDict, other: TensorDict) -> bool:
@@ -80,6 +85,8 @@ def test_rollouts_and_learned_weights_are_the_same_bits_for_any_number_of_actors
     assert torch.get_num_threads() == before + 1
     torch.set_num_threads(before)
     weights, _ = learn(LocalFleet(build_host(recipe)), recipe, tmp_path / "local")
+    films = films_of(tmp_path / "local")
+    assert list(films) == ["imagined-step000000.mp4", "imagined-step000001.mp4"]
     for actors in (1, 3):
         fleet = RayFleet(recipe, actors)
         try:
@@ -89,6 +96,7 @@ def test_rollouts_and_learned_weights_are_the_same_bits_for_any_number_of_actors
         finally:
             fleet.close()
         assert all(torch.equal(value, learned[name]) for name, value in weights.items())
+        assert films_of(tmp_path / str(actors)) == films
         assert stats["ledger"]["learned"] == stats["ledger"]["requested"] == 32
 
 

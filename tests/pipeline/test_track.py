@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from envs.episodes.filming import write_film
 from envs.episodes.video import read_video
 from pipeline import track
-from pipeline.evaluation.media import paired_video
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, stage
 from pipeline.graph.view import ConfigView
@@ -72,9 +72,9 @@ def filming(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     (folder / "part/metrics.jsonl").write_text('{"step": 3, "part/loss": 0.5}\n')
     for number in range(2):
         frames = [np.full((32, 48, 3), 40 * step, np.uint8) for step in range(4)]
-        paired_video(folder / f"media/before-{number}.mp4", frames, 10.0)
+        write_film(folder / f"media/before-{number}.mp4", frames, 10.0, rest=5)
     for step in (100, 200):
-        paired_video(folder / f"media/held-out-step{step:06d}.mp4", frames, 10.0)
+        write_film(folder / f"media/held-out-step{step:06d}.mp4", frames, 10.0, rest=5)
     return {}
 
 
@@ -104,7 +104,7 @@ def test_no_video_is_seen_before_it_is_whole(tmp_path: Path) -> None:
             seen.append(sorted(tmp_path.glob("*.mp4")))
             return np.zeros(self.shape, np.uint8)
 
-    paired_video(tmp_path / "one.mp4", [Looking()] * 3, 10.0)  # type: ignore[list-item]
+    write_film(tmp_path / "one.mp4", [Looking()] * 3, 10.0, rest=5)  # type: ignore[list-item]
     assert len(seen) >= 3 and not any(seen)
     assert read_video(tmp_path / "one.mp4").shape == (8, 3, 32, 48) and len(list(tmp_path.iterdir())) == 1
 

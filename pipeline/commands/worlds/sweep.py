@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from actors.factory import build_world
 from envs.episodes.clips import ClipStore
+from envs.episodes.filming import side_by_side, titled
 from envs.files import write_atomically, write_text
 from envs.initial_states import InitialStates
 from envs.specs import CHUNK, COMMAND, WorldSpec, to_chunk
@@ -30,7 +31,6 @@ from pipeline.evaluation.value.candidates import action_spread
 from pipeline.stages.given import mode_of
 
 _HEIGHT = 128  # pixels of a picture, about
-_BAR = 20  # pixels over a row, for its title
 
 
 def sweep(cfg: Mapping[str, Any], root: Path) -> list[Path]:
@@ -110,17 +110,12 @@ def contact_sheet(frames: Tensor, titles: list[str], count: int) -> NDArray[np.u
     `count` moments from the first to the last across, their views side by side.
     """
     at = torch.linspace(0, frames.shape[1] - 1, count).round().long().unique()
-    scale = max(1, round(_HEIGHT / frames.shape[-2]))
     rows = []
     for row, title in zip(frames[:, at], titles, strict=True):
-        moments = [np.concatenate(list(views.permute(0, 2, 3, 1).numpy()), 1) for views in row]
-        gap = np.full((moments[0].shape[0], 2, 3), 255, np.uint8)
+        moments = side_by_side(row.numpy(), _HEIGHT)
+        gap = np.full((moments[0].shape[0], 4, 3), 255, np.uint8)
         line = np.concatenate([part for moment in moments for part in (moment, gap)], 1)
-        line = cv2.resize(line, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
-        framed = cv2.copyMakeBorder(line, _BAR, 0, 6, 0, cv2.BORDER_CONSTANT, value=(24, 24, 24))
-        where = (6, _BAR - 6)
-        cv2.putText(framed, title, where, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (230, 230, 230), 1, cv2.LINE_AA)
-        rows.append(framed)
+        rows += titled([line], title)
     return np.ascontiguousarray(np.concatenate(rows))
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.evaluation.media import paired_video
+from envs.episodes.filming import tiled, titled, write_film, zoom_to
+from pipeline.evaluation.media import REST
 
-_HEIGHT = 192  # pixels of a view, about
 _COLOURS = (
     (250, 204, 21),
     (34, 211, 238),
@@ -21,7 +21,6 @@ _COLOURS = (
     (163, 230, 53),
 )  # RGB of arms; further ones begin anew
 _DIM = 0.45  # of the recorded trajectory's colour in the generated video
-_BAR = 22  # pixels
 
 
 def film_tracks(
@@ -41,17 +40,14 @@ def film_tracks(
     made, true = (np.zeros((0,)) if part is None else part.numpy() for part in tracks)
     above = _rows(videos[0][:frames], [(true, _DIM), (made, 1.0)])
     below = _rows(videos[1][:frames], [(true, 1.0)])
-    bars = [_bar(text, above[0].shape[1]) for text in ("generated", "recorded")]
-    paired_video(
-        path, [np.concatenate((bars[0], a, bars[1], b)) for a, b in zip(above, below, strict=True)], fps
-    )
+    write_film(path, tiled([titled(above, "generated"), titled(below, "recorded")]), fps, rest=REST)
 
 
 def _rows(video: Tensor, drawn: Sequence[tuple[NDArray[Any], float]]) -> list[NDArray[np.uint8]]:
     """Pictures uint8 [h, w, 3] of a video's views side by side, enlarged, with trajectories up to each
     frame.
     """
-    scale = max(1, round(_HEIGHT / video.shape[-2]))
+    scale = zoom_to(video.shape[-2])
     out = []
     for t, frame in enumerate(video.numpy()):
         parts = []
@@ -61,8 +57,7 @@ def _rows(video: Tensor, drawn: Sequence[tuple[NDArray[Any], float]]) -> list[ND
                 for arm in range(tracks.shape[2]) if tracks.ndim == 4 else ():
                     _line(big, tracks[: t + 1, view, arm] * scale, arm, share)
             parts.append(big)
-        row = np.concatenate(parts, 1)
-        out.append(np.ascontiguousarray(row[: row.shape[0] // 2 * 2, : row.shape[1] // 2 * 2]))
+        out.append(np.concatenate(parts, 1))
     return out
 
 
@@ -76,9 +71,3 @@ def _line(picture: NDArray[np.uint8], points: NDArray[Any], arm: int, share: flo
             cv2.line(picture, a, b, colour, 1, cv2.LINE_AA)
     if seen[-1]:
         cv2.circle(picture, tuple(int(v) for v in points[-1]), 4, colour, 1, cv2.LINE_AA)
-
-
-def _bar(text: str, width: int) -> NDArray[np.uint8]:
-    bar = np.full((_BAR, width, 3), 24, np.uint8)
-    cv2.putText(bar, text, (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (230, 230, 230), 1, cv2.LINE_AA)
-    return bar

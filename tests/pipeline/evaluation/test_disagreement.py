@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from envs.episodes.clips import ClipStore
-from envs.episodes.video import read_video
 from envs.judges.base import Judge, Judgement
 from envs.physics.suite import scene_of
 from envs.simulators.base import Simulator
@@ -18,7 +15,6 @@ from envs.simulators.replay import Replay
 from pipeline.evaluation.by_task import by_scene, scenes_of_seeds
 from pipeline.evaluation.disagreement import compared, curves, worst
 from pipeline.evaluation.judging import judge_both
-from pipeline.evaluation.media import film
 from pipeline.evaluation.statistics import rate_entry
 from tests.envs.physics.sections import Counting
 
@@ -117,17 +113,3 @@ def test_scenes_are_what_the_suite_says_they_are() -> None:
     found = [(cell["task"], cell["scene"], cell["successes"], cell["episodes"]) for cell in cells]
     assert found == [("a", "x", 1, 1), ("a", "y", 1, 1), ("b", "x", 1, 2)]
     assert by_scene(["a"] * 4, [""] * 4, rate_entry, won) == []
-
-
-def test_a_film_shows_all_views_side_by_side(tmp_path: Path) -> None:
-    frames = np.zeros((5, 2, 3, 33, 31), np.uint8)
-    frames[:, 1] = 200
-    film(tmp_path / "media" / "one.mp4", frames, 10.0)
-    seen = read_video(tmp_path / "media" / "one.mp4")
-    assert len(seen) == 5 and seen.shape[2] % 2 == 0 and seen.shape[3] % 2 == 0
-    assert (
-        seen[0, :, :, : seen.shape[3] // 2 - 4].mean()
-        < 30
-        < 170
-        < seen[0, :, :, seen.shape[3] // 2 + 4 :].mean()
-    )

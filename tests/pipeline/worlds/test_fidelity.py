@@ -13,6 +13,7 @@ import torch
 
 from actors.factory import open_clips
 from envs.embodiment import Embodiment
+from envs.episodes.filming import BAR
 from envs.targets import ConfigError
 from pipeline.commands.worlds.fidelity import fidelity
 from pipeline.commands.worlds.sweep import commanded, sweep
@@ -80,8 +81,8 @@ def test_a_contact_sheet_for_each_number_of_any_robot(
     words += [*untrained_world(load_config(words), tmp_path), "sweep.levels=[-1.0,1.0]"]
     sheets = sweep(load_config(words), tmp_path / "run")
     assert [path.stem for path in sheets] == [f"{n:02d}-{name}" for n, name in enumerate(robot.action_names)]
-    wide = 6 + 4 * 3 * (32 * len(robot.cameras) + 2)
-    assert cv2.imread(str(sheets[0])).shape == (3 * (20 + 4 * 32), wide, 3)
+    wide = 3 * (4 * 32 * len(robot.cameras) + 4)
+    assert cv2.imread(str(sheets[0])).shape == (3 * (BAR + 4 * 32), wide, 3)
     rows = json.loads((tmp_path / "run/sweep/sweep.json").read_text())["numbers"]
     assert all(row["changed"][0] == 0.0 for row in rows) and any(row["changed"][1] > 0 for row in rows)
     with pytest.raises(ConfigError, match=r"sweep\.episode=99: there are 20"):
