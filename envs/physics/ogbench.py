@@ -12,18 +12,16 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from envs.embodiment import ActionKind, Arm, Camera, Embodiment
+from envs.physics.mujoco_suite import MujocoSuite, World, steps_per_frame
 from envs.physics.noisy_oracle import NoisyOracle
-from envs.physics.render import calibration, offscreen_for
 from envs.physics.suite import (
     Array,
     Expert,
     HeldCondition,
     Observation,
     SuiteError,
-    TaskSuite,
     check_cameras,
     check_task,
     checked_action,
@@ -50,7 +48,7 @@ INSTALL = (
 )
 
 
-class OGBench(TaskSuite):
+class OGBench(MujocoSuite):
     """Tasks of OGBench's cube and scene environments whose start and target are drawn from the seed.
 
     Actions are [dx, dy, dz, dyaw, gripper] in -1..1: 1 moves the target of the hand 5 cm or 0.3 rad from
@@ -85,10 +83,9 @@ class OGBench(TaskSuite):
                 self._open, self._oracles = _package()
         except ImportError as error:
             raise SuiteError(f"task=ogbench needs more packages ({error}): {INSTALL}") from error
-        if SIM_HZ % control_hz:
-            raise SuiteError(f"task.suite.control_hz={control_hz} must divide {SIM_HZ}: 5, 10 or 20")
         check_cameras(cameras, CAMERAS)
-        self.size, self._views, self.substeps = size, cameras, round(SIM_HZ / control_hz)
+        super().__init__(size, cameras)
+        self.substeps = steps_per_frame(control_hz, SIM_HZ)
         self.condition = HeldCondition(hold, control_hz)
         self._envs: dict[str, Any] = {}
         self.embodiment = Embodiment(
@@ -134,24 +131,13 @@ class OGBench(TaskSuite):
         self._see()
         self.condition.update(bool(self._env._success))
 
-    def render(self) -> NDArray[np.uint8]:
-        """Pictures uint8 [V, 3, H, W] without shadows and reflections."""
-        return self._render(self.size, False)
-
-    def picture(self, size: tuple[int, int]) -> NDArray[np.uint8]:
-        """Pictures with shadows, of any size."""
-        return self._render(size, True)
-
-    def segment(self) -> NDArray[np.uint8]:
-        """See TaskSuite.segment."""
-        offscreen = offscreen_for(f"ogbench/{self._scene}", self._env._model, self.size)
-        return offscreen.segment(self._env._model, self._env._data, self._views)
+    def world(self) -> World:
+        """See MujocoSuite."""
+        return World(f"ogbench/{self._scene}", self._env._model, self._env._data)
 
     def observe(self) -> Observation:
         """Hand, gripper, and how the task stands; progress is the share of the target's distance made up."""
-        intrinsic, c2w = None, None
-        if self.embodiment.calibrated:
-            intrinsic, c2w = calibration(self._env._model, self._env._data, self._views, self.size)
+        intrinsic, c2w = self.calibration()
         seen = self._seen
         yaw, met = float(seen["proprio/effector_yaw"][0]), bool(self._env._success)
         state = (*seen["proprio/effector_pos"], np.cos(yaw), np.sin(yaw), *seen["proprio/gripper_opening"])
@@ -231,10 +217,6 @@ class OGBench(TaskSuite):
             return f"press the {('left', 'right')[env._target_button]} button"
         opened = {"drawer": env._target_drawer_pos < -0.08, "window": env._target_window_pos > 0.1}
         return f"{'open' if opened[self._kind] else 'close'} the {self._kind}"
-
-    def _render(self, size: tuple[int, int], shadows: bool) -> NDArray[np.uint8]:
-        offscreen = offscreen_for(f"ogbench/{self._scene}", self._env._model, size)
-        return offscreen.render(self._env._model, self._env._data, self._views, shadows)
 
 
 def _package() -> tuple[dict[str, Callable[[], Any]], dict[str, Any]]:

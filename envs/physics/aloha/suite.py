@@ -12,20 +12,18 @@ import warnings
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from envs.embodiment import ActionKind, Arm, Camera, Embodiment
 from envs.physics.aloha.arms import JOINTS, SIDES, ArmKinematics, Array, Hands
 from envs.physics.aloha.cameras import CAMERAS, load_model, wrist_of
 from envs.physics.aloha.experts import NoisyScript
 from envs.physics.aloha.scripts import Insertion, Script, TransferCube
-from envs.physics.render import calibration, offscreen_for
+from envs.physics.mujoco_suite import MujocoSuite, World, steps_per_frame
 from envs.physics.suite import (
     Expert,
     HeldCondition,
     Observation,
     SuiteError,
-    TaskSuite,
     check_cameras,
     check_task,
     checked_action,
@@ -46,7 +44,7 @@ INSTALL = (
 )
 
 
-class Aloha(TaskSuite):
+class Aloha(MujocoSuite):
     """gym-aloha's cube transfer and insertion, laid out as its environment does for the same seed.
 
     Actions are 14 absolute joint commands: for the left, then the right arm six joints in radians and the
@@ -80,15 +78,11 @@ class Aloha(TaskSuite):
                 importlib.import_module("gym_aloha.tasks.sim")
         except ImportError as error:
             raise SuiteError(f"task=aloha needs more packages ({error}): {INSTALL}") from error
-        if SIM_HZ % control_hz:
-            raise SuiteError(
-                f"task.suite.control_hz={control_hz} must divide {SIM_HZ}: 5, 6.25, 10, 12.5, 25 or 50"
-            )
         check_cameras(cameras, CAMERAS)
-        self.size, self.substeps = size, round(SIM_HZ / control_hz)
+        super().__init__(size, tuple(CAMERAS[name] for name in cameras))
+        self.substeps = steps_per_frame(control_hz, SIM_HZ)
         self.condition = HeldCondition(hold, control_hz)
         self._benches: dict[str, _Bench] = {}
-        self._views = tuple(CAMERAS[name] for name in cameras)
         names = tuple(f"{side}_{part}" for side in SIDES for part in (*JOINTS, "gripper"))
         self.embodiment = Embodiment(
             robot="aloha",
@@ -124,25 +118,14 @@ class Aloha(TaskSuite):
         self._bench.step(action, self.substeps)
         self.condition.update(self._bench.reward == MAX_REWARD)
 
-    def render(self) -> NDArray[np.uint8]:
-        """Pictures uint8 [V, 3, H, W] without shadows and reflections."""
-        return self._render(self.size, False)
-
-    def picture(self, size: tuple[int, int]) -> NDArray[np.uint8]:
-        """Pictures with shadows, of any size."""
-        return self._render(size, True)
-
-    def segment(self) -> NDArray[np.uint8]:
-        """See TaskSuite.segment."""
-        offscreen = offscreen_for(f"aloha/{self._task}", self._bench.model, self.size)
-        return offscreen.segment(self._bench.model, self._bench.data, self._views)
+    def world(self) -> World:
+        """See MujocoSuite."""
+        return World(f"aloha/{self._task}", self._bench.model, self._bench.data)
 
     def observe(self) -> Observation:
         """Joints, and how the task stands; progress is a quarter of gym-aloha's reward of 0 to 4."""
         bench = self._bench
-        intrinsic, c2w = None, None
-        if self.embodiment.calibrated:
-            intrinsic, c2w = calibration(bench.model, bench.data, self._views, self.size)
+        intrinsic, c2w = self.calibration()
         return Observation(
             state=bench.state(),
             command=bench.command.copy(),
@@ -163,10 +146,6 @@ class Aloha(TaskSuite):
         bench = self._bench
         script, period = _SCRIPTS[self._task](), 1 / self.embodiment.fps
         return NoisyScript(script, bench.arms, bench.look, bench.command, noise_level, rng, period)
-
-    def _render(self, size: tuple[int, int], shadows: bool) -> NDArray[np.uint8]:
-        offscreen = offscreen_for(f"aloha/{self._task}", self._bench.model, size)
-        return offscreen.render(self._bench.model, self._bench.data, self._views, shadows)
 
 
 class _Bench:

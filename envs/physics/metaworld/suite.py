@@ -12,19 +12,17 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from envs.embodiment import ActionKind, Arm, Camera, Embodiment
 from envs.physics.metaworld.noisy_policy import NoisyPolicy
 from envs.physics.metaworld.words import instruction_of
-from envs.physics.render import calibration, offscreen_for
+from envs.physics.mujoco_suite import MujocoSuite, World, steps_per_frame
 from envs.physics.suite import (
     Array,
     Expert,
     HeldCondition,
     Observation,
     SuiteError,
-    TaskSuite,
     check_cameras,
     check_task,
     checked_action,
@@ -50,7 +48,7 @@ INSTALL = (
 )
 
 
-class MetaWorld(TaskSuite):
+class MetaWorld(MujocoSuite):
     """Tasks of Meta-World v3 whose start and goal are drawn from the seed.
 
     Actions are [dx, dy, dz, gripper] in -1..1: 1 moves the hand's target by 1 cm in each of the SIM_HZ steps,
@@ -82,18 +80,14 @@ class MetaWorld(TaskSuite):
         except ImportError as error:
             raise SuiteError(f"task=metaworld needs more packages ({error}): {INSTALL}") from error
         warnings.filterwarnings("ignore", "Constant.s. may be too high")  # its experts' saturated actions
-        if SIM_HZ % control_hz:
-            raise SuiteError(
-                f"task.suite.control_hz={control_hz} must divide {SIM_HZ}: 5, 8, 10, 16, 20, 40 or 80"
-            )
         check_cameras(cameras, CAMERAS)
+        super().__init__(size, tuple(SCENE[1] if name == SCENE[0] else name for name in cameras))
         self._classes: dict[str, Any] = metaworld.ALL_V3_ENVIRONMENTS
         self._experts: dict[str, Any] = ENV_POLICY_MAP
         self.tasks = tuple(sorted(set(self._classes) & set(self._experts)))
-        self.size, self.substeps = size, round(SIM_HZ / control_hz)
+        self.substeps = steps_per_frame(control_hz, SIM_HZ)
         self.condition = HeldCondition(hold, control_hz)
         self._envs: dict[str, Any] = {}
-        self._views = tuple(SCENE[1] if name == SCENE[0] else name for name in cameras)
         self._task = ""
         names = ("x", "y", "z", "gripper")
         self.embodiment = Embodiment(
@@ -136,24 +130,13 @@ class MetaWorld(TaskSuite):
             self._sight, self._reward, _, _, self._info = self._env.step(self.command)
         self.condition.update(self._satisfied())
 
-    def render(self) -> NDArray[np.uint8]:
-        """Pictures uint8 [V, 3, H, W] without shadows and reflections."""
-        return self._render(self.size, False)
-
-    def picture(self, size: tuple[int, int]) -> NDArray[np.uint8]:
-        """Pictures with shadows, of any size."""
-        return self._render(size, True)
-
-    def segment(self) -> NDArray[np.uint8]:
-        """See TaskSuite.segment."""
-        offscreen = offscreen_for(self._task, self._env.model, self.size)
-        return offscreen.segment(self._env.model, self._env.data, self._views)
+    def world(self) -> World:
+        """See MujocoSuite."""
+        return World(self._task, self._env.model, self._env.data)
 
     def observe(self) -> Observation:
         """Hand, gripper, and how the task stands; progress is a tenth of Meta-World's shaped reward."""
-        intrinsic, c2w = None, None
-        if self.embodiment.calibrated:
-            intrinsic, c2w = calibration(self._env.model, self._env.data, self._views, self.size)
+        intrinsic, c2w = self.calibration()
         return Observation(
             state=self._sight[:4].copy(),
             command=self.command.copy(),
@@ -179,10 +162,6 @@ class MetaWorld(TaskSuite):
 
     def _satisfied(self) -> bool:
         return bool(self._info["success"])
-
-    def _render(self, size: tuple[int, int], shadows: bool) -> NDArray[np.uint8]:
-        offscreen = offscreen_for(self._task, self._env.model, size)
-        return offscreen.render(self._env.model, self._env.data, self._views, shadows)
 
 
 def _open(factory: Any) -> Any:

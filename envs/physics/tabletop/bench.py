@@ -1,4 +1,4 @@
-"""The two arms in one MuJoCo world at a time: carry out actions, render, say how the goal stands."""
+"""The two arms in one MuJoCo world at a time: carry out actions, say how the goal stands."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.render import offscreen_for
 from envs.physics.suite import HeldCondition, checked_action
 from envs.physics.tabletop.actions import ActionInterface, Target
 from envs.physics.tabletop.arms import ArmKinematics
@@ -41,8 +40,6 @@ class Bench:
         actions: class of its commands.
         control_hz: actions and frames per second.
         hold: seconds an episode's condition must hold.
-        cameras: to render, in order.
-        assets: a name that all its models share, whose textures and meshes are the same.
     """
 
     goal: Goal
@@ -50,15 +47,8 @@ class Bench:
     model: mujoco.MjModel
     data: mujoco.MjData
 
-    def __init__(
-        self,
-        actions: type[ActionInterface],
-        control_hz: float,
-        hold: float,
-        cameras: tuple[str, ...],
-        assets: str,
-    ):
-        self.control_hz, self.cameras, self.assets = control_hz, cameras, assets
+    def __init__(self, actions: type[ActionInterface], control_hz: float, hold: float):
+        self.control_hz = control_hz
         self.arms = ArmKinematics()
         self.actions = actions(self.arms, control_hz)
         self.condition = HeldCondition(hold, control_hz)
@@ -107,7 +97,7 @@ class Bench:
             self.data.ctrl[k * 9 : k * 9 + 7] = joints[k]
             self.data.ctrl[k * 9 + 7 : k * 9 + 9] = (1.0 - grippers[k]) * FINGER_TRAVEL
 
-    # -- what can be seen and known --------------------------------------------------------------------------
+    # -- what is known --------------------------------------------------------------------------------------
     def state(self) -> Array:
         """Joint state [16]: seven joints in radians and the gripper (1 closed) of left and right arm."""
         grippers = 1.0 - self.data.qpos[self._slides].mean(1) / FINGER_TRAVEL
@@ -116,12 +106,3 @@ class Bench:
     def flanges(self) -> Array:
         """Flange poses [2, 6] that the arms really have, in metres and radians."""
         return self.arms.read(self.data)
-
-    def render(self, size: tuple[int, int], shadows: bool) -> NDArray[np.uint8]:
-        """Pictures uint8 [V, 3, H, W]."""
-        offscreen = offscreen_for(self.assets, self.model, size)
-        return offscreen.render(self.model, self.data, self.cameras, shadows)
-
-    def segment(self, size: tuple[int, int]) -> NDArray[np.uint8]:
-        """What each pixel shows, uint8 [V, H, W] of render.PARTS."""
-        return offscreen_for(self.assets, self.model, size).segment(self.model, self.data, self.cameras)

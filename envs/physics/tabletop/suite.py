@@ -6,16 +6,14 @@ What all its suites share stands in `TwoArmSuite`; `Tabletop` is the smallest of
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from envs.embodiment import Camera, Embodiment
-from envs.physics.render import calibration
+from envs.physics.mujoco_suite import MujocoSuite, World
 from envs.physics.suite import (
     Array,
     Expert,
     Observation,
     SuiteError,
-    TaskSuite,
     check_cameras,
     check_task,
 )
@@ -27,7 +25,7 @@ from envs.physics.tabletop.tasks import TASKS, TabletopTask
 from envs.ranges import NonNegative, Positive
 
 
-class TwoArmSuite(TaskSuite):
+class TwoArmSuite(MujocoSuite):
     """Two 7-DoF arms with parallel grippers and calibrated cameras; subclasses lay out episodes.
 
     Args:
@@ -56,8 +54,8 @@ class TwoArmSuite(TaskSuite):
             raise SuiteError(f"task.suite.actions={actions!r} is unknown; choose one of {sorted(ACTIONS)}")
         check_cameras(cameras, CAMERAS)
         kind = ACTIONS[actions]
-        self.size = size
-        self._bench = Bench(kind, control_hz, hold, cameras, type(self).__name__)
+        super().__init__(size, cameras)
+        self._bench = Bench(kind, control_hz, hold)
         self.embodiment = Embodiment(
             robot="worldloop_tabletop",
             action_names=kind.names,
@@ -74,22 +72,14 @@ class TwoArmSuite(TaskSuite):
         """Carry out one absolute action [A]; too fast or too far is carried out as far as limits allow."""
         self._bench.step(action)
 
-    def render(self) -> NDArray[np.uint8]:
-        """Pictures uint8 [V, 3, H, W] without shadows, which cost eight times all else in software."""
-        return self._bench.render(self.size, shadows=False)
-
-    def picture(self, size: tuple[int, int]) -> NDArray[np.uint8]:
-        """Pictures with shadows, of any size."""
-        return self._bench.render(size, shadows=True)
-
-    def segment(self) -> NDArray[np.uint8]:
-        """See TaskSuite.segment."""
-        return self._bench.segment(self.size)
+    def world(self) -> World:
+        """See MujocoSuite."""
+        return World(type(self).__name__, self._bench.model, self._bench.data)
 
     def observe(self) -> Observation:
         """Joint state, calibration, and how the task stands."""
         bench = self._bench
-        intrinsic, c2w = calibration(bench.model, bench.data, bench.cameras, self.size)
+        intrinsic, c2w = self.calibration()
         return Observation(
             state=bench.state(),
             command=bench.actions.command.copy(),
