@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from envs.physics.aloha.arms import ArmKinematics, Array, Hand, Hands, facing
 from envs.physics.aloha.scripts import Script, Sight
-from envs.physics.suite import check_noise_level
+from envs.physics.noise import Drift, Interruptions
 
 SPEED = 0.35  # m/s that fingertips move at most
 TURN_SPEED = 2.5  # rad/s
@@ -50,39 +50,27 @@ class NoisyScript:
         rng: np.random.Generator,
         period: float,
     ):
-        check_noise_level(noise_level)
         self.script, self.arms, self.look = script, arms, look
-        self.noise_level, self.rng, self.period = noise_level, rng, period
+        self.rng, self.period = rng, period
         self.joints = command.reshape(2, 7)[:, :6].copy()
         self.hands: Hands = arms.forward(self.joints, command.reshape(2, 7)[:, 6])
         self.phase, self.waited = 0, 0.0
-        self.keep = 0.8 ** (period / 0.1)
-        self.start = 0.1 * noise_level**2 * period / 0.1  # chance that way-points interrupt, per action
+        self.interruptions = Interruptions[Hands](noise_level, _WAYPOINT, rng, period)
         self.bias = rng.normal(0.0, BIAS * noise_level, (2, 2))  # m, of the things' places on the table
-        self.drift = np.zeros((2, 3))
-        self.left, self.waypoints = 0, self.hands
+        self.drift = Drift(DRIFT * noise_level, (2, 3), rng, period)
 
     def __call__(self) -> Array:
         """The next joint command [14]."""
         sight = Sight(*self.look(), self.hands)
-        if self.left == 0 and (self.noise_level >= 1.0 or self.rng.random() < self.start):
-            self.left = max(1, round(_WAYPOINT / self.period))
-            self.waypoints = self._wander(sight)
-        if self.left:
-            self.left -= 1
-            goals = self.waypoints
-        else:
-            goals = self._follow(sight)
+        goals = self.interruptions(lambda: self._wander(sight)) or self._follow(sight)
         left, right = (
             _towards(hand, goal, SPEED * self.period, TURN_SPEED * self.period)
             for hand, goal in zip(self.hands, goals, strict=True)
         )
         self.hands = (left, right)
-        scale = DRIFT * self.noise_level * np.sqrt(1 - self.keep**2)
-        self.drift = self.keep * self.drift + self.rng.normal(0.0, scale, (2, 3))
         bent = [
             replace(hand, position=hand.position + off)
-            for hand, off in zip(self.hands, self.drift, strict=True)
+            for hand, off in zip(self.hands, self.drift(), strict=True)
         ]
         self.joints = self.arms.solve(bent, self.joints, JOINT_SPEED * self.period)
         openings = [[hand.opening] for hand in self.hands]

@@ -11,6 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.physics.noise import Drift
+
 Array = NDArray[np.float64]
 SPEED = 0.22  # m/s a fingertip moves at most
 _STANDOFF = 0.055  # m from block centre to fingertip centre when the push begins
@@ -112,16 +114,13 @@ class Drifting(FingertipExpert):
     """
 
     def __init__(self, expert: FingertipExpert, noise_level: float, rng: np.random.Generator, period: float):
-        self.expert, self.arm, self.rng = expert, expert.arm, rng
-        self.keep = 0.8 ** (period / 0.1)
-        self.scale = 0.0133 * noise_level * np.sqrt(1 - self.keep**2)
-        self.drift = np.zeros(2)
+        self.expert, self.arm = expert, expert.arm
+        self.drift = Drift(0.0133 * noise_level, 2, rng, period)
 
     def fingertip(self, tip: Array) -> Array:
         """The next fingertip position [2] in metres."""
         goal = self.expert.fingertip(tip)
-        self.drift = self.keep * self.drift + self.rng.normal(0.0, self.scale, 2)
-        return goal + self.drift
+        return goal + self.drift()
 
 
 def _towards(tip: Array, goal: Array, stride: float) -> Array:
