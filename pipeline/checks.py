@@ -49,6 +49,7 @@ _SECTIONS = {
     "distill": learning.DistillSection,
     "chaos": running.ChaosSection,
     "evaluate": measuring.EvaluateSection,
+    "controls": measuring.ControlsSection,
     "measure": measuring.MeasureSection,
     "study": measuring.StudySection,
     "imagined": measuring.ImaginedSection,

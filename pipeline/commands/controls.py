@@ -40,6 +40,7 @@ class Row:
     """A line of the table.
 
     Args:
+        name: in controls.only; "" of the run itself.
         title: what it is.
         graph: the graph that holds its stages.
         node: the evaluation in physics that it shows.
@@ -47,6 +48,7 @@ class Row:
         note: what must be known to compare it with the others; "" for nothing.
     """
 
+    name: str
     title: str
     graph: Graph
     node: str
@@ -55,7 +57,8 @@ class Row:
 
 
 def run_controls(cfg: Cfg, root: Path, tracker: Tracker | None = None) -> dict[str, Any]:
-    """Run the controls of a finished run; writes controls.json and renders its report anew.
+    """Run the controls of a finished run, or those of controls.only; after each one controls.json and the
+    run's report hold those that are finished by then.
 
     Returns:
         Rows by title: a rate entry, gain in points, paired (McNemar against the policy before),
@@ -72,32 +75,35 @@ def run_controls(cfg: Cfg, root: Path, tracker: Tracker | None = None) -> dict[s
             f"{root} holds no finished run of this config (`worldloop stages` says what differs); the"
             " controls stand beside one: first `worldloop run` with the same options"
         )
-    rows = control_rows(cfg, root, loop)
-    for row in rows:
+    rows, only, table = control_rows(cfg, root, loop), cfg["controls"]["only"], dict[str, Any]()
+    for row in (row for row in rows if not only or row.name in only):
         row.graph.run(row.node, tracker)
-    table = control_table(loop, rows)
-    write_text(root / "controls.json", json.dumps(table, indent=1, default=float))
-    result = json.loads((root / "result.json").read_text())
-    page = build_report(loop.view("report"), loop.inputs("report"), result, table)
-    write_text(root / "report.html", page)
+        table = control_table(loop, [row for row in rows if row.graph.finished(row.node)])
+        write_text(root / "controls.json", json.dumps(table, indent=1, default=float))
+        result = json.loads((root / "result.json").read_text())
+        page = build_report(loop.view("report"), loop.inputs("report"), result, table)
+        write_text(root / "report.html", page)
     return table
 
 
 def control_rows(cfg: Cfg, root: Path, loop: Graph) -> list[Row]:
     """The run itself and its controls, whose stages are added to the run's graph or have one of their own."""
     deploys = tuple(f"deploy-{n}" for n in range(1, last_round(cfg) + 2))
-    learned = {f"RL in physics, equal {equal}": _rl_in_physics(loop, cfg, equal) for equal in EQUAL}
+    learned = {equal: _rl_in_physics(loop, cfg, equal) for equal in EQUAL}
     note = privileged_note(cfg)
     loop.add("filtered-bc", only_here.filtered_bc, {"data": ["collect", *deploys]})
     loop.add("evaluate-filtered-bc", prove.evaluate_physics, {"policy": "filtered-bc"})
     without = build_loop(cfg, root, with_rl=False)
     blind = build_loop({**cfg, "rl": {**cfg["rl"], "imagined": 0.0}}, root)
     return [
-        Row("loop", loop, "evaluate-after", deploys),
-        Row("loop without RL iterations", without, "evaluate-after", deploys),
-        Row("loop without imagined decisions", blind, "evaluate-after", deploys),
-        *(Row(title, loop, f"evaluate-{name}", (name,), note) for title, name in learned.items()),
-        Row("filtered BC", loop, "evaluate-filtered-bc", deploys),
+        Row("", "loop", loop, "evaluate-after", deploys),
+        Row("without_rl", "loop without RL iterations", without, "evaluate-after", deploys),
+        Row("without_imagined", "loop without imagined decisions", blind, "evaluate-after", deploys),
+        *(
+            Row(f"rl_equal_{equal}", f"RL in physics, equal {equal}", loop, f"evaluate-{name}", (name,), note)
+            for equal, name in learned.items()
+        ),
+        Row("filtered_bc", "filtered BC", loop, "evaluate-filtered-bc", deploys),
     ]
 
 

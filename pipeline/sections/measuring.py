@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, MinLen, MultipleOf
 
@@ -19,6 +19,15 @@ class EvaluateSection:
     episodes: Count
     envs: Count
     imagined: Count
+
+
+@dataclass(frozen=True)
+class ControlsSection:
+    """Section controls."""
+
+    only: Sequence[
+        Literal["without_rl", "without_imagined", "rl_equal_episodes", "rl_equal_steps", "filtered_bc"]
+    ]
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from envs.targets import ConfigError
 from pipeline.commands.controls import control_rows, table_text
 from pipeline.config import load_config
 from pipeline.loop import build_loop
@@ -18,6 +19,15 @@ def test_rl_in_physics_says_that_its_rewards_are_privileged(progress: str, told:
     noted = {title: note for title, note in rows.items() if note}
     assert set(noted) == {title for title in rows if title.startswith("RL in physics")} and len(noted) == 2
     assert all(f"suite's true {told}, which are privileged" in note for note in noted.values())
+
+
+def test_rows_are_chosen_by_names_that_exist(tmp_path: Path) -> None:
+    cfg = load_config(["experiment=smoke"])
+    names = [row.name for row in control_rows(cfg, tmp_path, build_loop(cfg, tmp_path))]
+    assert names[0] == "" and len(set(names)) == len(names) == 6
+    load_config(["experiment=smoke", f"controls.only=[{','.join(names[1:])}]"])
+    with pytest.raises(ConfigError, match=r"controls\.only.*without_rl"):
+        load_config(["experiment=smoke", "controls.only=[no_rl]"])
 
 
 def test_the_table_shows_notes() -> None:

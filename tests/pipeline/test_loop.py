@@ -41,6 +41,10 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     assert "| algorithm; seed | PPO; 0 | PPO; 0 |" in table
     again = worldloop(tmp_path, "run", *words)
     assert again.output.count("is finished, reused") == 24
+    one = worldloop(tmp_path, "controls", *words, "controls.only=[filtered_bc]")
+    assert one.status == 0, one.output[-3000:]
+    assert set(json.loads((run / "controls.json").read_text())) == {"before", "loop", "filtered BC"}
+    assert "filtered BC" in (run / "report.html").read_text()
     controls = worldloop(tmp_path, "controls", *words)
     assert controls.status == 0, controls.output[-3000:]
     rows = json.loads((run / "controls.json").read_text())
