@@ -32,7 +32,7 @@ class GoalJudge(Judge):
         hold: frames in a row that make an episode a success.
         threshold: of success, until calibration sets it.
         metric: `_target_` and options of a distance of pictures: a module of two [N, 3, H, W] to [N] with a
-            `name`, such as envs.perceptual.PerceptualDistance or envs.judges.lpips.LPIPS.
+            `name`, such as envs.judges.perceptual.PerceptualDistance or envs.judges.lpips.LPIPS.
         cameras: which are compared: "all", "main", or names.
     """
 

@@ -1,6 +1,6 @@
 """LPIPS (Zhang et al. 2018) with AlexNet, from weights that lie on disk; nothing is downloaded.
 
-A distance of pictures like envs/perceptual.py, for whoever has the two files: torchvision's AlexNet
+A distance of pictures like envs/judges/perceptual.py, for whoever has the two files: torchvision's AlexNet
 (alexnet-owt-7be5be79.pth) and the linear weights of the `lpips` package (lpips/weights/v0.1/alex.pth).
 """
 

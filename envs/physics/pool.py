@@ -7,7 +7,6 @@ another (process.py).
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Mapping, Sequence
 from multiprocessing.connection import Connection, wait
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.machine import available_cores
 from envs.physics.process import PoolError, WorkerProcess
 from envs.physics.suite import task_names
 from envs.physics.worker import Track, WorkerSpec
@@ -23,12 +23,7 @@ from envs.targets import ConfigError, to_plain
 
 LOST = 0.05  # share of the episodes of a pool that may be given up before it stops
 
-__all__ = ["PoolError", "TaskPool", "Track", "available_cores"]
-
-
-def available_cores() -> int:
-    """Cores this process may run on, which in containers and batch systems is less than the machine has."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+__all__ = ["PoolError", "TaskPool", "Track"]
 
 
 class TaskPool:

@@ -13,7 +13,8 @@ import torch
 
 from actors.world_config import embodiment_of
 from envs.episodes.filming import side_by_side, write_film
-from envs.physics.pool import TaskPool, available_cores
+from envs.machine import available_cores
+from envs.physics.pool import TaskPool
 from envs.physics.suite import task_names
 from envs.physics.worker import Track
 from envs.rng import Purpose, episode_seeds

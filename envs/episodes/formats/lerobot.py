@@ -7,11 +7,13 @@ info.json and the file indices and timestamps of meta/episodes, so episodes may 
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
-import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.dataset as pads
@@ -27,11 +29,13 @@ from envs.episodes.formats.lerobot_files import (
     read_episode_rows,
     read_info,
     read_tasks,
+    stored_picture,
 )
 from envs.episodes.formats.lerobot_info import INFO_KEY, camera_features
 from envs.episodes.formats.lerobot_robot import agreed_robot
 from envs.episodes.pictures import resize_intrinsics, resize_picture
 from envs.episodes.video import read_clip
+from envs.machine import available_cores
 
 
 class LeRobotDataset:
@@ -80,6 +84,7 @@ class LeRobotDataset:
         self.rows = read_episode_rows(self.root)
         self._tasks = {index: task for task, index in read_tasks(self.root).items()}
         self._cached: tuple[Path, pa.Table] | None = None
+        self._reading = Lock()  # of what is cached
 
     @property
     def fps(self) -> float:
@@ -90,8 +95,18 @@ class LeRobotDataset:
         return len(self.rows)
 
     def __iter__(self) -> Iterator[Episode]:
-        """Every episode in order."""
-        return (self.episode(number) for number in range(len(self)))
+        """Every episode in order, decoded ahead by as many threads as there are cores."""
+        threads = available_cores()
+        pool, ahead = ThreadPoolExecutor(threads, "episodes"), deque[Future[Episode]]()
+        try:
+            for number in range(len(self)):
+                ahead.append(pool.submit(self.episode, number))
+                if len(ahead) > 2 * threads:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
     def episode(self, number: int) -> Episode:
         """Read one episode.
@@ -171,27 +186,31 @@ class LeRobotDataset:
         )
 
     def _numbers(self, path: Path) -> pa.Table:
-        """All columns of a data file but pictures and what is not asked for; the last file is kept."""
-        if self._cached is None or self._cached[0] != path:
-            pictures = set(camera_features(self.features).values())
-            wanted = {"action", "observation.state", "episode_index", "task_index", names.COMMAND, names.C2W}
-            wanted |= {names.INTRINSIC, names.POSES, names.PRESENT, names.SOURCE, names.SEED}
-            wanted |= {names.SUCCESS, names.REWARD}
-            file = open_parquet(path)
-            columns = [
-                name
-                for name in file.schema_arrow.names
-                if name not in pictures
-                and (name in wanted or (self.privileged and name.startswith(PRIVILEGED)))
-            ]
-            missing = {"action", "observation.state", "episode_index"} - set(columns)
-            if missing:
-                raise EpisodeError(f"{path}: columns {sorted(missing)} are missing")
-            try:
-                self._cached = (path, file.read(columns=columns))
-            except (OSError, pa.ArrowInvalid) as error:
-                raise EpisodeError(f"{path}: {error}; restore the file") from error
-        return self._cached[1]
+        """`_read` of a data file; the last one is kept."""
+        with self._reading:
+            if self._cached is None or self._cached[0] != path:
+                self._cached = (path, self._read(path))
+            return self._cached[1]
+
+    def _read(self, path: Path) -> pa.Table:
+        """All columns of a data file but pictures and what is not asked for."""
+        pictures = set(camera_features(self.features).values())
+        wanted = {"action", "observation.state", "episode_index", "task_index", names.COMMAND, names.C2W}
+        wanted |= {names.INTRINSIC, names.POSES, names.PRESENT, names.SOURCE, names.SEED}
+        wanted |= {names.SUCCESS, names.REWARD}
+        file = open_parquet(path)
+        columns = [
+            name
+            for name in file.schema_arrow.names
+            if name not in pictures and (name in wanted or (self.privileged and name.startswith(PRIVILEGED)))
+        ]
+        missing = {"action", "observation.state", "episode_index"} - set(columns)
+        if missing:
+            raise EpisodeError(f"{path}: columns {sorted(missing)} are missing")
+        try:
+            return file.read(columns=columns)
+        except (OSError, pa.ArrowInvalid) as error:
+            raise EpisodeError(f"{path}: {error}; restore the file") from error
 
     def _known(self, table: pa.Table) -> dict[str, Any]:
         """All fields of the episode that are numbers."""
@@ -268,21 +287,8 @@ class LeRobotDataset:
             )
         except (OSError, pa.ArrowInvalid) as error:
             raise EpisodeError(f"{path}: {error}; restore the file") from error
-        pictures = [self._decode(cell, key, path) for cell in part[key].to_pylist()]
+        pictures = [stored_picture(self.root, key, cell) for cell in part[key].to_pylist()]
         return np.stack([resize_picture(picture, self.size).transpose(2, 0, 1) for picture in pictures])
-
-    def _decode(self, cell: dict[str, Any] | None, key: str, path: Path) -> NDArray[np.uint8]:
-        """A picture uint8 [H, W, 3] of a cell {bytes, path}."""
-        cell = cell or {}
-        stored = cell.get("bytes")
-        if stored is None and cell.get("path"):
-            beside = self.root / cell["path"]
-            stored = beside.read_bytes() if beside.exists() else None
-        flat = np.frombuffer(stored or b"", np.uint8)
-        picture = cv2.imdecode(flat, cv2.IMREAD_COLOR_RGB) if len(flat) else None
-        if picture is None:
-            raise EpisodeError(f"{path}: column {key} holds no readable picture ({cell.get('path')})")
-        return np.asarray(picture, np.uint8)
 
 
 def _first_command(robot: Embodiment, action: NDArray[Any], states: NDArray[Any]) -> NDArray[Any]:

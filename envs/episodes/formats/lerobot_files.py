@@ -1,4 +1,6 @@
-"""The files of a LeRobot v3.0 data set but videos: info.json, tasks, episodes, rows; damage is named."""
+"""The files of a LeRobot v3.0 data set but videos: info.json, tasks, episodes, rows, single pictures; damage
+is named.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
@@ -48,6 +52,24 @@ def open_parquet(path: Path) -> pq.ParquetFile:
         return pq.ParquetFile(path, page_checksum_verification=True)
     except (OSError, pa.ArrowInvalid) as error:
         raise EpisodeError(f"{path}: {error}; restore the file or collect its episodes again") from error
+
+
+def stored_picture(root: Path, name: str, cell: Mapping[str, Any] | None) -> NDArray[np.uint8]:
+    """A picture uint8 [H, W, 3] of a column's cell {bytes, path}.
+
+    Raises:
+        EpisodeError: if it cannot be decoded.
+    """
+    cell = cell or {}
+    stored = cell.get("bytes")
+    if stored is None and cell.get("path"):
+        beside = root / cell["path"]
+        stored = beside.read_bytes() if beside.exists() else None
+    flat = np.frombuffer(stored or b"", np.uint8)
+    picture = cv2.imdecode(flat, cv2.IMREAD_COLOR_RGB) if len(flat) else None
+    if picture is None:
+        raise EpisodeError(f"column {name} holds no readable picture ({cell.get('path')})")
+    return np.asarray(picture, np.uint8)
 
 
 def write_groups(path: Path, tables: Sequence[pa.Table]) -> None:

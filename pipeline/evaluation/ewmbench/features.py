@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from envs.perceptual import PerceptualDistance
+from envs.judges.perceptual import PerceptualDistance
 from envs.targets import ConfigError
 from pipeline.evaluation.fidelity.extractors import Extractor
 
@@ -44,8 +44,8 @@ class PatchExtractor(ABC):
 
 
 class PyramidPatches(PatchExtractor):
-    """Bands of a normalised Laplacian pyramid (envs/perceptual.py), with their signs, and colours, in a grid
-    of patches: structure that moves or melts changes them, and light hardly does.
+    """Bands of a normalised Laplacian pyramid (judges/perceptual.py), with their signs, and colours, in a grid of
+    patches: structure that moves or melts changes them, and light hardly does.
 
     Args:
         grid: patches of a row and of a column.

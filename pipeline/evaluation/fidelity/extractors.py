@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from envs.perceptual import PerceptualDistance
+from envs.judges.perceptual import PerceptualDistance
 from envs.targets import ConfigError
 
 
@@ -39,7 +39,7 @@ class Extractor(ABC):
 
 
 class PyramidFrames(Extractor):
-    """Contrast of every band of a normalised Laplacian pyramid (envs/perceptual.py) and colours, in each
+    """Contrast of every band of a normalised Laplacian pyramid (judges/perceptual.py) and colours, in each
     quarter of a picture. It tells sharp from blurred and one scene from another, and knows no things.
     """
 

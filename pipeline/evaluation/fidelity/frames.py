@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure as ssim
 
-from envs.perceptual import PerceptualDistance
+from envs.judges.perceptual import PerceptualDistance
 from envs.physics.render import PARTS
 
 _AT_ONCE = 256  # pictures

@@ -19,8 +19,8 @@ from actors.world_config import world_spec
 from envs.episodes.clips import ClipStore
 from envs.episodes.episode import Episode
 from envs.episodes.formats.lerobot_writer import LeRobotWriter
+from envs.judges.perceptual import PerceptualDistance
 from envs.manifest import read_manifest, write_manifest
-from envs.perceptual import PerceptualDistance
 from envs.rng import Purpose, episode_seeds
 from envs.simulators.base import Simulator
 from envs.simulators.replay import replay

@@ -12,7 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from envs.episodes.clips import ClipStore
-from envs.perceptual import PerceptualDistance
+from envs.judges.perceptual import PerceptualDistance
 from envs.simulators.base import Simulator
 from envs.simulators.replay import replay
 from pipeline.evaluation.fidelity.end_effector import EndEffectorRuler, end_effector_summary

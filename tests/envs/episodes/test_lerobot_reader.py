@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -208,3 +209,15 @@ def test_broken_pictures_and_numbers_are_named(tmp_path: Path) -> None:
     pq.write_table(table.set_column(at, "action", nan), path)
     with pytest.raises(EpisodeError, match=r"file-000\.parquet.*commands holds NaN"):
         LeRobotDataset(root).episode(0)
+
+
+def test_episodes_come_in_order_and_nobody_reads_on_when_nobody_asks(tmp_path: Path) -> None:
+    root = tmp_path / "set"
+    write_set(root, next(iter(SETS.values())))
+    data = LeRobotDataset(root, SIZE)
+    for number, episode in enumerate(data):
+        assert np.array_equal(episode.frames, LeRobotDataset(root, SIZE).episode(number).frames)
+    some = iter(data)
+    next(some)
+    some.close()  # type: ignore[attr-defined]
+    assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("episodes")]

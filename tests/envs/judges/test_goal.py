@@ -19,7 +19,7 @@ from tests.moving_square import SIZE, picture
 from tests.sections import merged, section
 
 TEXTS = ["to the corner", "to the middle"]
-METRIC = {"_target_": "envs.perceptual.PerceptualDistance"}
+METRIC = {"_target_": "envs.judges.perceptual.PerceptualDistance"}
 SPEC = world_spec(ARM_DELTAS.at(SIZE), SIZE)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from envs.episodes.clips import ClipStore
-from envs.perceptual import PerceptualDistance
+from envs.judges.perceptual import PerceptualDistance
 from envs.rng import constant_generator
 from envs.simulators.base import Simulator
 from envs.specs import WorldSpec

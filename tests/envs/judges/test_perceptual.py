@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from envs.perceptual import PerceptualDistance
+from envs.judges.perceptual import PerceptualDistance
 
 
 @pytest.fixture
