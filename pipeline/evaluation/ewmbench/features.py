@@ -44,8 +44,8 @@ class PatchExtractor(ABC):
 
 
 class PyramidPatches(PatchExtractor):
-    """Bands of a normalised Laplacian pyramid (judges/perceptual.py), with their signs, and colours, in a grid of
-    patches: structure that moves or melts changes them, and light hardly does.
+    """Bands of a normalised Laplacian pyramid (judges/perceptual.py), their signs, and colours, in a grid
+    of patches: structure that moves or melts changes them, and light hardly does.
 
     Args:
         grid: patches of a row and of a column.
