@@ -10,7 +10,6 @@ from envs.targets import ConfigError
 from pipeline.benches.training import overfit, pretrained
 from pipeline.config import load_config
 
-
 SMALL = ["experiment=smoke", "task.size=[32,32]", "task.suite.cameras=[head]"]
 
 
