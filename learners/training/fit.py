@@ -123,7 +123,7 @@ def fit(
         watch: the figure shown while it runs.
         optimise: makes the optimisers of parts that learn differently; by default config.optimiser moves
             all. A group's `lr_scale` multiplies the learning rate. What a step's loss does not reach stays.
-        look: shows what has been learned: called after each checkpoint, by every worker, with the number of
+        look: shows what has been learned: called before each checkpoint, by every worker, with the number of
             steps, while the averaged weights are in place. Nothing that it does changes what is learned next.
 
     Returns:
@@ -221,6 +221,10 @@ def fit(
             bar.set_postfix_str(f"{watch} {figures.get(watch, smooth):.4g}", refresh=False)
             stop = from_leader(stop_requested)
             due = (step + 1) % config.checkpoint_every == 0 or step + 1 == config.steps
+            # before the checkpoint: whoever goes on from there does not look at that step again
+            if due and look is not None:
+                with averaged_weights(module, trained, average if config.ema else {}):
+                    trainee(look, step + 1)
             if stop or due:
                 stream.flush()
                 checkpoints.save(step + 1, state(), {"step": step + 1, "spent": spent, "smooth": smooth})
@@ -230,9 +234,6 @@ def fit(
                     f"{name}: stopped after step {step}, as asked; the same command goes on from there"
                 )
                 leave(stop)
-            if due and look is not None:
-                with averaged_weights(module, trained, average if config.ema else {}):
-                    trainee(look, step + 1)
     bar.close()
     if config.ema:
         with torch.no_grad():

@@ -91,6 +91,23 @@ def test_a_look_sees_what_will_be_handed_on_and_changes_nothing(tmp_path: Path) 
     assert not torch.equal(looks[6]["line.weight"], looks[20]["line.weight"])
 
 
+def test_nothing_that_a_killed_run_was_looking_at_is_left_unseen(tmp_path: Path) -> None:
+    looked: list[int] = []
+
+    def look(_: Net, step: int) -> None:
+        looked.append(step)
+        if looked.count(20) == 1 and step == 20:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path / "killed", look=look)
+    net, rows = train(tmp_path / "killed", look=look)
+    assert looked == [6, 12, 18, 20, 20]
+    whole, wanted = train(tmp_path / "whole")
+    assert rows == wanted
+    assert all(torch.equal(value, net.state_dict()[key]) for key, value in whole.state_dict().items())
+
+
 def test_checkpoints_hold_numbers_and_no_code(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         train(tmp_path, stop=15)

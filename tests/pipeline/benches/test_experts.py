@@ -32,4 +32,4 @@ def test_an_expert_that_fails_is_shown_with_its_seeds(tmp_path: Path) -> None:
         experts(load_config(words))
     videos = sorted(tmp_path.rglob("*.mp4"))
     assert [video.name for video in videos[-2:]] == ["expert-push-9000000.mp4", "expert-push-9000002.mp4"]
-    assert read_video(videos[0]).shape == (5, 3, 64, 64)
+    assert read_video(videos[0]).shape == (5, 3, 192, 192)
