@@ -12,6 +12,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
+import torch
 
 from envs.embodiment import Embodiment
 from envs.episodes import Episode, LeRobotWriter
@@ -44,6 +45,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     sizes = Counter(item.path for item in items)
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: (item.path.stem not in WITH_RAY, item.path not in slow, -sizes[item.path]))
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    """More threads than one end with the test that asked for them: beside other work they wait for each other."""
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

@@ -104,8 +104,8 @@ def test_an_interrupted_fit_goes_on_to_the_same_metrics_weights_and_result(
 
 
 def test_a_command_ends_soon_and_leaves_a_checkpoint(tmp_path: Path) -> None:  # Ctrl-C: test_signals.py
-    words = ["stage", "imitation", "experiment=smoke", f"runs={tmp_path}", "track=disabled"]
-    words += ["imitation.perception.steps=5000", "collect.episodes.train=12"]
+    words = ["stage", "imitation", "experiment=soak", f"runs={tmp_path}", "track=disabled"]
+    words += ["imitation.perception.steps=5000"]
     command = subprocess.Popen(
         [sys.executable, "-m", "pipeline", *words],
         cwd=Path(__file__).resolve().parents[3],
