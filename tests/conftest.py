@@ -49,7 +49,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(autouse=True)
 def one_thread() -> None:
-    """More threads than one end with the test that asked for them: beside other work they wait for another."""
+    """More threads than one end with the test that asked for them: beside other work they wait for long."""
     torch.set_num_threads(1)
 
 

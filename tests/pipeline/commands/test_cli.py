@@ -111,6 +111,7 @@ def test_shells_complete_commands_and_choices() -> None:
     assert completed("worldloop", "run", "experiment", "=", "quickstart_") == [
         "quickstart_dit",
         "quickstart_fine",
+        "quickstart_long",
     ]
     assert "bashcompinit" in worldloop("completion", "zsh").stdout
     assert "say which shell" in worldloop("completion", "fish").stderr

@@ -110,8 +110,8 @@ SERVERS = ("serve", "play")  # this is how they end
 AT_ONCE = {"convert", "stages", "summary", "compare", "submit", "tasks", "config", "doctor", "completion"}
 
 
-# The same code answers both, so one command is asked one way and the next the other; those whose processes live
-# longest are asked both ways.
+# The same code answers both, so one command is asked one way and the next the other; those whose processes
+# live longest are asked both ways.
 BOTH = ("run", "serve", "chaos", "chaos soak")
 CASES = [
     (name, number)
