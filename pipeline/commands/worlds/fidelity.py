@@ -23,7 +23,7 @@ from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.fidelity.grid import Settings, combinations, run_grid, with_settings
 from pipeline.evaluation.fidelity.long import drift, long_episodes, longest
 from pipeline.evaluation.fidelity.masks import part_labels
-from pipeline.evaluation.fidelity.open_loop import OpenLoop, held_coded, held_still
+from pipeline.evaluation.fidelity.open_loop import OpenLoop
 from pipeline.evaluation.fidelity.page import build_page, summary_text
 from pipeline.evaluation.measurement import evenly, groups, speed
 from pipeline.graph.code_version import code_of
@@ -69,14 +69,13 @@ def fidelity(cfg: Cfg, root: Path) -> str:
         for name, some in groups(store, episodes).items()
     }
     measured = loop.measure(simulator).result(store.spec.embodiment.views, mine)
-    distance = loop.distance
-    still, coded = held_still(store, episodes, distance), held_coded(store, episodes, distance, simulator)
+    still, coded = loop.held_still(), loop.held_coded(simulator)
     result: dict[str, Any] = {
         **subject.about(),
         "task": cfg["task"]["name"],
         "size": list(store.spec.size),
         "fps": store.fps,
-        "perceptual": distance.name,
+        "perceptual": loop.distance.name,
         **measured,
         "masks": _masks(section, labels),
         "still": still.by_frame,

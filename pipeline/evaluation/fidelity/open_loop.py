@@ -79,6 +79,37 @@ class OpenLoop:
         out.end_effector = end_effector_summary(self.hands, out.hands)
         return out
 
+    def held_still(self) -> Measured:
+        """Errors of a world that shows each episode's first frame for ever: what is to be beaten."""
+        return self._held(lambda first: first)
+
+    def held_coded(self, simulator: Simulator) -> Measured | None:
+        """The same where the first frame is shown as the simulator's autoencoder keeps it, which is as far as
+        decoding alone gets; None if it has none.
+        """
+        first = self.store.frames(self.store.start[self.episodes[:1]])[:, None]
+        if simulator.coded(first.to(simulator.device)) is None:
+            return None
+
+        def shown(first: Tensor) -> Tensor:
+            coded = simulator.coded(first.to(simulator.device))
+            assert coded is not None
+            return coded.cpu()
+
+        return self._held(shown)
+
+    def _held(self, shown: Callable[[Tensor], Tensor]) -> Measured:
+        """Errors of what is shown for ever of first frames uint8 [N, 1, V, 3, H, W]."""
+        out = Measured()
+        for begin in range(0, len(self.episodes), _SIDE_BY_SIDE):
+            some = slice(begin, begin + _SIDE_BY_SIDE)
+            rows, valid = self.store.whole(self.episodes[some])
+            first = shown(self.store.frames(self.store.start[self.episodes[some]])[:, None])
+            frames = first.expand(-1, rows.shape[1], -1, -1, -1, -1)
+            marks = None if self.labels is None else _fitted(self.labels[some], rows.shape[1])
+            out.add(frame_errors(frames, self.store.frames(rows), self.distance, marks), valid)
+        return out
+
     def _part(self, simulator: Simulator, some: slice, about: Mapping[str, Any]) -> Tensors:
         """What is measured of some episodes, now or at some earlier time."""
         if self.kept is None:
@@ -213,41 +244,3 @@ def _longer(values: Tensor, frames: int) -> Tensor:
 def _median(found: Mapping[str, float] | None) -> float | None:
     """That of quantiles; None where nothing was found."""
     return None if found is None or found["median"] != found["median"] else found["median"]
-
-
-def held_still(store: ClipStore, episodes: Tensor, distance: PerceptualDistance) -> Measured:
-    """Errors of a world that shows each episode's first frame for ever: what is to be beaten."""
-    return _held(store, episodes, distance, lambda first: first)
-
-
-def held_coded(
-    store: ClipStore, episodes: Tensor, distance: PerceptualDistance, simulator: Simulator
-) -> Measured | None:
-    """The same where the first frame is shown as the simulator's autoencoder keeps it, which is as far as
-    decoding alone gets; None if it has none.
-    """
-    if simulator.coded(store.frames(store.start[episodes[:1]])[:, None].to(simulator.device)) is None:
-        return None
-
-    def shown(first: Tensor) -> Tensor:
-        coded = simulator.coded(first.to(simulator.device))
-        assert coded is not None
-        return coded.cpu()
-
-    return _held(store, episodes, distance, shown)
-
-
-def _held(
-    store: ClipStore,
-    episodes: Tensor,
-    distance: PerceptualDistance,
-    shown: Callable[[Tensor], Tensor],
-) -> Measured:
-    """Errors of what is shown for ever of first frames uint8 [N, 1, V, 3, H, W]."""
-    out = Measured()
-    for some in episodes.split(_SIDE_BY_SIDE):
-        rows, valid = store.whole(some)
-        first = shown(store.frames(store.start[some])[:, None])
-        frames = first.expand(-1, rows.shape[1], -1, -1, -1, -1)
-        out.add(frame_errors(frames, store.frames(rows), distance), valid)
-    return out

@@ -7,7 +7,7 @@ from typing import Any
 
 from actors.factory import build_simulator
 from actors.process import prepare_process
-from pipeline.evaluation.fidelity.open_loop import OpenLoop, held_still
+from pipeline.evaluation.fidelity.open_loop import OpenLoop
 from pipeline.evaluation.measurement import evenly
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import TASK, Cfg, open_store
@@ -26,7 +26,7 @@ def video_errors(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     simulator = build_simulator(cfg, inputs.weights("simulator")).eval()
     found = loop.measure(simulator).result(store.spec.embodiment.views, {})
     kept = ("episodes", "overall", "by_frame", "object_cm", "object_lost")
-    still = held_still(store, episodes, loop.distance).by_frame
+    still = loop.held_still().by_frame
     return {
         **{name: found[name] for name in kept},
         "still": still,

@@ -25,7 +25,7 @@ from pipeline.evaluation.fidelity.frechet import Moments, frechet
 from pipeline.evaluation.fidelity.grid import combinations, optimum, with_settings
 from pipeline.evaluation.fidelity.long import drift
 from pipeline.evaluation.fidelity.masks import read_labels
-from pipeline.evaluation.fidelity.open_loop import OpenLoop, held_coded, held_still
+from pipeline.evaluation.fidelity.open_loop import OpenLoop
 from tests.moving_square import picture
 
 
@@ -208,9 +208,10 @@ def test_a_right_world_is_measured_as_right(store: ClipStore) -> None:
     for one, other in zip(right["frechet"], wrong["frechet"], strict=True):
         assert one["extractor"] == other["extractor"] and one["value"] < other["value"] / 10
     assert {one["samples"] for one in right["frechet"]} == {8 * 12 * 3, 8 * 3 * 3}
-    still = held_still(store, torch.arange(8), loop.distance)
+    still = loop.held_still()
     assert still.by_frame["mse"][-1] > 5 * right["by_frame"]["mse"][-1]
-    assert held_coded(store, torch.arange(8), loop.distance, Drawing(store.spec, "right")) is None
+    assert still.overall["arm_mse"] == pytest.approx(still.overall["mse"])
+    assert loop.held_coded(Drawing(store.spec, "right")) is None
 
 
 def test_collapse_is_seen_and_nothing_else_taken_for_it(store: ClipStore) -> None:
