@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # sbatch docs/cluster/slurm.sh rl experiment=quickstart launch=ray launch.actors=16
-# Head on the first node, workers on the others, one token for all; ends with the command. What the command says goes
-# to slurm-JOB.out, what Ray says to slurm-JOB-ray-NODE.out.
+# Head on the first node, workers on the others, one token for all; ends with the command. What the command
+# says goes to slurm-JOB.out, what Ray says to slurm-JOB-ray-NODE.out.
 #SBATCH --job-name=worldloop
 #SBATCH --nodes=3
 #SBATCH --ntasks-per-node=1
@@ -24,19 +24,22 @@ mkdir -p "$HOME/.ray"
 (umask 077; python -c 'import secrets; print(secrets.token_hex(32))' > "$RAY_AUTH_TOKEN_PATH")
 trap 'ray stop --force >/dev/null 2>&1 || true; rm -f "$RAY_AUTH_TOKEN_PATH"' EXIT
 
-log=(--output=slurm-%j-ray-%N.out)
-srun --nodes=1 --ntasks=1 -w "$head" --overlap "${log[@]}" \
-  ray start --head --node-ip-address="$address" --port=$port --num-cpus="$SLURM_CPUS_PER_TASK" --include-dashboard=false --block &
+log=slurm-%j-ray-%N.out
+srun --nodes=1 --ntasks=1 -w "$head" --overlap --output=$log \
+  ray start --head --node-ip-address="$address" --port=$port --num-cpus="$SLURM_CPUS_PER_TASK" \
+  --include-dashboard=false --block &
 timeout 300 bash -c "until (exec 3<>/dev/tcp/$address/$port) 2>/dev/null; do sleep 1; done"
 for node in "${nodes[@]:1}"; do
-  srun --nodes=1 --ntasks=1 -w "$node" --overlap "${log[@]}" ray start --address="$address:$port" --num-cpus="$SLURM_CPUS_PER_TASK" --block &
+  srun --nodes=1 --ntasks=1 -w "$node" --overlap --output=$log \
+    ray start --address="$address:$port" --num-cpus="$SLURM_CPUS_PER_TASK" --block &
 done
 timeout 300 python -c 'import sys, time, ray
 ray.init(address=sys.argv[1], log_to_driver=False)
 while sum(node["Alive"] for node in ray.nodes()) < int(sys.argv[2]): time.sleep(1)' "$address:$port" "${#nodes[@]}"
 
-# This script runs on the head itself. SLURM's TERM two minutes before the end reaches the learner, which writes its
-# checkpoint; submit again to go on. As a step of srun it would be killed at once, for srun takes TERM as an order to end it.
+# This script runs on the head itself, and SLURM's TERM two minutes before the end reaches the learner, which
+# writes its checkpoint; submit again to go on. A step of srun would be killed at once: srun takes TERM as an
+# order to end it.
 python -m pipeline "$@" launch.address="$address:$port" &
 run=$!
 trap 'kill -TERM $run 2>/dev/null || true; wait $run' TERM
