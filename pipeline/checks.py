@@ -36,6 +36,7 @@ _SECTIONS = {
     "task": learning.TaskSection,
     "collect": learning.CollectSection,
     "imitation": learning.ImitationSection,
+    "explore": learning.ExploreSection,
     "rounds": learning.RoundsSection,
     "extra_starts": learning.ExtraStartsSection,
     "clone": learning.CloneSection,

@@ -18,7 +18,7 @@ from pipeline.acting import acting
 from pipeline.graph.graph import Graph
 from pipeline.graph.workers import learners_of
 from pipeline.outside import CHECKPOINT, KINEMATICS, STATE_CHECKPOINT, files_at, fingerprint, judge_files
-from pipeline.stages import collect, imitation, keep, pace, prove, rl, show, world
+from pipeline.stages import collect, explore, imitation, keep, pace, prove, rl, show, world
 
 Cfg = Mapping[str, Any]
 T = TypeVar("T")
@@ -114,7 +114,8 @@ def imagined_iterations(cfg: Cfg) -> int:
 
 def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
     data: list[str] = [graph.add("collect", collect.collect)]
-    first = policy = best = add_imitation(graph, cfg, data)
+    first = add_imitation(graph, cfg, data)
+    policy = best = _explore(graph, cfg, first, data)
     starts = _extra_starts(graph, cfg) if with_rl else []
     made, known = World(), ""
     for number in range(1, last_round(cfg) + 1):
@@ -139,6 +140,15 @@ def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
     before = graph.add("evaluate-before", prove.evaluate_physics, {"policy": first})
     after = graph.add("evaluate-after", prove.evaluate_physics, {"policy": policy})
     _conclude(graph, data, made, first, policy, {"physics_before": before, "physics_after": after})
+
+
+def _explore(graph: Graph, cfg: Cfg, policy: str, data: list[str]) -> str:
+    """The policy that explores as widely as physics lets it, if it can be told to; its trials are data."""
+    kind: Any = target(cfg["policy"], "policy")
+    if not cfg["explore"]["levels"] or not hasattr(kind, "scale_exploration"):
+        return policy
+    data.append(graph.add("explore", explore.explore, {"policy": policy}))
+    return "explore"
 
 
 def _deploy(graph: Graph, cfg: Cfg, policy: str, number: int) -> str:

@@ -4,6 +4,7 @@ time.
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -186,9 +187,10 @@ class ChunkGaussianHead(Head):
         """Mean absolute distance of the mean knots that vary."""
         return self._gap(self(one)[0], self(other)[0])
 
-    def exploration(self) -> list[nn.Parameter]:
-        """The learned spread."""
-        return [self.log_std]
+    @torch.no_grad()
+    def scale_exploration(self, factor: float) -> None:
+        """Multiply the spread."""
+        self.log_std += math.log(factor)
 
     def _gap(self, one: Tensor, other: Tensor) -> Tensor:
         active = (self.gain > 0).float()

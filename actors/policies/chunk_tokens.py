@@ -140,6 +140,8 @@ class ChunkTokenHead(Head):
         p, q = (ChunkTokens(*self(hidden)) for hidden in (one, other))
         return 0.5 * (_kl(p, q) + _kl(q, p)).mean() / (p.active.sum().clamp(min=1) * self.chunk)
 
-    def exploration(self) -> list[nn.Parameter]:
-        """None: how sure tokens are cannot be told from which they are."""
-        return []
+    @torch.no_grad()
+    def scale_exploration(self, factor: float) -> None:
+        """Multiply the temperature at which tokens are drawn, by dividing the logits."""
+        self.logits.weight /= factor
+        self.logits.bias /= factor

@@ -17,6 +17,8 @@ Whatever else a policy has is used if it is there:
   frames;
 - `gaze(observed)`, those features and what key-points look for (vla.py), `instruction_keypoints` and
   `views`: the last `instruction_keypoints` key-points are taught where hands go;
+- `scale_exploration(factor)`: with it, how widely chunks are drawn around the mode is found in physics
+  (section explore); without it the policy explores as it is;
 - `imitation_loss(observed, chunks [B, K, A])`: a better one than the negative log-likelihood.
 """
 

@@ -49,8 +49,8 @@ class Head(nn.Module, abc.ABC):
         """Scalar distance of what is said of two hidden vectors [N, width]."""
 
     @abc.abstractmethod
-    def exploration(self) -> list[nn.Parameter]:
-        """Parameters that say how much to explore, which demonstrations do not tell."""
+    def scale_exploration(self, factor: float) -> None:
+        """Multiply how widely chunks are drawn around the mode, which stays."""
 
 
 def varying(chunks: Tensor, robot: Embodiment) -> Tensor:

@@ -266,6 +266,10 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         for part in parts if query is None else [*parts, query.proprioception]:
             part.normalise(*(states, commands)[: len(part.keys)])
 
+    def scale_exploration(self, factor: float) -> None:
+        """Multiply how widely chunks are drawn around the mode, which stays."""
+        self.head.scale_exploration(factor)
+
     def disagreement(self, one: TensorDictBase, other: TensorDictBase) -> Tensor:
         """By how much the head says something else of observations [B] than of others."""
         return self.head.apart(self.policy_features(one), self.policy_features(other))

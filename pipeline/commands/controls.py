@@ -88,7 +88,8 @@ def run_controls(cfg: Cfg, root: Path, tracker: Tracker | None = None) -> dict[s
 
 def control_rows(cfg: Cfg, root: Path, loop: Graph) -> list[Row]:
     """The run itself and its controls, whose stages are added to the run's graph or have one of their own."""
-    deploys = tuple(f"deploy-{n}" for n in range(1, last_round(cfg) + 2))
+    explored = ("explore",) if "explore" in loop.nodes else ()
+    deploys = (*explored, *(f"deploy-{n}" for n in range(1, last_round(cfg) + 2)))
     learned = {equal: _rl_in_physics(loop, cfg, equal) for equal in EQUAL}
     note = privileged_note(cfg)
     loop.add("filtered-bc", only_here.filtered_bc, {"data": ["collect", *deploys]})
@@ -100,7 +101,14 @@ def control_rows(cfg: Cfg, root: Path, loop: Graph) -> list[Row]:
         Row("without_rl", "loop without RL iterations", without, "evaluate-after", deploys),
         Row("without_imagined", "loop without imagined decisions", blind, "evaluate-after", deploys),
         *(
-            Row(f"rl_equal_{equal}", f"RL in physics, equal {equal}", loop, f"evaluate-{name}", (name,), note)
+            Row(
+                f"rl_equal_{equal}",
+                f"RL in physics, equal {equal}",
+                loop,
+                f"evaluate-{name}",
+                (*explored, name),
+                note,
+            )
             for equal, name in learned.items()
         ),
         Row("filtered_bc", "filtered BC", loop, "evaluate-filtered-bc", deploys),

@@ -29,9 +29,9 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         name, seed, simulator, algorithm, verdict; physics_before and physics_after (rate entries) with paired
         (McNemar), None without physics; imagined_before, imagined_after; judge, rollout, frames_per_second
         (see the measure stage); tasks (the same rates by task, {} if there is one); scenes (the same rates of
-        each task in each scene that occurs, [] if there is one); rounds (gaps); episodes used and held out;
-        seconds per stage; training (see `_training`); what the judge has cost (stages/judge_cost.py), {} if
-        it is free; alarms (see `_alarms`).
+        each task in each scene that occurs, [] if there is one); exploration (see the explore stage;
+        None without it); rounds (gaps); episodes used and held out; seconds per stage; training (see
+        `_training`); what the judge has cost (stages/judge_cost.py), {} if it is free; alarms (see `_alarms`).
     """
     finished = manifests(inputs)
     imagined, measured = (result_of(inputs.folder(role)) for role in ("imagined", "measured"))
@@ -39,7 +39,7 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
     gathered = [
         entry["result"]
         for name, entry in finished.items()
-        if name.split("-")[0] in ("collect", "deploy", "recordings")
+        if name.split("-")[0] in ("collect", "explore", "deploy", "recordings")
     ]
     result: dict[str, Any] = {
         "name": cfg["name"],
@@ -56,6 +56,7 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         "frames_per_second": measured["frames_per_second"],
         "tasks": _tasks(cfg, inputs, imagined),
         "scenes": _scenes(cfg, inputs, imagined),
+        "exploration": finished["explore"]["result"] if "explore" in finished else None,
         "rounds": [entry["result"] for name, entry in finished.items() if name.startswith("gap-")],
         "episodes_used": sum(entry["episodes"] - entry.get("held_out", 0) for entry in gathered),
         "episodes_held_out": sum(entry.get("held_out", 0) for entry in gathered),

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Gt, Le, Lt, MinLen
 
-from envs.ranges import Count, Discount, Natural, NonNegative, Share
+from envs.ranges import Count, Discount, Natural, NonNegative, Positive, Share
 from pipeline.sections.kinds import Choice, Fit, Name, Side
 
 
@@ -71,6 +71,15 @@ class ImitationSection:
     perception: Fit
     discount: Discount
     fit: Fit
+
+
+@dataclass(frozen=True)
+class ExploreSection:
+    """Section explore."""
+
+    levels: Sequence[Positive]
+    episodes: Count
+    keep: Share
 
 
 @dataclass(frozen=True)

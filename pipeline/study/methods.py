@@ -180,7 +180,8 @@ def add_rl_in_physics(graph: Graph, cfg: Cfg, equal: Equal) -> str:
     few = max(1, round(deployed_episodes(cfg) / cfg["rl"]["envs"]))
     iterations = {"episodes": few, "steps": imagined_iterations(cfg)}[equal]
     name = f"rl-in-physics-equal-{equal}"
-    return graph.add(name, rl.rl_in_physics, {"policy": "imitation"}, iterations=iterations)
+    first = "explore" if "explore" in graph.nodes else "imitation"
+    return graph.add(name, rl.rl_in_physics, {"policy": first}, iterations=iterations)
 
 
 def privileged_note(cfg: Cfg) -> str:

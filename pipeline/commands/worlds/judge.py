@@ -113,7 +113,7 @@ def _folders(cfg: Mapping[str, Any], root: Path, selection: Selection) -> list[P
     if not has_physics(cfg):
         return [Path(folder) for folder in cfg["task"]["data"]]
     graph = build_loop(cfg, root)
-    recorded = [name for name in graph.nodes if name == "collect" or name.startswith("deploy-")]
+    recorded = [name for name in graph.nodes if name.split("-")[0] in ("collect", "explore", "deploy")]
     found = [graph.folder(name) for name in recorded if (graph.folder(name) / "manifest.json").exists()]
     if not found:
         raise ConfigError(
