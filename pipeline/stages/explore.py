@@ -8,7 +8,8 @@ rewards are too rare to learn from, and simulator and judge see little but failu
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,13 @@ from actors.process import prepare_process
 from actors.world_config import world_spec
 from envs.episodes.episode import Episode
 from envs.episodes.formats.lerobot_writer import LeRobotWriter
-from envs.episodes.splits import write_splits
+from envs.episodes.splits import TRAIN, write_splits
 from envs.episodes.write_behind import WriteBehind
 from envs.rng import Purpose, episode_seeds
 from pipeline.evaluation.statistics import rate, rate_entry
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, stage
-from pipeline.stages.collect import run_recorded
+from pipeline.stages.collect import SPLITS, run_recorded
 from pipeline.stages.given import PHYSICS, Cfg
 
 Rate = dict[str, Any]  # see rate_entry
@@ -49,21 +50,17 @@ def explore(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     seeds = episode_seeds(cfg["seed"], Purpose.DEPLOY, section["episodes"])
     data = folder / "dataset"
     shutil.rmtree(data, ignore_errors=True)
-    widest_first = sorted(section["levels"], reverse=True)
-    level, tried = widest_first[0], dict[float, Rate]()
     with WriteBehind(LeRobotWriter(data, world_spec(cfg).embodiment)) as behind:
-        mode = _tried(cfg, inputs, seeds, None, behind)
-        for level in widest_first if mode["successes"] else ():
-            tried[level] = _tried(cfg, inputs, seeds, level, behind)
-            if rate(tried[level]) >= section["keep"] * rate(mode):
-                break
+        found = find_level(section["levels"], section["keep"], partial(_tried, cfg, inputs, seeds, behind))
+    level, mode, tried = found
     seen = [
         f"mode {mode['successes']}",
         *(f"x{factor:g} {one['successes']}" for factor, one in tried.items()),
     ]
     tqdm.write(f"explore: successes of {mode['episodes']} episodes each: {', '.join(seen)}")
     episodes = sum(one["episodes"] for one in (mode, *tried.values()))
-    write_splits(data, {"train": episodes})  # levels share starts, so none of them is fit to be held out
+    # Levels share starts, so no episode is fit to be held out.
+    write_splits(data, {name: episodes if name == TRAIN else 0 for name in SPLITS})
     save_weights(_scaled(cfg, inputs, level), folder)
     return {
         "level": level,
@@ -75,7 +72,28 @@ def explore(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     }
 
 
-def _tried(cfg: Cfg, inputs: Inputs, seeds: list[int], level: float | None, behind: WriteBehind) -> Rate:
+def find_level(
+    levels: Iterable[float], keep: float, trial: Callable[[float | None], Rate]
+) -> tuple[float, Rate, dict[float, Rate]]:
+    """The widest level whose success rate is at least `keep` times the mode's; see `explore`.
+
+    Args:
+        levels: factors of how widely the policy explores.
+        trial: success of the policy at a level, or of its mode for None.
+
+    Returns:
+        The level, the mode's success, and that of each level that was tried.
+    """
+    widest_first = sorted(levels, reverse=True)
+    level, mode, tried = widest_first[0], trial(None), dict[float, Rate]()
+    for level in widest_first if mode["successes"] else ():
+        tried[level] = trial(level)
+        if rate(tried[level]) >= keep * rate(mode):
+            break
+    return level, mode, tried
+
+
+def _tried(cfg: Cfg, inputs: Inputs, seeds: list[int], behind: WriteBehind, level: float | None) -> Rate:
     """Record episodes of the policy that explores so widely, or of its mode if `level` is None."""
     policy = _scaled(cfg, inputs, 1.0 if level is None else level)
     robot, won = world_spec(cfg).embodiment, list[bool]()

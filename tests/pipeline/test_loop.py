@@ -65,7 +65,7 @@ def test_no_learned_weight_knows_privileged_columns(tmp_path: Path) -> None:
     true = build_loop(cfg, tmp_path / "true")
     true.run("rl-1")
     noisy = build_loop(cfg, tmp_path / "noisy")
-    for name in ("collect", "deploy-1"):
+    for name in ("collect", "explore", "deploy-1"):
         shutil.copytree(true.folder(name), noisy.folder(name))
         assert overwrite_privileged(noisy.folder(name) / "dataset") > 0
         # or the graph would see that the data have changed

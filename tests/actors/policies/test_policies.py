@@ -86,6 +86,22 @@ def test_writes_chunks_of_the_robot_and_scores_them_as_written(name: str, robot:
     assert torch.equal(one, two)
 
 
+@pytest.mark.parametrize("name", [name for name in POLICIES if name.startswith("chunk_")])
+def test_explores_more_narrowly_around_the_same_mode(name: str) -> None:
+    spec = world_spec(ARM_DELTAS)
+    policy = policy_of(name, spec)
+    seen = observations(spec, 4)
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        before = policy(inputs_for(seen, policy))[CHUNK]
+        wide = distribution(policy, seen).entropy()
+        policy.scale_exploration(0.25)
+        assert torch.allclose(policy(inputs_for(seen, policy))[CHUNK], before)
+        narrow = distribution(policy, seen).entropy()
+        policy.scale_exploration(4.0)
+        again = distribution(policy, seen).entropy()
+    assert bool((narrow < wide).all()) and torch.allclose(again, wide, atol=1e-3)
+
+
 def said(policy: TensorDictModuleBase, observed: TensorDict, action: torch.Tensor) -> torch.Tensor:
     """How likely a policy finds an action [B, ...] on these observations, [B]."""
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -176,10 +192,7 @@ def test_imitates_a_few_chunks_after_taking_units_from_them(name: str) -> None:
     chunks = 20.0 + rise * 3 * torch.randn(6, 1, spec.action_dim)
     chunks[..., 1] = 5.0  # a joint that never moves
     policy.normalise(chunks, seen[STATE], seen[COMMAND])
-    if hasattr(policy, "head"):
-        for parameter in policy.head.exploration():
-            parameter.requires_grad_(False)
-    optimiser = torch.optim.Adam([p for p in policy.parameters() if p.requires_grad], 3e-3)
+    optimiser = torch.optim.Adam(policy.parameters(), 3e-3)
     losses = []
     for _ in range(60):
         optimiser.zero_grad()

@@ -1,0 +1,63 @@
+"""How widely the first policy explores is what physics lets it, and its trials are data like any."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from actors.factory import open_clips
+from pipeline.config import load_config
+from pipeline.evaluation.statistics import rate_entry
+from pipeline.loop import build_loop
+from pipeline.stages.explore import find_level
+from pipeline.study.methods import add_rl_in_physics
+
+WORDS = ["experiment=soak", "track=disabled", "explore.levels=[0.5,1.0]", "explore.episodes=3"]
+
+
+@pytest.mark.parametrize(
+    ("successes", "level", "tried"),
+    [
+        ({None: 40, 1.0: 30}, 1.0, [1.0]),  # of 100 each, by level; None is the mode
+        ({None: 40, 1.0: 8, 0.5: 20, 0.25: 24}, 0.25, [1.0, 0.5, 0.25]),
+        ({None: 40, 1.0: 2, 0.5: 4, 0.25: 8}, 0.25, [1.0, 0.5, 0.25]),  # none is narrow enough
+        ({None: 0}, 1.0, []),  # nothing can be told
+    ],
+)
+def test_the_widest_level_that_keeps_enough_of_the_modes_successes(
+    successes: dict[float | None, int], level: float, tried: list[float]
+) -> None:
+    def trial(factor: float | None) -> dict[str, Any]:
+        return rate_entry(torch.arange(100) < successes[factor])
+
+    found, mode, seen = find_level([0.25, 1.0, 0.5], 0.6, trial)
+    assert found == level and list(seen) == tried and mode["successes"] == successes[None]
+
+
+def test_trials_are_recorded_and_the_policy_goes_on_with_what_was_found(tmp_path: Path) -> None:
+    cfg = load_config(WORDS)
+    graph = build_loop(cfg, tmp_path)
+    made = graph.run("explore")["explore"]["result"]
+    store = open_clips(cfg, [graph.folder("explore") / "dataset"])
+    assert len(store) == made["episodes"] == 3 * (1 + len(made["levels"]))
+    assert len(store.select(["policy-0"])) == len(store.split("train")) == len(store)
+    assert ("alarm" in made) is (made["mode"]["successes"] == 0 or made["level"] == 0.5)
+    before, after = (
+        load_file(graph.folder(name) / "weights.safetensors") for name in ("imitation", "explore")
+    )
+    moved = {key for key, value in before.items() if not torch.equal(value, after[key])}
+    assert moved <= {key for key in before if key.endswith("log_std")}
+    assert graph.nodes["deploy-1"].inputs["policy"] == "explore"
+    assert graph.nodes[add_rl_in_physics(graph, cfg, "steps")].inputs["policy"] == "explore"
+    assert "explore" in graph.nodes["simulator-1"].inputs["data"]
+    assert graph.nodes["evaluate-before"].inputs["policy"] == "imitation"
+
+
+@pytest.mark.parametrize("words", [["explore.levels=[]"], ["policy=tiny_vla"]])
+def test_without_levels_or_a_way_to_scale_there_is_no_such_stage(words: list[str], tmp_path: Path) -> None:
+    graph = build_loop(load_config([*WORDS, *words]), tmp_path)
+    assert "explore" not in graph.nodes and graph.nodes["deploy-1"].inputs["policy"] == "imitation"
