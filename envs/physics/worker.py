@@ -120,11 +120,13 @@ class Worker:
     def __init__(self, spec: WorkerSpec, slots: int):
         self.spec = spec
         self.slots = [Slot(build_suite(spec.suite)) for _ in range(slots)]
+        self._played: list[set[str]] = [set() for _ in range(slots)]  # tasks of each slot's suite so far
         for task in spec.tasks:
             check_task(task, self.slots[0].suite.tasks)
 
     def reset(self, seeds: dict[int, int], record: bool) -> dict[int, dict[str, Any]]:
         """Start episodes {slot: seed}; returns an observation per slot."""
+        self._exchange({index: task_of(self.spec.tasks, seed) for index, seed in seeds.items()})
         out = {}
         for index, seed in seeds.items():
             slot = self.slots[index]
@@ -136,6 +138,24 @@ class Worker:
                 slot.track.add(slot.suite, observed)
             out[index] = self._answer(slot, observed)
         return out
+
+    def _exchange(self, tasks: dict[int, str]) -> None:
+        """Give slots {slot: task} that begin anew each other's suites, so that as many as can be have played
+        their task before. Suites keep a model for each task: made for every slot and task, fifty tasks would
+        take fifty times the memory.
+        """
+        free = [(self.slots[index].suite, self._played[index]) for index in tasks]
+        waiting = []
+        for index, task in tasks.items():
+            fit = next((n for n, (_, played) in enumerate(free) if task in played), None)
+            if fit is None:
+                waiting.append(index)
+            else:
+                self.slots[index].suite, self._played[index] = free.pop(fit)
+        free.sort(key=lambda one: len(one[1]))
+        for index, (suite, played) in zip(waiting, free, strict=True):
+            self.slots[index].suite, self._played[index] = suite, played
+            played.add(tasks[index])
 
     def step(self, chunks: dict[int, NDArray[Any]]) -> dict[int, dict[str, Any]]:
         """Carry out chunks {slot: [K, A]} of commands, each to its end, as imagined worlds do; an episode

@@ -16,9 +16,10 @@ from actors.rollouts.evaluate import evaluate
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import PoolError, TaskPool
 from envs.physics.suite import build_suite
+from envs.physics.worker import Worker, WorkerSpec
 from envs.specs import CHUNK, LOST, STATE, ActionMode, Rewards, WorldSpec
 from envs.targets import ConfigError
-from tests.envs.physics.sections import task_section
+from tests.envs.physics.sections import Counting, task_section
 
 COUNTING = {"_target_": "tests.envs.physics.sections.Counting", "fault": ""}
 
@@ -37,6 +38,29 @@ def test_several_tasks_are_played_by_turns(workers: int) -> None:
     pool.close()
     with pytest.raises(ConfigError, match=r"recount.*unknown"):
         TaskPool(COUNTING, ["count", "recount"], 2, 8, workers)
+
+
+class Remembering(Counting):
+    """Counts, and remembers what it was asked to play."""
+
+    def reset(self, task: str, seed: int) -> None:
+        super().reset(task, seed)
+        self.played = getattr(self, "played", set()) | {task}
+
+
+def test_models_of_tasks_are_not_made_for_every_slot() -> None:
+    tasks = ("a", "b", "c", "d")
+    suite = {"_target_": f"{__name__}.Remembering", "fault": "", "tasks": tasks}
+    worker = Worker(WorkerSpec(suite, tasks, 8), 6)
+    for begin in range(0, 60, 6):
+        said = worker.reset({slot: begin + slot for slot in range(6)}, False)
+        assert [said[slot]["instruction"] for slot in range(6)] == [tasks[(begin + n) % 4] for n in range(6)]
+        assert [said[slot]["state"][0] for slot in range(6)] == [begin + slot for slot in range(6)]
+    assert sum(len(slot.suite.played) for slot in worker.slots) <= 8  # of 24
+    before = {slot: worker.slots[slot].suite for slot in (0, 1, 3, 4)}
+    worker.reset({2: 7, 5: 8}, False)  # the others are in mid-episode
+    assert all(worker.slots[slot].suite is suite for slot, suite in before.items())
+    assert len({id(slot.suite) for slot in worker.slots}) == 6
 
 
 def test_a_killed_worker_is_replaced_and_its_episodes_go_on() -> None:
