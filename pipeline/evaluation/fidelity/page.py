@@ -42,6 +42,7 @@ def build_page(result: Mapping[str, Any]) -> str:
             long=_long(result["long"]) if result["long"] else [],
             grid=_grid(result["grid"]) if result["grid"] else None,
             collapse=collapse_text(result["long"]),
+            object_error=object_text(result),
             end_effector=end_effector_text(result["end_effector"]),
         )
     )
@@ -62,6 +63,7 @@ def summary_text(result: Mapping[str, Any]) -> str:
     lines.append("")
     for one in result["frechet"]:
         lines.append(f"Frechet distance {one['value']:.4g} of {one['samples']} samples by {one['extractor']}")
+    lines.append(object_text(result))
     lines.append(end_effector_text(result["end_effector"]))
     lines.append(collapse_text(result["long"]))
     if result["grid"]:
@@ -75,6 +77,21 @@ def summary_text(result: Mapping[str, Any]) -> str:
 def texts(row: Mapping[str, Any]) -> list[str]:
     """The texts of FIGURES; "-" for what is unknown."""
     return ["-" if row.get(key) is None else form.format(row[key]) for key, _, form in FIGURES]
+
+
+def object_text(result: Mapping[str, Any]) -> str:
+    """Where the first object was found, in a sentence."""
+    cm, lost = result["object_cm"], result["object_lost"]
+    if lost is None:
+        return (
+            "The first object is not measured: nobody recorded where it is, or no still camera is calibrated."
+        )
+    if cm is None:
+        return "The first object is lost: it is found in no generated frame."
+    return (
+        f"The first object lies {cm:.2f} cm off (median over the frames in which it is found) and is lost in"
+        f" {100 * lost:.1f}% of those that truly show it."
+    )
 
 
 def collapse_text(long: Mapping[str, Any] | None) -> str:

@@ -19,6 +19,7 @@ from pipeline.commands.worlds.fidelity import fidelity
 from pipeline.commands.worlds.sweep import commanded, sweep
 from pipeline.config import load_config
 from pipeline.evaluation.fidelity.masks import part_labels
+from pipeline.evaluation.joined.page import parts_of
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
 from tests.worlds import scripted_set, untrained_world
 
@@ -48,6 +49,9 @@ def test_fidelity_with_masks_from_physics(tmp_path: Path) -> None:
         {"simulator.context": 4, "simulator.horizon": 4},
     ]
     assert result["grid"]["figure"] == "arm_mse" and "Least arm MSE: simulator.context=" in said
+    lost = result["object_lost"]  # of two rows of the summary none hides the other
+    rows = {row.name: row.value for row in parts_of(result, None, None)[0].rows}
+    assert "The first object " in said and rows["object lost ↓"] == f"{lost:.1%}"
     hands = result["end_effector"]
     assert hands["truth"] == "physics" and "line of sight of head" in hands["method"]
     assert hands["generated_cm"]["median"] > 0 and "End effectors lie" in said

@@ -37,6 +37,8 @@ def test_what_was_measured_stands_on_one_page(
     alone = summary(root)
     psnr = json.loads((root / "fidelity.json").read_text())["overall"]["psnr"]
     assert f"| PSNR dB ↑ | {psnr:.2f} |" in alone and "| arm MSE ↓ | unmeasured |" in alone
+    assert "| object off where it is found, cm ↓ | unmeasured |" in alone
+    assert "| object lost ↓ | unmeasured |" in alone
     assert "| **Policies** | unmeasured; worldloop policy-value |" in alone
     ewmbench(load_config(words), root)
     policy_value(load_config(words), root)
