@@ -138,7 +138,8 @@ def _long(cfg: Cfg, root: Path, subject: Subject, store: ClipStore, loop: OpenLo
     else:
         episodes = longest(store, subject.held_out(store), section["episodes"])
     assert loop.kept is not None
-    about = {**loop.identity, "long": dict(section), "episodes": episodes.tolist()}
+    code = code_of(drift.__module__, cfg["simulator"])
+    about = {**loop.identity, "long": dict(section), "episodes": episodes.tolist(), "code": code}
     bf16, distance = cfg["simulator"]["bf16"], loop.distance
     out = loop.kept.figures("long", about, lambda: drift(simulator, store, episodes, bf16, distance))
     return {"wanted": section["frames"], **out}

@@ -99,7 +99,11 @@ def collapse_text(long: Mapping[str, Any] | None) -> str:
     if long is None:
         return "No long rollouts were made."
     end = long["end"]
-    outcome = "the video has collapsed" if long["collapsed"] else "no collapse"
+    outcome = {
+        True: "the video has collapsed",
+        False: "no collapse",
+        None: "collapse unknown (there is no other episode, as whose pictures it could err)",
+    }[long["collapsed"]]
     short = (
         f" ({long['wanted']} were wanted; recordings are no longer)"
         if long["frames"] < long["wanted"]

@@ -26,6 +26,7 @@ from pipeline.evaluation.fidelity.grid import combinations, optimum, with_settin
 from pipeline.evaluation.fidelity.long import drift
 from pipeline.evaluation.fidelity.masks import read_labels
 from pipeline.evaluation.fidelity.open_loop import OpenLoop
+from pipeline.evaluation.fidelity.page import collapse_text
 from tests.moving_square import picture
 
 
@@ -217,13 +218,16 @@ def test_a_right_world_is_measured_as_right(store: ClipStore) -> None:
 def test_collapse_is_seen_and_nothing_else_taken_for_it(store: ClipStore) -> None:
     episodes = torch.arange(0, 20, 2)
 
-    def of(how: str) -> dict[str, object]:
-        return drift(Drawing(store.spec, how), store, episodes, False, PerceptualDistance())
+    def of(how: str, count: int = 10) -> dict[str, object]:
+        return drift(Drawing(store.spec, how), store, episodes[:count], False, PerceptualDistance())
 
     right, noise, grey = of("right"), of("noise"), of("grey")
     assert not right["collapsed"] and noise["collapsed"] and grey["collapsed"]
     assert right["frames"] == 12 and len(right["still"]) == len(right["unrelated"]) == 12  # type: ignore[arg-type]
     assert right["end"]["sharpness"] == pytest.approx(1, abs=0.2)  # type: ignore[index]
+    alone = of("right", 1)  # errors of one episode have nothing to be compared with
+    assert alone["collapsed"] is None and of("grey", 1)["collapsed"]
+    assert "collapse unknown" in collapse_text({**alone, "wanted": 12})
     assert noise["end"]["sharpness"] > 2 and grey["end"]["sharpness"] < 0.1  # type: ignore[index]
 
 
