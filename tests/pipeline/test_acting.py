@@ -11,6 +11,7 @@ import pytest
 from envs.simulators.dit.engine import DiTSimulator
 from envs.targets import ConfigError
 from pipeline.acting import acting
+from pipeline.cli.runs import stage_named
 from pipeline.config import load_config
 from pipeline.loop import build_loop
 
@@ -57,3 +58,6 @@ def test_a_student_stands_between_the_simulator_and_all_that_act_in_it(tmp_path:
     assert graph.nodes["simulator-2"].inputs["warm"] == "simulator-1"
     assert graph.nodes["student-2"].inputs["warm"] == "student-1"
     assert graph.inputs("evaluate-imagined").folder("simulator") == graph.folder("student-2")
+    assert stage_named("distill", list(graph.nodes)) == "student-2"
+    with pytest.raises(ConfigError, match="no stage student-3; did you mean student-"):
+        stage_named("student-3", list(graph.nodes))
