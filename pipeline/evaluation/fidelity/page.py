@@ -9,6 +9,7 @@ from markupsafe import Markup
 
 from pipeline.evaluation.charts import Curve, line_chart
 from pipeline.evaluation.fidelity.end_effector import end_effector_text
+from pipeline.evaluation.fidelity.strides import HEADINGS, VERDICTS, common_stride, stride_cells
 from pipeline.evaluation.report import templates
 
 # Figures of a row: key, heading and form.
@@ -40,6 +41,7 @@ def build_page(result: Mapping[str, Any]) -> str:
             rows={name: texts(row) for name, row in rows.items()},
             curves=_curves(result),
             long=_long(result["long"]) if result["long"] else [],
+            strides=_strides(result["strides"]) if result["strides"] else None,
             grid=_grid(result["grid"]) if result["grid"] else None,
             collapse=collapse_text(result["long"]),
             object_error=object_text(result),
@@ -49,7 +51,7 @@ def build_page(result: Mapping[str, Any]) -> str:
 
 
 def summary_text(result: Mapping[str, Any]) -> str:
-    """Markdown: overall figures, by source, Frechet distances, long rollouts, and the grid's optimum."""
+    """Markdown: overall figures, by source, Frechet distances, long rollouts, strides, and the grid."""
     titles = [title for _, title, _ in FIGURES]
     lines = [
         f"{result['simulator']} under the true actions of {result['episodes']} held-out episodes; perceptual"
@@ -66,11 +68,14 @@ def summary_text(result: Mapping[str, Any]) -> str:
     lines.append(object_text(result))
     lines.append(end_effector_text(result["end_effector"]))
     lines.append(collapse_text(result["long"]))
-    if result["grid"]:
-        table = _grid(result["grid"])
-        lines += ["", f"| {' | '.join(table['headings'])} |", f"|{' --- |' * len(table['headings'])}"]
-        lines += [f"| {' | '.join(cells)} |" for cells in table["rows"]]
-        lines += ["", table["best"]]
+    for table in (
+        _strides(result["strides"]) if result["strides"] else None,
+        _grid(result["grid"]) if result["grid"] else None,
+    ):
+        if table:
+            lines += ["", f"| {' | '.join(table['headings'])} |", f"|{' --- |' * len(table['headings'])}"]
+            lines += [f"| {' | '.join(cells)} |" for cells in table["rows"]]
+            lines += ["", table["note"]]
     return "\n".join(lines)
 
 
@@ -145,8 +150,19 @@ def _points(values: Sequence[float | None]) -> tuple[list[float], list[float]]:
     return [x for x, _ in known], [y for _, y in known]
 
 
+def _strides(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Headings, rows of texts, and what must be known to compare them."""
+    common = common_stride([row["stride"] for row in rows])
+    return {
+        "headings": [*HEADINGS, *(title for _, title, _ in FIGURES), *VERDICTS],
+        "rows": [stride_cells(row, texts(row)) for row in rows],
+        "note": f"Errors are those of frames {common}, {2 * common}, ..., which all strides show. Verdicts"
+        " are the judge's, against recorded success; it sees the frames that are shown",
+    }
+
+
 def _grid(grid: Mapping[str, Any]) -> dict[str, Any]:
-    """Headings, rows of texts, and the optimum in words."""
+    """The same, with the optimum in words."""
     headings = [*grid["keys"], *(title for _, title, _ in FIGURES), "frames/s"]
     rows = [
         [
@@ -159,4 +175,4 @@ def _grid(grid: Mapping[str, Any]) -> dict[str, Any]:
     best = grid["rows"][grid["best"]]["settings"]
     settings = ", ".join(f"{key}={value}" for key, value in best.items())
     name = grid["figure"].replace("_mse", " MSE").replace("mse", "MSE")
-    return {"headings": headings, "rows": rows, "best": f"Least {name}: {settings}"}
+    return {"headings": headings, "rows": rows, "note": f"Least {name}: {settings}"}

@@ -27,6 +27,7 @@ from pipeline.evaluation.fidelity.long import drift
 from pipeline.evaluation.fidelity.masks import read_labels
 from pipeline.evaluation.fidelity.open_loop import OpenLoop
 from pipeline.evaluation.fidelity.page import collapse_text
+from pipeline.evaluation.fidelity.strides import by_stride, stride_cells
 from tests.moving_square import picture
 
 
@@ -213,6 +214,18 @@ def test_a_right_world_is_measured_as_right(store: ClipStore) -> None:
     assert still.by_frame["mse"][-1] > 5 * right["by_frame"]["mse"][-1]
     assert still.overall["arm_mse"] == pytest.approx(still.overall["mse"])
     assert loop.held_coded(Drawing(store.spec, "right")) is None
+
+
+def test_strides_are_compared_at_the_frames_that_all_of_them_show(store: ClipStore) -> None:
+    labels = torch.zeros(8, 12, 3, 32, 32, dtype=torch.uint8)
+    labels[:, 3::4] = 1  # the arm is seen in every fourth frame alone
+    loop = OpenLoop(store, torch.arange(8), False, labels)
+    rows = by_stride(loop, Drawing(store.spec, "right"), [1, 2, 4])
+    assert [row["frames"] for row in rows] == [12, 12, 12]  # the square's places are what is commanded
+    assert len({row["psnr"] for row in rows}) == 1 and rows[0]["psnr"] > 25
+    assert len({row["arm_mse"] for row in rows}) == 1 and rows[0]["arm_mse"] is not None
+    assert all(row["seconds"] > 0 and row["verdicts"] == {} for row in rows)
+    assert stride_cells(rows[0], ["x"])[3:] == ["12.0", "x", "-", "-"]
 
 
 def test_collapse_is_seen_and_nothing_else_taken_for_it(store: ClipStore) -> None:
