@@ -89,6 +89,7 @@ _TARGETS = {
     "ewmbench.frames": (),
     "ewmbench.texts": (),
 }
+_FASTER = 10  # times as fast as its critic a student may learn
 _TOP = {key.partition(".")[0] for key in (*_SECTIONS, *_FITS, *_SIMULATOR_FITS, *_TARGETS, "rl", "launch")}
 
 
@@ -229,6 +230,7 @@ def _together(cfg: Cfg) -> Iterator[str]:
     if rl["evaluate_every"] and not task.get("suite"):
         yield f"rl.evaluate_every={rl['evaluate_every']} needs physics, which this task has not; set it to 0"
     yield from _learning(cfg)
+    yield from _distilling(cfg["distill"])
     try:
         acting(cfg)
     except ConfigError as error:
@@ -267,6 +269,19 @@ def _learning(cfg: Cfg) -> Iterator[str]:
             f"rl.chunks={rl['chunks']} cuts episodes short, and neither a critic (algorithm={name}) nor"
             " judge.rewards.progress=0 says what the rest is worth; set rl.chunks=null"
         )
+
+
+def _distilling(section: Cfg) -> Iterator[str]:
+    """Students that would run away from their critic, if the method has one."""
+    critic = section["method"].get("critic_lr")
+    for phase in ("first", "refresh") if section["steps"] and critic else ():
+        student = section[phase]["fit"]["lr"]
+        if critic < student / _FASTER:
+            yield (
+                f"distill.{phase}.fit.lr={student} is more than {_FASTER} times distill.method.critic_lr="
+                f"{critic}: the critic could not follow what the student makes; say"
+                f" distill.{phase}.fit.lr={critic}, or raise distill.method.critic_lr"
+            )
 
 
 def _at(cfg: Cfg, path: str) -> Any:

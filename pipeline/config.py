@@ -16,6 +16,7 @@ from envs.targets import ConfigError, nearest
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 IF_CHOSEN = "if_chosen"  # options by group and choice, which count where that is what was chosen
+_SECTIONS = {"distiller": "distill"}  # of groups whose choices fill a part of one
 
 
 def load_config(overrides: Sequence[str]) -> dict[str, Any]:
@@ -81,13 +82,13 @@ def composed(overrides: Sequence[str]) -> dict[str, Any]:
         chosen, section = made.pop("hydra").runtime.choices, made.pop(IF_CHOSEN)
     given = [word.split("=")[0].lstrip("+~") for word in overrides]
     given = [key for key in given if key not in chosen]  # judge=proxy says which, and no option of it
-    for path, value in _of_chosen(OmegaConf.to_container(section), chosen):
+    for group, option, value in _of_chosen(OmegaConf.to_container(section), chosen):
+        path = f"{_SECTIONS.get(group, group)}.{option}"
         if any(key == path or path.startswith(f"{key}.") or key.startswith(f"{path}.") for key in given):
             continue
         try:
             OmegaConf.update(made, path, value)
         except OmegaConfBaseException as error:
-            group, _, option = path.partition(".")
             raise ConfigError(
                 f"{IF_CHOSEN}.{group}.{chosen[group]}.{option} is no option of {group}={chosen[group]}"
             ) from error
@@ -96,8 +97,8 @@ def composed(overrides: Sequence[str]) -> dict[str, Any]:
     return {str(key): value for key, value in plain.items()}
 
 
-def _of_chosen(section: Any, chosen: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Paths and values of those options in the section if_chosen that belong to what was chosen.
+def _of_chosen(section: Any, chosen: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
+    """Groups, paths and values of those options in the section if_chosen that belong to what was chosen.
 
     Raises:
         ConfigError: for a group of choices that there is not.
@@ -106,7 +107,7 @@ def _of_chosen(section: Any, chosen: Mapping[str, Any]) -> Iterator[tuple[str, A
         if group not in chosen:
             raise ConfigError(f"{IF_CHOSEN}.{group} is no group of choices{nearest(group, groups())}")
         for path, value in _leaves(by_choice.get(chosen[group], {})):
-            yield f"{group}.{path}", value
+            yield group, path, value
 
 
 def _leaves(section: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

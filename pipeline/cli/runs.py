@@ -7,6 +7,7 @@ torch.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 from envs.targets import ConfigError, nearest
@@ -48,7 +49,9 @@ def rl(words: Words) -> None:
 
 
 def stage(words: Words) -> None:
-    """run one stage and what it needs: worldloop stage simulator-1 experiment=quickstart"""
+    """run one stage and what it needs: worldloop stage simulator-1 experiment=quickstart; distill is the last
+    student
+    """
     if not words or "=" in words[0]:
         raise ConfigError(
             "say which stage: worldloop stage imitation experiment=quickstart; `worldloop stages` lists them"
@@ -178,6 +181,21 @@ def finetune(words: Words) -> None:
     print(f"weights in {' and '.join(str(one) for one in made if (one / 'weights.safetensors').exists())}")
 
 
+def stage_named(name: str, stages: Sequence[str]) -> str:
+    """The stage that a name means; distill is the last student.
+
+    Raises:
+        ConfigError: if there is none, naming the nearest, or the option that makes students.
+    """
+    students = [stage for stage in stages if stage.startswith("student-")]
+    if not students and (name == "distill" or name.startswith("student")):
+        raise ConfigError(f"no stage {name}: distill.steps=0 is without a student; add distill.steps=2")
+    name = students[-1] if name == "distill" else name
+    if name not in stages:
+        raise ConfigError(f"no stage {name}{nearest(name, stages)}")
+    return name
+
+
 def _run_until(name: str, words: Words) -> Path:
     """Run a stage and what it needs; returns its folder."""
     cfg, root = prepared(words)
@@ -187,8 +205,7 @@ def _run_until(name: str, words: Words) -> Path:
     from pipeline.track import tracking
 
     graph = build_loop(cfg, root)
-    if name not in graph.nodes:
-        raise ConfigError(f"no stage {name}{nearest(name, graph.nodes)}")
+    name = stage_named(name, list(graph.nodes))
     check_labels(cfg, graph, name)
     check_launch(cfg["launch"])
     with owning(root, f"stage {name}"), tracking(cfg, root) as tracker:

@@ -109,6 +109,7 @@ class FidelitySection:
     clips_extractor: Choice
     long: Mapping[str, Any]
     end_effectors: bool
+    strides: Annotated[tuple[Count, ...], MinLen(1)]
     grid: Mapping[Name, Annotated[Sequence[Any], MinLen(1)]] | None
 
 

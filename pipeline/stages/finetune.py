@@ -17,7 +17,7 @@ from learners.stages.state import train_state
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import TASK, Cfg, fit_options, learning_episodes
-from pipeline.stages.world import distil, train_codec
+from pipeline.stages.world import distil, lacking_strides, train_codec
 
 _READS = ("seed", "threads", *TASK, "simulator", "microbatches")
 
@@ -52,14 +52,18 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return dict(stats)
 
 
-@stage(reads=(*_READS, "distill.steps", "distill.method", "distill.first"), place=Place.LEARNERS)
+@stage(
+    reads=(*_READS, "distill.steps", "distill.method", "distill.first", "finetune.simulator.strides"),
+    place=Place.LEARNERS,
+)
 def student(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The few-step student of that simulator, as section distill says.
 
     Settings: fingerprint of the data.
     """
-    store = open_clips(cfg, cfg["task"]["data"])
-    return distil(cfg, folder, inputs, "distill.first", store, learning_episodes(store))
+    store, taught = open_clips(cfg, cfg["task"]["data"]), cfg["finetune"]["simulator"]["strides"]
+    told = lacking_strides("distill.first", cfg["distill"]["first"]["strides"], "finetune.simulator", taught)
+    return {**distil(cfg, folder, inputs, "distill.first", store, learning_episodes(store)), **told}
 
 
 @stage(reads=(*_READS, "finetune.state"), place=Place.LEARNERS)

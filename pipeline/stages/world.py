@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from learners.stages.simulator import ClipBatches, SimulatorFitConfig, train_sim
 from learners.stages.state import train_state
 from learners.stages.text_world import calibrate_ending, train_text_world
 from learners.stages.tokenizer import train_tokenizer
+from learners.training.parallel import leads
 from pipeline.acting import acting
 from pipeline.evaluation.judging import episode_success, labelled
 from pipeline.graph.artefact import save_weights
@@ -93,7 +95,10 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return {**stats, "steps": fit.steps, "parameters": sum(p.numel() for p in model.parameters())}
 
 
-@stage(reads=(*SIMULATOR, "distill.steps", "distill.method", "distill.{phase}"), place=Place.LEARNERS)
+@stage(
+    reads=(*SIMULATOR, "distill.steps", "distill.method", "distill.{phase}", "simulator_fit.{phase}.strides"),
+    place=Place.LEARNERS,
+)
 def student(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The few-step student of the role `simulator`, going on from the role `warm`, the student before, if
     there is one. Later stages meet it by the config of `acting`.
@@ -104,7 +109,28 @@ def student(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     store = open_store(cfg, inputs)
     episodes = learning_episodes(store)
     newest = newest_episodes(store, episodes)
-    return distil(cfg, folder, inputs, f"distill.{phase}", store, episodes, newest)
+    key, taught = f"distill.{phase}", cfg["simulator_fit"][phase]["strides"]
+    told = lacking_strides(key, cfg["distill"][phase]["strides"], f"simulator_fit.{phase}", taught)
+    return {**distil(cfg, folder, inputs, key, store, episodes, newest), **told}
+
+
+def lacking_strides(key: str, known: Sequence[int], teacher: str, taught: Sequence[int]) -> dict[str, str]:
+    """{"alarm"}: strides that a student is not taught although its teacher was, also printed before it
+    learns; {} if there are none.
+
+    Args:
+        key, teacher: of the sections that hold their strides, `known` and `taught`.
+    """
+    lacking = [stride for stride in taught if stride not in known]
+    if not lacking:
+        return {}
+    text = (
+        f"{key}.strides={list(known)} lacks {lacking} of {teacher}.strides: at these the student is not"
+        f" taught to take few steps; say {key}.strides={list(taught)}"
+    )
+    if leads():
+        tqdm.write(f"student: {text}")
+    return {"alarm": text}
 
 
 def distil(

@@ -11,8 +11,10 @@ import pytest
 from envs.simulators.dit.engine import DiTSimulator
 from envs.targets import ConfigError
 from pipeline.acting import acting
+from pipeline.cli.runs import stage_named
 from pipeline.config import load_config
 from pipeline.loop import build_loop
+from pipeline.stages.world import lacking_strides
 
 WORDS = ["experiment=smoke", "simulator=dit_small"]
 
@@ -29,6 +31,15 @@ class Careless(DiTSimulator):
     @classmethod
     def student_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
         return {**super().student_section(section, steps), "memory_frames": 1}
+
+
+def test_a_student_that_lacks_strides_of_its_teacher_gives_an_alarm(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert lacking_strides("distill.first", (1, 2), "simulator_fit.first", (2, 1)) == {}
+    alarm = lacking_strides("distill.first", [1], "simulator_fit.first", [1, 2, 4])["alarm"]
+    assert alarm.startswith("distill.first.strides=[1] lacks [2, 4] of simulator_fit.first.strides")
+    assert alarm.endswith("say distill.first.strides=[1, 2, 4]") and alarm in capsys.readouterr().out
 
 
 def test_students_that_are_conditioned_otherwise_are_refused_before_any_work() -> None:
@@ -57,3 +68,6 @@ def test_a_student_stands_between_the_simulator_and_all_that_act_in_it(tmp_path:
     assert graph.nodes["simulator-2"].inputs["warm"] == "simulator-1"
     assert graph.nodes["student-2"].inputs["warm"] == "student-1"
     assert graph.inputs("evaluate-imagined").folder("simulator") == graph.folder("student-2")
+    assert stage_named("distill", list(graph.nodes)) == "student-2"
+    with pytest.raises(ConfigError, match="no stage student-3; did you mean student-"):
+        stage_named("student-3", list(graph.nodes))

@@ -64,6 +64,10 @@ from pipeline.loop import build_loop
         ),
         (["simulator=dit", "distill.steps=5"], r"more than the teacher's simulator\.denoising\.steps=4"),
         (["simulator=gesim", "task=lerobot", "task.data=[x]", "distill.steps=5"], r"distilled sampler has 4"),
+        (
+            ["simulator=dit", "distill.steps=2", "distiller=dmd2_gesim", "distill.first.fit={lr: 1e-4}"],
+            r"distill\.first\.fit\.lr=0\.0001 is more than 10 times .*say distill\.first\.fit\.lr=2e-06",
+        ),
         (["distill.method.critic_lr=0"], r"distill\.method\.critic_lr=0"),
         (["+if_chosen.judge.learned.pionts=3"], r"if_chosen\.judge\.learned\.pionts is no option of"),
         (
@@ -90,6 +94,16 @@ def test_options_of_a_choice_count_with_that_choice_alone() -> None:
     assert (told["judge"]["width"], told["task"]["suite"]["hold"]) == (5, 0.3)
     for name in choices("judge"):  # an experiment's options of its own judge are no other's
         assert load_config(["experiment=soak", f"judge={name}"])["judge"]
+
+
+def test_a_distiller_sets_the_learning_rates_of_student_and_critic() -> None:
+    def rates(*words: str) -> list[float]:
+        made = load_config(["simulator=dit", "distill.steps=2", *words])["distill"]
+        return [made["method"]["critic_lr"], *(made[name]["fit"]["lr"] for name in ("first", "refresh"))]
+
+    assert rates("distiller=dmd2") == rates() == [2e-4, 1e-4, 1e-4]
+    assert rates("distiller=dmd2_gesim") == [2e-6, 2e-6, 2e-6]
+    assert rates("distiller=dmd2_gesim", "distill.first.fit.lr=1e-5") == [2e-6, 1e-5, 2e-6]
 
 
 def test_all_mistakes_are_told_at_once() -> None:

@@ -42,9 +42,9 @@ NO_MODEL = (
     " judge=vlm_local, as docs/own_judge.md tells."
 )
 PARITY = (
-    "Strict parity: figures repeat quirks of the public code (one arm alone, pictures' width and height both"
-    " 1, nothing for a perfect match of dynamics). It averages over all samples: compare it with the row of"
-    " means."
+    "Strict parity: figures repeat quirks of the public code (the given first frame counts, one arm alone,"
+    " pictures' width and height both 1, nothing for a perfect match of dynamics). It averages over all"
+    " samples: compare it with the row of means. What differs still is told by docs/ewmbench.md."
 )
 ALIKE = (
     "All samples of each episode came out alike: this simulator draws nothing, so the best of them is any,"

@@ -5,7 +5,7 @@ episodes.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from pipeline.evaluation.fidelity.long import drift, long_episodes, longest
 from pipeline.evaluation.fidelity.masks import part_labels
 from pipeline.evaluation.fidelity.open_loop import OpenLoop
 from pipeline.evaluation.fidelity.page import build_page, summary_text
+from pipeline.evaluation.fidelity.strides import by_stride, common_stride
 from pipeline.evaluation.measurement import evenly, groups, speed
 from pipeline.graph.code_version import code_of
 from pipeline.graph.kept import Kept
@@ -42,6 +43,7 @@ def fidelity(cfg: Cfg, root: Path) -> str:
 
     Raises:
         ConfigError: if what is named is not there or cannot work.
+        JudgeError: if there are strides, and the judge cannot be asked any more; the same command goes on.
     """
     section = cfg["fidelity"]
     # what cannot work is told before anything is measured
@@ -54,6 +56,7 @@ def fidelity(cfg: Cfg, root: Path) -> str:
     store = subject.store()
     held = subject.held_out(store)
     episodes = evenly(held[store.length[held] > 1], section["episodes"])
+    strides = _checked_strides(section["strides"], store, episodes)
     simulator = subject.simulator()
     labels = part_labels(cfg, store, episodes, section["masks"])
     hands = end_effector_ruler(subject.cfg, store, subject.data, root)
@@ -86,10 +89,13 @@ def fidelity(cfg: Cfg, root: Path) -> str:
         },
         "frames_per_second": {f"batch {n}": speed(simulator, store, n, 1) for n in (1, 32)},
         "long": _long(cfg, root, subject, store, loop) if section["long"]["frames"] else None,
+        "strides": None,
         "grid": None,
     }
+    alone = replace(loop, extractors=(), hands="nobody asked")
+    if strides != [1]:
+        result["strides"] = by_stride(_with_judge(subject, alone), simulator, strides)
     if settled:
-        alone = replace(loop, extractors=(), hands="nobody asked")
         result["grid"] = _grid(cfg, subject, alone, tried, len(settled))
     write_text(root / "fidelity.json", json.dumps(result, indent=1))
     write_text(root / "fidelity.html", build_page(result))
@@ -128,6 +134,29 @@ def _masks(section: Mapping[str, Any], labels: Tensor | None) -> dict[str, Any]:
     return {"source": section["masks"] or "physics", "episodes": known}
 
 
+def _checked_strides(strides: Sequence[int], store: ClipStore, episodes: Tensor) -> list[int]:
+    """In rising order, each once.
+
+    Raises:
+        ConfigError: if no episode lasts until a frame that all of them show.
+    """
+    longest, common = int(store.length[episodes].max()) - 1, common_stride(strides)
+    if common > longest:
+        raise ConfigError(
+            f"fidelity.strides={list(strides)} first show the same frame after {common}, and no episode has"
+            f" more than {longest}; choose strides that divide each other"
+        )
+    return sorted(set(strides))
+
+
+def _with_judge(subject: Subject, loop: OpenLoop) -> OpenLoop:
+    """The same, with the subject's judge asked, if it has one."""
+    if not subject.weights["judge"].is_file():
+        return loop
+    identity = {**loop.identity, "judge": subject.identity("judge")}
+    return replace(loop, judge=subject.judge(), identity=identity)
+
+
 def _long(cfg: Cfg, root: Path, subject: Subject, store: ClipStore, loop: OpenLoop) -> dict[str, Any] | None:
     section, simulator = cfg["fidelity"]["long"], subject.simulator()
     if has_physics(cfg):
@@ -138,7 +167,8 @@ def _long(cfg: Cfg, root: Path, subject: Subject, store: ClipStore, loop: OpenLo
     else:
         episodes = longest(store, subject.held_out(store), section["episodes"])
     assert loop.kept is not None
-    about = {**loop.identity, "long": dict(section), "episodes": episodes.tolist()}
+    code = code_of(drift.__module__, cfg["simulator"])
+    about = {**loop.identity, "long": dict(section), "episodes": episodes.tolist(), "code": code}
     bf16, distance = cfg["simulator"]["bf16"], loop.distance
     out = loop.kept.figures("long", about, lambda: drift(simulator, store, episodes, bf16, distance))
     return {"wanted": section["frames"], **out}

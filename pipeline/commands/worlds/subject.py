@@ -104,12 +104,15 @@ class Subject:
         return _with_weights(build_judge(self.cfg), self.weights["judge"]).eval()
 
     def about(self) -> dict[str, Any]:
-        """What is looked at, for people: name, classes of simulator and judge, and the weights' files."""
+        """What is looked at, for people: name, classes of simulator and judge, the weights' files, and their
+        marks, by which a file that was written anew is another.
+        """
         return {
             "name": self.cfg["name"],
             "simulator": str(self.cfg["simulator"]["_target_"]).rpartition(".")[2],
             "judge": str(self.cfg["judge"]["_target_"]).rpartition(".")[2],
             "weights": {role: str(path) for role, path in self.weights.items()},
+            "marks": {role: mark_of(path) for role, path in self.weights.items()},
         }
 
     def identity(self, *roles: str) -> dict[str, Any]:

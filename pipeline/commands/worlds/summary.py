@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ def summary(root: Path) -> str:
         The table, as Markdown.
 
     Raises:
-        ConfigError: if nothing has been measured, or different weights were.
+        ConfigError: if nothing has been measured, or different weights were: of other files, or of one that
+            was written anew in between.
     """
     found = {name: _read(root / f"{name}.json") for name in RESULTS}
     there = {name: result for name, result in found.items() if result is not None}
@@ -29,15 +31,20 @@ def summary(root: Path) -> str:
             f"nothing was measured of the simulator of {root}: first `worldloop fidelity`, `worldloop"
             " ewmbench` or `worldloop policy-value` with the same options"
         )
-    weights = {name: result["weights"]["simulator"] for name, result in there.items()}
+    weights = {name: _weights(result) for name, result in there.items()}
     if len(set(weights.values())) > 1:
-        measured = "; ".join(f"{name}: {path}" for name, path in weights.items())
+        measured = "; ".join(f"{name}: {path}, {mark[:12]}" for name, (path, mark) in weights.items())
         raise ConfigError(f"different weights were measured ({measured}); measure anew, by equal options")
     first = next(iter(there.values()))
     parts = parts_of(*found.values())
     page = build_page(first["name"], first["simulator"], first["weights"]["simulator"], parts)
     write_text(root / "summary.html", page)
     return summary_text(first["simulator"], parts)
+
+
+def _weights(result: Mapping[str, Any]) -> tuple[str, str]:
+    """The file of the simulator's weights and its mark; results of former versions hold no marks."""
+    return result["weights"]["simulator"], result.get("marks", {}).get("simulator", "unknown")
 
 
 def _read(path: Path) -> dict[str, Any] | None:

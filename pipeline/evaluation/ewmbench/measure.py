@@ -28,7 +28,7 @@ class Instruments:
         detector: of grippers; None where there can be none.
         detected: positions of the cameras that it looks through, in its order.
         reader: asks a vision-language model; None without one.
-        strict_parity: see trajectory.scores and scene.scene_consistency.
+        strict_parity: see scene.scene_consistency and scene.video_embedding.
     """
 
     patches: PatchExtractor
@@ -66,4 +66,5 @@ class Instruments:
 
     def _embedding(self, video: Tensor) -> Tensor:
         seen = video[:, list(self.views)]
-        return video_embedding(self.frames(seen.flatten(0, 1)).unflatten(0, seen.shape[:2]))
+        features = self.frames(seen.flatten(0, 1)).unflatten(0, seen.shape[:2])
+        return video_embedding(features, self.strict_parity)

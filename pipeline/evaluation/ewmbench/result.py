@@ -36,7 +36,7 @@ class Scoring:
     errors: Sequence[LogicalError]
 
     def episode(self, made: Sequence[Record], true: Record, instruction: str) -> dict[str, Any]:
-        """Figures of one episode's samples: each of them, the best by Hausdorff distance, their mean, the
+        """Figures of one episode's samples: each of them, the best by its trajectories, their mean, the
         recording's own, and those of its first frame held.
         """
         tracked = [self._tracked(record, true) for record in made]
@@ -59,11 +59,12 @@ class Scoring:
 
     def _tracked(self, made: Record, true: Record) -> Scores | None:
         """Mean over cameras of the scores of one sample; None where nobody knows trajectories. The first
-        frame is given, and does not count.
+        frame is given, and does not count, but in the public code.
         """
         if made.tracks is None or true.tracks is None:
             return None
-        found, wanted = made.tracks[1:].double().numpy(), true.tracks[1:].double().numpy()
+        given = 0 if self.strict_parity else 1
+        found, wanted = made.tracks[given:].double().numpy(), true.tracks[given:].double().numpy()
         each = [
             scores(found[:, view], wanted[:, view], self.size, self.strict_parity)
             for view in range(wanted.shape[1])

@@ -54,9 +54,12 @@ def diversity(embeddings: Tensor) -> float | None:
     return float(1 - (alike.sum() - alike.diagonal().sum()) / (count * (count - 1)))
 
 
-def video_embedding(features: Tensor) -> Tensor:
-    """One embedding [D] of a video's features [T, V, D]: their mean."""
-    return features.flatten(0, 1).mean(0)
+def video_embedding(features: Tensor, strict_parity: bool) -> Tensor:
+    """One embedding [D] of a video's features [T, V, D]: their mean; with strict_parity that of features of
+    length 1, as in the public code.
+    """
+    each = features.flatten(0, 1)
+    return (functional.normalize(each, dim=-1) if strict_parity else each).mean(0)
 
 
 def mean_scene(rows: list[Scene]) -> Scene | None:

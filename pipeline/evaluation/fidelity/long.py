@@ -84,7 +84,8 @@ def drift(
         and of the same moment of another episode (None of one episode), which say how much an error is;
         sharpness [T], the mean gradient of generated over that of true frames: below 1 is blur, above it
         noise; end, PSNR and sharpness over the last tenth; collapsed, whether in that tenth the error is
-        that of an unrelated picture or more, or the sharpness less than half or more than twice the truth's.
+        that of an unrelated picture or more, or the sharpness less than half or more than twice the truth's;
+        None where the sharpness does not say so and there is no unrelated picture.
     """
     made = replay(simulator, store, episodes, bf16=bf16)
     true = store.frames(made.rows)
@@ -107,9 +108,10 @@ def drift(
         "unrelated": _line(psnr(others["unrelated"]), both) if "unrelated" in others else None,
     }
     error, sharpness = float(errors["mse"].mean(-1)[ends].mean()), float(sharp[ends].mean())
-    limit = float(others["unrelated"][both].mean()) if "unrelated" in others else float("inf")
     out["end"] = {"psnr": float(psnr(errors["mse"])[ends].mean()), "sharpness": sharpness}
-    out["collapsed"] = bool(error >= limit or not 0.5 <= sharpness <= 2.0)
+    out["collapsed"] = True if not 0.5 <= sharpness <= 2.0 else None
+    if not out["collapsed"] and "unrelated" in others:
+        out["collapsed"] = error >= float(others["unrelated"][both].mean())
     return out
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from envs.episodes.clips import ClipStore
+from envs.judges.base import Judge
 from envs.judges.perceptual import PerceptualDistance
 from envs.simulators.base import Simulator
 from envs.simulators.replay import replay
@@ -19,6 +21,7 @@ from pipeline.evaluation.fidelity.end_effector import EndEffectorRuler, end_effe
 from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.fidelity.frames import by_frame, frame_errors, summary
 from pipeline.evaluation.fidelity.frechet import Moments, frechet
+from pipeline.evaluation.fidelity.verdicts import judged
 from pipeline.evaluation.objects.error import object_offsets, object_summary
 from pipeline.graph.kept import Kept, Tensors
 
@@ -39,8 +42,10 @@ class OpenLoop:
         extractors: of Frechet distances.
         clip: frames of a clip.
         hands: measures end effectors, or why nothing can.
+        stride: recorded frames from one generated frame to the next.
+        judge: is asked about what was generated; None for nobody.
         kept: where what was measured of each batch is kept; None for nowhere.
-        identity: what that depends on beside episodes, labels and extractors.
+        identity: what that depends on beside these, with the judge's weights.
     """
 
     store: ClipStore
@@ -50,6 +55,8 @@ class OpenLoop:
     extractors: Sequence[Extractor] = ()
     clip: int = 8
     hands: EndEffectorRuler | str = "nobody asked"
+    stride: int = 1
+    judge: Judge | None = None
     distance: PerceptualDistance = field(default_factory=PerceptualDistance)
     kept: Kept | None = None
     identity: Mapping[str, Any] = field(default_factory=dict)
@@ -67,6 +74,7 @@ class OpenLoop:
             some = slice(begin, begin + _SIDE_BY_SIDE)
             part = self._part(simulator, some, about or {})
             out.add(_named(part, "error"), part["valid"])
+            out.seconds += float(part["seconds"])
             for number, pair in enumerate(sides):
                 for moments, side in zip(pair, _SIDES, strict=True):
                     if (features := part.get(f"{side}/{number}")) is not None:
@@ -75,6 +83,8 @@ class OpenLoop:
             out.objects.append(_named(part, "object"))
             if isinstance(self.hands, EndEffectorRuler):
                 out.hands.append(_named(part, "hand"))
+            if self.judge is not None:
+                out.judged.append(_named(part, "judge"))
         out.frechet = [frechet(*pair) for pair in sides if min(one.count for one in pair) > 1]
         out.end_effector = end_effector_summary(self.hands, out.hands)
         return out
@@ -122,21 +132,24 @@ class OpenLoop:
             "labels": hashlib.sha256(shown).hexdigest(),
             "extractors": [extractor.name for extractor in self.extractors],
             "clip": self.clip,
+            "stride": self.stride,
             "hands": self.hands if isinstance(self.hands, str) else self.hands.ruler.identity,
             "distance": self.distance.name,
         }
         return self.kept.get(f"rolled-out-{some.start}", identity, lambda: self._rolled_out(simulator, some))
 
     def _rolled_out(self, simulator: Simulator, some: slice) -> Tensors:
-        """Errors and valid, see Measured.add; features of generated and true samples by the extractor's
-        number; offsets of objects and hands.
+        """Errors and valid, see Measured.add; seconds that generating took; features of generated and true
+        samples by the extractor's number; offsets of objects and hands; scores of the judge.
         """
-        episodes = self.episodes[some]
-        made = replay(simulator, self.store, episodes, bf16=self.bf16)
-        true = self.store.frames(made.rows)
-        marks = None if self.labels is None else _fitted(self.labels[some], made.rows.shape[1])
+        episodes, began = self.episodes[some], time.perf_counter()
+        made = replay(simulator, self.store, episodes, bf16=self.bf16, stride=self.stride)
+        out = {"valid": made.valid, "seconds": torch.tensor(time.perf_counter() - began)}
+        true, marks = self.store.frames(made.rows), None
+        if self.labels is not None:
+            marks = _fitted(self.labels[some, self.stride - 1 :: self.stride], made.rows.shape[1])
         errors = frame_errors(made.frames, true, self.distance, marks)
-        out = {"valid": made.valid, **{f"error/{name}": values for name, values in errors.items()}}
+        out |= {f"error/{name}": values for name, values in errors.items()}
         for number, extractor in enumerate(self.extractors):
             for side, video in zip(_SIDES, (made.frames, true), strict=True):
                 if samples := _samples(video, made.valid, extractor.clips, self.clip):
@@ -146,6 +159,9 @@ class OpenLoop:
         if isinstance(self.hands, EndEffectorRuler):
             hands = self.hands.measure(self.store, episodes, made, true)
             out |= {f"hand/{name}": values for name, values in hands.items()}
+        if self.judge is not None:
+            said = judged(self.judge, self.store, episodes, made, true)
+            out |= {f"judge/{name}": values for name, values in said.items()}
         return out
 
 
@@ -155,17 +171,21 @@ class Measured:
     Attributes:
         errors: float32 [N, T, V] by name, see frames.frame_errors.
         valid: bool [N, T].
+        seconds: of wall time in which everything was generated.
         frechet: see frechet.frechet, one for each extractor that had samples enough.
         objects: see objects.error.object_offsets, of each part.
         hands: see end_effector.EndEffectorRuler.measure, of each part; end_effector: what they come to.
+        judged: see verdicts.judged, of each part; [] without a judge.
     """
 
     def __init__(self) -> None:
         self.errors: dict[str, Tensor] = {}
         self.valid = torch.zeros(0, 0, dtype=torch.bool)
+        self.seconds = 0.0
         self.frechet: list[dict[str, Any]] = []
         self.objects: list[dict[str, Tensor]] = []
         self.hands: list[dict[str, Tensor]] = []
+        self.judged: list[dict[str, Tensor]] = []
         self.end_effector: dict[str, Any] = {}
 
     def add(self, errors: Mapping[str, Tensor], valid: Tensor) -> None:

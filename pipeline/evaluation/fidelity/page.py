@@ -9,6 +9,7 @@ from markupsafe import Markup
 
 from pipeline.evaluation.charts import Curve, line_chart
 from pipeline.evaluation.fidelity.end_effector import end_effector_text
+from pipeline.evaluation.fidelity.strides import HEADINGS, VERDICTS, common_stride, stride_cells
 from pipeline.evaluation.report import templates
 
 # Figures of a row: key, heading and form.
@@ -40,15 +41,17 @@ def build_page(result: Mapping[str, Any]) -> str:
             rows={name: texts(row) for name, row in rows.items()},
             curves=_curves(result),
             long=_long(result["long"]) if result["long"] else [],
+            strides=_strides(result["strides"]) if result["strides"] else None,
             grid=_grid(result["grid"]) if result["grid"] else None,
             collapse=collapse_text(result["long"]),
+            object_error=object_text(result),
             end_effector=end_effector_text(result["end_effector"]),
         )
     )
 
 
 def summary_text(result: Mapping[str, Any]) -> str:
-    """Markdown: overall figures, by source, Frechet distances, long rollouts, and the grid's optimum."""
+    """Markdown: overall figures, by source, Frechet distances, long rollouts, strides, and the grid."""
     titles = [title for _, title, _ in FIGURES]
     lines = [
         f"{result['simulator']} under the true actions of {result['episodes']} held-out episodes; perceptual"
@@ -62,13 +65,17 @@ def summary_text(result: Mapping[str, Any]) -> str:
     lines.append("")
     for one in result["frechet"]:
         lines.append(f"Frechet distance {one['value']:.4g} of {one['samples']} samples by {one['extractor']}")
+    lines.append(object_text(result))
     lines.append(end_effector_text(result["end_effector"]))
     lines.append(collapse_text(result["long"]))
-    if result["grid"]:
-        table = _grid(result["grid"])
-        lines += ["", f"| {' | '.join(table['headings'])} |", f"|{' --- |' * len(table['headings'])}"]
-        lines += [f"| {' | '.join(cells)} |" for cells in table["rows"]]
-        lines += ["", table["best"]]
+    for table in (
+        _strides(result["strides"]) if result["strides"] else None,
+        _grid(result["grid"]) if result["grid"] else None,
+    ):
+        if table:
+            lines += ["", f"| {' | '.join(table['headings'])} |", f"|{' --- |' * len(table['headings'])}"]
+            lines += [f"| {' | '.join(cells)} |" for cells in table["rows"]]
+            lines += ["", table["note"]]
     return "\n".join(lines)
 
 
@@ -77,12 +84,31 @@ def texts(row: Mapping[str, Any]) -> list[str]:
     return ["-" if row.get(key) is None else form.format(row[key]) for key, _, form in FIGURES]
 
 
+def object_text(result: Mapping[str, Any]) -> str:
+    """Where the first object was found, in a sentence."""
+    cm, lost = result["object_cm"], result["object_lost"]
+    if lost is None:
+        return (
+            "The first object is not measured: nobody recorded where it is, or no still camera is calibrated."
+        )
+    if cm is None:
+        return "The first object is lost: it is found in no generated frame."
+    return (
+        f"The first object lies {cm:.2f} cm off (median over the frames in which it is found) and is lost in"
+        f" {100 * lost:.1f}% of those that truly show it."
+    )
+
+
 def collapse_text(long: Mapping[str, Any] | None) -> str:
     """What came of long rollouts, in a sentence."""
     if long is None:
         return "No long rollouts were made."
     end = long["end"]
-    outcome = "the video has collapsed" if long["collapsed"] else "no collapse"
+    outcome = {
+        True: "the video has collapsed",
+        False: "no collapse",
+        None: "collapse unknown (there is no other episode, as whose pictures it could err)",
+    }[long["collapsed"]]
     short = (
         f" ({long['wanted']} were wanted; recordings are no longer)"
         if long["frames"] < long["wanted"]
@@ -124,8 +150,19 @@ def _points(values: Sequence[float | None]) -> tuple[list[float], list[float]]:
     return [x for x, _ in known], [y for _, y in known]
 
 
+def _strides(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Headings, rows of texts, and what must be known to compare them."""
+    common = common_stride([row["stride"] for row in rows])
+    return {
+        "headings": [*HEADINGS, *(title for _, title, _ in FIGURES), *VERDICTS],
+        "rows": [stride_cells(row, texts(row)) for row in rows],
+        "note": f"Errors are those of frames {common}, {2 * common}, ..., which all strides show. Verdicts"
+        " are the judge's, against recorded success; it sees the frames that are shown",
+    }
+
+
 def _grid(grid: Mapping[str, Any]) -> dict[str, Any]:
-    """Headings, rows of texts, and the optimum in words."""
+    """The same, with the optimum in words."""
     headings = [*grid["keys"], *(title for _, title, _ in FIGURES), "frames/s"]
     rows = [
         [
@@ -138,4 +175,4 @@ def _grid(grid: Mapping[str, Any]) -> dict[str, Any]:
     best = grid["rows"][grid["best"]]["settings"]
     settings = ", ".join(f"{key}={value}" for key, value in best.items())
     name = grid["figure"].replace("_mse", " MSE").replace("mse", "MSE")
-    return {"headings": headings, "rows": rows, "best": f"Least {name}: {settings}"}
+    return {"headings": headings, "rows": rows, "note": f"Least {name}: {settings}"}

@@ -73,8 +73,9 @@ def _video(found: Found) -> Iterator[Row]:
         yield Row(f"{title} {_BETTER[key]}", MISSING if value is None else form.format(value))
     for one in found["frechet"]:
         yield Row(f"Frechet distance, {one['extractor']}, {one['samples']} samples ↓", f"{one['value']:.4g}")
-    cm, hands = found["object_cm"], found["end_effector"]
-    yield Row("object off, cm ↓", MISSING if cm is None else f"{cm:.2f}")
+    cm, lost, hands = found["object_cm"], found["object_lost"], found["end_effector"]
+    yield Row("object off where it is found, cm ↓", MISSING if cm is None else f"{cm:.2f}")
+    yield Row("object lost ↓", MISSING if lost is None else f"{lost:.1%}")
     made, own = (hands.get(f"{name}_cm") for name in ("generated", "recorded"))
     yield Row("end effector off, cm ↓", *(f"{one['median']:.2f}" if one else MISSING for one in (made, own)))
     for batch, speed in found["frames_per_second"].items():

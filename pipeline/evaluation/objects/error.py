@@ -71,9 +71,9 @@ def object_summary(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Any]:
     """What the `object_offsets` of some episodes come to, those of all parts in one.
 
     Returns:
-        object_px and object_cm (median, 90th percentile over all frames), object_cm_at_end, object_lost
-        (share of frames), and locator_px, the locator's own error on true video; {} where nothing was
-        measured.
+        object_px and object_cm (median, 90th percentile over the frames in which it was found), their
+        object_cm_at_end, object_lost (share of the frames that truly show it), and locator_px, the locator's
+        own error on true video; {} where nothing was measured.
     """
     known = [part for part in parts if part and len(part["lost"])]
     if not known:

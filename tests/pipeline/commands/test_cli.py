@@ -75,6 +75,10 @@ def test_mistakes_name_the_fix() -> None:
         (("compare", "/nowhere"), "result.json is not there"),
         (("stage",), "worldloop stages"),
         (
+            ("stage", "distill", "experiment=smoke"),
+            "distill.steps=0 is without a student; add distill.steps=2",
+        ),
+        (
             ("evaluate", "policy=imitation", "policy=coarse", "experiment=smoke", "name=never-run")
             + (f"hydra.searchpath=[file://{ROOT}/examples/configs]",),
             "imitation-",  # whose weights are not there; coarse is the class that they would be of

@@ -18,7 +18,8 @@ from pipeline.evaluation.ewmbench.choose import Paths, choose
 from pipeline.evaluation.ewmbench.coverage import least_overlap, mean_overlap, overlaps, voxels
 from pipeline.evaluation.ewmbench.features import PyramidPatches, WordGrams
 from pipeline.evaluation.ewmbench.records import Record, Records
-from pipeline.evaluation.ewmbench.scene import Scene, diversity, scene_consistency
+from pipeline.evaluation.ewmbench.result import Scoring
+from pipeline.evaluation.ewmbench.scene import Scene, diversity, scene_consistency, video_embedding
 from pipeline.evaluation.ewmbench.semantics import (
     VideoReport,
     bleu,
@@ -157,6 +158,37 @@ def test_trajectories_with_gaps_and_of_unequal_length() -> None:
     assert best_of([found, *rows]) == 2  # type: ignore[list-item]
 
 
+def record(*cameras: Floats) -> Record:
+    """A video of cameras [T, 2] in which one arm's gripper was found."""
+    tracks = torch.from_numpy(np.stack(cameras, 1))[:, :, None].float()
+    return Record((), torch.zeros(1), tracks, None)
+
+
+def test_a_sample_that_loses_its_gripper_in_a_camera_is_not_the_best() -> None:
+    true, gone = line(10, 20, 30, 50), line(10, NAN, NAN, NAN)
+    near, far = true + np.array([0.0, 1.0]), true + np.array([0.0, 8.0])
+    scoring = Scoring(SIZE, False, WordGrams(), ())
+    found = scoring.episode([record(near, gone), record(far, far), record(far, near)], record(true, true), "")
+    assert [row["lost"] for row in found["samples"]] == [0.5, 0.0, 0.0] and found["best"] == 2
+    assert [found[row]["hsd"] for row in ("generated", "mean")] == pytest.approx([0.045, (1 + 8 + 4.5) / 300])
+
+
+def test_the_given_first_frame_counts_in_the_public_code_alone() -> None:
+    # It lies 30 pixels away from all others: speeds 30, 10, 20 beside 30, 10, 10.
+    true, made = line(0, 30, 40, 50), line(0, 30, 40, 60)
+    sane, public = (
+        Scoring(SIZE, strict, WordGrams(), ()).episode([record(made)], record(true), "")["generated"]
+        for strict in (False, True)
+    )
+    assert sane["hsd"] == public["hsd"] == pytest.approx(0.1)
+    # warped in order: only the last pair is apart, of three frames or of four
+    assert (sane["ndtw"], public["ndtw"]) == pytest.approx((0.1 / 3, 0.1 / 4))
+    # Spans of speed 20 and 20, sorted 10, 20, 30 and 10, 10, 30: 10 / 3 apart. Changes -20, 10 and -20, 0:
+    # spans 30 and 20, and 10 / 2 apart.
+    wanted = 0.007 / (0.1 / 3) + 0.003 * (20 / 30) / (0.1 / 2)
+    assert public["dyn"] == pytest.approx(wanted / CAPS["dyn"], rel=1e-5)
+
+
 # -- the set
 def test_voxels_are_passed_without_gaps() -> None:
     path = torch.tensor([[[0.1, 0.1]], [[3.5, 0.1]]])
@@ -203,6 +235,12 @@ def test_scene_consistency_by_hand() -> None:
 def test_diversity_by_hand() -> None:
     assert diversity(torch.tensor([[1.0, 0], [3, 0], [0, 2]])) == pytest.approx(2 / 3)
     assert diversity(torch.ones(3, 4)) == pytest.approx(0) and diversity(torch.ones(1, 4)) is None
+
+
+def test_each_frame_counts_alike_in_the_public_codes_embedding() -> None:
+    features = torch.tensor([[[3.0, 0.0]], [[0.0, 1.0]]])
+    assert video_embedding(features, False).tolist() == [1.5, 0.5]
+    assert video_embedding(features, True).tolist() == [0.5, 0.5]
 
 
 def test_patches_tell_a_moving_scene_from_light() -> None:

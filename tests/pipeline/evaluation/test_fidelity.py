@@ -26,6 +26,8 @@ from pipeline.evaluation.fidelity.grid import combinations, optimum, with_settin
 from pipeline.evaluation.fidelity.long import drift
 from pipeline.evaluation.fidelity.masks import read_labels
 from pipeline.evaluation.fidelity.open_loop import OpenLoop
+from pipeline.evaluation.fidelity.page import collapse_text
+from pipeline.evaluation.fidelity.strides import by_stride, stride_cells
 from tests.moving_square import picture
 
 
@@ -214,16 +216,31 @@ def test_a_right_world_is_measured_as_right(store: ClipStore) -> None:
     assert loop.held_coded(Drawing(store.spec, "right")) is None
 
 
+def test_strides_are_compared_at_the_frames_that_all_of_them_show(store: ClipStore) -> None:
+    labels = torch.zeros(8, 12, 3, 32, 32, dtype=torch.uint8)
+    labels[:, 3::4] = 1  # the arm is seen in every fourth frame alone
+    loop = OpenLoop(store, torch.arange(8), False, labels)
+    rows = by_stride(loop, Drawing(store.spec, "right"), [1, 2, 4])
+    assert [row["frames"] for row in rows] == [12, 12, 12]  # the square's places are what is commanded
+    assert len({row["psnr"] for row in rows}) == 1 and rows[0]["psnr"] > 25
+    assert len({row["arm_mse"] for row in rows}) == 1 and rows[0]["arm_mse"] is not None
+    assert all(row["seconds"] > 0 and row["verdicts"] == {} for row in rows)
+    assert stride_cells(rows[0], ["x"])[3:] == ["12.0", "x", "-", "-"]
+
+
 def test_collapse_is_seen_and_nothing_else_taken_for_it(store: ClipStore) -> None:
     episodes = torch.arange(0, 20, 2)
 
-    def of(how: str) -> dict[str, object]:
-        return drift(Drawing(store.spec, how), store, episodes, False, PerceptualDistance())
+    def of(how: str, count: int = 10) -> dict[str, object]:
+        return drift(Drawing(store.spec, how), store, episodes[:count], False, PerceptualDistance())
 
     right, noise, grey = of("right"), of("noise"), of("grey")
     assert not right["collapsed"] and noise["collapsed"] and grey["collapsed"]
     assert right["frames"] == 12 and len(right["still"]) == len(right["unrelated"]) == 12  # type: ignore[arg-type]
     assert right["end"]["sharpness"] == pytest.approx(1, abs=0.2)  # type: ignore[index]
+    alone = of("right", 1)  # errors of one episode have nothing to be compared with
+    assert alone["collapsed"] is None and of("grey", 1)["collapsed"]
+    assert "collapse unknown" in collapse_text({**alone, "wanted": 12})
     assert noise["end"]["sharpness"] > 2 and grey["end"]["sharpness"] < 0.1  # type: ignore[index]
 
 

@@ -19,6 +19,7 @@ from envs.simulators.replay import Replay
 from envs.specs import WorldSpec
 from envs.targets import ConfigError
 from pipeline.evaluation.fidelity.open_loop import Measured
+from pipeline.evaluation.fidelity.page import object_text
 from pipeline.evaluation.measurement import rollout_error
 from pipeline.evaluation.objects.error import object_offsets
 from pipeline.evaluation.objects.rays import on_plane
@@ -88,6 +89,22 @@ def test_a_median_is_that_of_all_frames_however_they_were_measured(tmp_path: Pat
     found = measured.result((), {})
     every = torch.cat([part["cm"] for part in measured.objects])
     assert found["object_cm"] == float(every.median()) > 8.0 and found["object_lost"] == 0.0
+
+
+def test_a_lost_object_is_said_to_be_lost(tmp_path: Path) -> None:
+    store, episodes = store_of(tmp_path, with_positions(0)), torch.arange(3)
+    right = recorded(store, episodes)
+    true = store.frames(right.rows)
+    black = right._replace(frames=torch.zeros_like(true))
+    said = []
+    for parts in ([black], [black, right], []):
+        measured = Measured()
+        measured.objects += [object_offsets(store, episodes, made, true) for made in parts]
+        measured.add({"mse": torch.zeros(3, 1, 1)}, torch.ones(3, 1, dtype=torch.bool))
+        said.append(object_text(measured.result((), {})))
+    assert said[0] == "The first object is lost: it is found in no generated frame."
+    assert "median over the frames in which it is found) and is lost in 50.0% of those" in said[1]
+    assert said[2].startswith("The first object is not measured")
 
 
 def test_poses_that_are_no_rows_of_objects_are_left_alone(tmp_path: Path) -> None:

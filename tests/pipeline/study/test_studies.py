@@ -115,6 +115,23 @@ def test_students_gain_by_the_same_rl_as_their_teacher(root: Path) -> None:
     assert student.nodes["rl-1"].settings == teacher.nodes["rl-1"].settings
 
 
+def test_students_stand_beside_a_baseline_and_a_teacher_of_as_few_steps(root: Path) -> None:
+    words = ["study=students", "simulator=dit_small"]
+    rows = {entry.name: entry.made.graph for entry in planned(root, words).rows}
+    assert list(rows) == ["teacher", "undistilled", "four", "two", "one", "trajectory"]
+    assert [name for name, graph in rows.items() if "student-1" not in graph.nodes] == list(rows)[:2]
+    taken = {name: graph.cfg["simulator"]["denoising"]["steps"] for name, graph in rows.items()}
+    assert list(taken.values()) == [15, 4, 4, 2, 1, 4]
+    made = {name: graph.nodes["student-1"].cfg["distill"] for name, graph in list(rows.items())[2:]}
+    kinds = {name: section["method"]["_target_"].rpartition(".")[2] for name, section in made.items()}
+    assert kinds == {name: "TrajectoryRegression" if name == "trajectory" else "DMD2" for name in made}
+    # of DMD2's steps so many are the student's
+    share = made["four"]["method"]["critic_updates"] + 1
+    for phase in ("first", "refresh"):
+        steps = {name: section[phase]["fit"]["steps"] for name, section in made.items()}
+        assert steps["four"] == share * steps["trajectory"]
+
+
 ROBOSCAPE = (
     *("study=roboscape", "task=tabletop", "task.horizon=32", "task.suite.cameras=[head]"),
     *("judge=golden_goal", "simulator=tokens_small", "study.places=[two_tasks]"),

@@ -19,6 +19,7 @@ from pipeline.commands.worlds.fidelity import fidelity
 from pipeline.commands.worlds.sweep import commanded, sweep
 from pipeline.config import load_config
 from pipeline.evaluation.fidelity.masks import part_labels
+from pipeline.evaluation.joined.page import parts_of
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
 from tests.worlds import scripted_set, untrained_world
 
@@ -30,7 +31,7 @@ def test_fidelity_with_masks_from_physics(tmp_path: Path) -> None:
     cfg = load_config(soak)
     data = scripted_set(cfg, tmp_path / "set", 3)
     words = [*soak, *untrained_world(cfg, tmp_path), f"imagined.data=[{data}]"]
-    words += ["fidelity.long={frames: 30, episodes: 1, noise_level: 1.0}"]
+    words += ["fidelity.long={frames: 30, episodes: 1, noise_level: 1.0}", "fidelity.strides=[1,2]"]
     tried = load_config([*words, "fidelity.grid={simulator.context: [1, 4], simulator.horizon: [4]}"])
     said = fidelity(tried, tmp_path / "run")
     result = json.loads((tmp_path / "run/fidelity.json").read_text())
@@ -47,18 +48,34 @@ def test_fidelity_with_masks_from_physics(tmp_path: Path) -> None:
         {"simulator.context": 1, "simulator.horizon": 4},
         {"simulator.context": 4, "simulator.horizon": 4},
     ]
+    one, two = result["strides"]
+    assert (one["stride"], two["stride"], two["covers"]) == (1, 2, 2 * one["covers"]) and one["seconds"] > 0
+    assert one["frames"] >= two["frames"] > one["frames"] - 2 and None not in (one["arm_mse"], two["mse"])
+    for row in (one, two):
+        for video in ("generated", "recorded"):
+            assert sum(row["verdicts"][video][name] for name in ("tp", "fp", "fn", "tn", "dropped")) == 3
+    assert "| verdicts right |" in said and "Errors are those of frames 2, 4, ..." in said
     assert result["grid"]["figure"] == "arm_mse" and "Least arm MSE: simulator.context=" in said
+    lost = result["object_lost"]  # of two rows of the summary none hides the other
+    rows = {row.name: row.value for row in parts_of(result, None, None)[0].rows}
+    assert "The first object " in said and rows["object lost ↓"] == f"{lost:.1%}"
     hands = result["end_effector"]
     assert hands["truth"] == "physics" and "line of sight of head" in hands["method"]
     assert hands["generated_cm"]["median"] > 0 and "End effectors lie" in said
     # nothing is rolled out twice: neither the one batch, nor that of each setting
     again = fidelity(tried, tmp_path / "run")
-    assert said.endswith("0 parts were reused") and again.endswith("3 parts were reused")
+    assert said.endswith("0 parts were reused") and again.endswith("5 parts were reused")
     both = json.loads((tmp_path / "run/fidelity.json").read_text())
-    for name in ("overall", "by_frame", "frechet", "long", "end_effector", "object_cm"):
+    for name in ("overall", "by_frame", "frechet", "long", "strides", "end_effector", "object_cm"):
         assert both[name] == result[name]
     page = (tmp_path / "run/fidelity.html").read_text()
-    assert "Frechet distances" in page and not re.findall(r'(?:src|href)=(?!"#)', page)
+    assert (
+        "Frechet distances" in page
+        and "Strides at inference" in page
+        and not re.findall(r'(?:src|href)=(?!"#)', page)
+    )
+    with pytest.raises(ConfigError, match=r"fidelity\.strides=\[30, 7\] first show the same frame after 210"):
+        fidelity(load_config([*words, "fidelity.strides=[30,7]"]), tmp_path / "run")
     with pytest.raises(ConfigError, match="another architecture"):
         fidelity(load_config([*words, "fidelity.grid={simulator.net.layers: [2]}"]), tmp_path / "run")
     with pytest.raises(ConfigError, match=r"fidelity\.frames_extractor\._target_=.*single frames"):

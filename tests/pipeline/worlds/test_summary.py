@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from safetensors.torch import load_file, save_file
 
 from envs.embodiment import Embodiment
 from envs.targets import ConfigError
@@ -37,6 +38,8 @@ def test_what_was_measured_stands_on_one_page(
     alone = summary(root)
     psnr = json.loads((root / "fidelity.json").read_text())["overall"]["psnr"]
     assert f"| PSNR dB ↑ | {psnr:.2f} |" in alone and "| arm MSE ↓ | unmeasured |" in alone
+    assert "| object off where it is found, cm ↓ | unmeasured |" in alone
+    assert "| object lost ↓ | unmeasured |" in alone
     assert "| **Policies** | unmeasured; worldloop policy-value |" in alone
     ewmbench(load_config(words), root)
     policy_value(load_config(words), root)
@@ -46,6 +49,11 @@ def test_what_was_measured_stands_on_one_page(
     page = (root / "summary.html").read_text()
     assert page.count("<table>") == 3 and not re.findall(r'(?:src|href)=(?!"#)', page)
     other = json.loads((root / "ewmbench.json").read_text())
+    weights = Path(other["weights"]["simulator"])
+    save_file({name: value * 2 for name, value in load_file(weights).items()}, weights)  # trained anew
+    ewmbench(load_config(words), root)
+    with pytest.raises(ConfigError, match=rf"fidelity: {weights}, \w+; ewmbench: {weights}, \w+;"):
+        summary(root)
     other["weights"]["simulator"] = "elsewhere"
     (root / "ewmbench.json").write_text(json.dumps(other))
     with pytest.raises(ConfigError, match=r"different weights were measured .*ewmbench: elsewhere"):
