@@ -236,7 +236,18 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         stats["generated_frames"] = len(generated)
     _calibrate(cfg, model, store, world, bf16)
     save_weights(model, folder)
-    return {**stats, "threshold": float(model.threshold), **model.facts()}
+    return {**stats, "threshold": float(model.threshold), **model.facts(), **_unfinished(cfg, model)}
+
+
+def _unfinished(cfg: Cfg, model: Judge) -> dict[str, str]:
+    """{"alarm"}: most goals that the judge imagined for calibration never end, whatever stands in for them;
+    {} otherwise.
+    """
+    facts = model.facts()
+    goals, unfinished = facts.get("goals", 0), facts.get("goals_unfinished", 0)
+    if 2 * unfinished <= goals:
+        return {}
+    return {"alarm": f"{unfinished} of {goals} imagined goals never end; {type(model).remedy(cfg['judge'])}"}
 
 
 def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor) -> TensorDict:

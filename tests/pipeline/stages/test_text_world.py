@@ -55,6 +55,13 @@ def test_a_text_world_that_never_says_done_is_told_with_what_to_change(
     said = r"no judgement on (\d+) of \1 .*ending\.threshold=1\.0, .*fallback=drop: .*=last_frame or progress"
     with pytest.raises(ConfigError, match=said):
         world.judge.run(view, tmp_path, Inputs({"data": tmp_path}, settings))
+    cfg["judge"]["fallback"] = "last_frame"  # with which no judgement is missing
+    made = world.judge.run(
+        world.judge.view("judge-1", cfg, settings), tmp_path, Inputs({"data": tmp_path}, settings)
+    )
+    assert made["goals"] == made["goals_unfinished"] and "imagined goals never end" in made["alarm"]
+    assert "train it longer (text_world_fit)" in made["alarm"]
+    cfg["judge"]["fallback"] = "drop"
     fleet = SimpleNamespace(ledger=EpisodeLedger(dropped={"judge": 3, "physics": 2}))
     assert "judge.fallback=drop: train it longer" in what_the_judge_needs(cfg, fleet)  # type: ignore[arg-type]
     fleet.ledger.drop("physics", 1)
