@@ -190,7 +190,7 @@ class ChunkGaussianHead(Head):
     @torch.no_grad()
     def scale_exploration(self, factor: float) -> None:
         """Multiply the spread."""
-        self.log_std += math.log(factor)
+        self.log_std.add_(math.log(factor))
 
     def _gap(self, one: Tensor, other: Tensor) -> Tensor:
         active = (self.gain > 0).float()

@@ -143,5 +143,5 @@ class ChunkTokenHead(Head):
     @torch.no_grad()
     def scale_exploration(self, factor: float) -> None:
         """Multiply the temperature at which tokens are drawn, by dividing the logits."""
-        self.logits.weight /= factor
-        self.logits.bias /= factor
+        self.logits.weight.div_(factor)
+        self.logits.bias.div_(factor)

@@ -72,7 +72,7 @@ class Alarms:
                 self._warn(
                     "collapsed entropy",
                     iteration,
-                    "exploration is gone; raise algorithm.entropy or policy.std",
+                    "exploration is gone; raise algorithm.entropy or policy.head.std",
                 )
 
     def _warn(self, kind: str, iteration: int, advice: str) -> None:

@@ -53,13 +53,14 @@ class CodecAlarm:
         """Look at one step's figures."""
         warning = self.codec.warning(figures)
         self.bad = self.bad + 1 if warning else 0
-        if self.bad == self.patience and not self.message:
+        if self.bad == self.patience:
             self.give(warning)
 
     def give(self, warning: str) -> None:
-        """Give the alarm."""
+        """Give the alarm, unless it was given before."""
+        if not self.message:
+            tqdm.write(f"ALARM tokenizer: {warning}")
         self.message = warning
-        tqdm.write(f"ALARM tokenizer: {warning}")
 
 
 def train_tokenizer(

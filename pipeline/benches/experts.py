@@ -20,8 +20,8 @@ from envs.physics.worker import Track
 from envs.rng import Purpose, episode_seeds
 from pipeline.evaluation.by_task import tasks_of_seeds
 from pipeline.evaluation.statistics import rate, rate_entry, rate_line
+from pipeline.stages.collect import LEAST
 
-LEAST = 0.9  # share of episodes in which an expert must succeed
 SHOWN = 3  # failures of a task that are saved as videos
 _AT_ONCE = 64  # episodes, whose frames are held in memory
 

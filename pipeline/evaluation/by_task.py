@@ -30,11 +30,8 @@ def tasks_of_episodes(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor
 
 def evenly(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor, count: int) -> Tensor:
     """`count` of a store's episodes int64 [N], or all if they are fewer, in their order: of each task as many
-    as of the others, as far as there are. Physics plays tasks by turns, so the first ones are that; other
-    recordings may stand there task by task.
+    as of the others, as far as there are.
     """
-    if cfg["task"].get("suite"):
-        return episodes[:count]
     tasks = tasks_of_episodes(cfg, store, episodes)
     turns, turn = dict.fromkeys(tasks, 0), []
     for task in tasks:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import partial
 from itertools import islice
@@ -37,7 +38,8 @@ from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.given import DATASETS, PHYSICS, ROBOT, Cfg
 
 _SIDE_BY_SIDE = 64  # deployed episodes
-_FILMED = 5  # failures of the expert, at most
+_FILMED = 3  # failures of each task's expert, at most
+LEAST = 0.9  # share of its episodes in which an expert must succeed to be one
 SPLITS = ("train", "held_out", "calibration")  # in the order of their episodes
 
 
@@ -78,7 +80,7 @@ def collect(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         "held_out": len(store.split("held_out")),
         "frames": int(store.length.sum()),
         "successes": sum(bool(row["success"]) for row in store.episodes),
-        "expert_failures": _failures(cfg, store, folder),
+        **_failures(cfg, store, folder),
         "physics_episodes": {"scripted": len(store)},
     }
 
@@ -101,21 +103,27 @@ def _seal_shards(folder: Path, writer: LeRobotWriter) -> None:
     keep_whole(folder, writer.shard_files())
 
 
-def _failures(cfg: Cfg, store: ClipStore, folder: Path) -> list[str]:
-    """Task and seed of every episode in which the expert itself failed; says so, leaves videos of some."""
+def _failures(cfg: Cfg, store: ClipStore, folder: Path) -> dict[str, Any]:
+    """expert_failures, task and seed of every episode in which the expert itself failed, some of each task
+    saved as videos; alarm, if an expert fails so often that there is little to learn from.
+    """
     tried, failed = store.select(["expert"]), store.select(["expert"], succeeded=False)
-    tasks = tasks_of_episodes(cfg, store, failed)
-    names = [f"{task}-{store.episodes[n]['seed']}" for task, n in zip(tasks, failed.tolist(), strict=True)]
-    for name, number in list(zip(names, failed.tolist(), strict=True))[:_FILMED]:
-        frames = store.frames(store.rows(torch.tensor([number]))).numpy()
-        write_film(folder / "media" / f"expert-{name}.mp4", side_by_side(frames), store.fps)
-    if names:
-        tqdm.write(
-            f"collect: the expert failed in {len(names)} of {len(tried)} episodes, by task and seed"
-            f" {', '.join(names[:_FILMED])}{' ...' if len(names) > _FILMED else ''}; videos of them are in"
-            f" {folder / 'media'}"
-        )
-    return names
+    counts, shown = Counter(tasks_of_episodes(cfg, store, tried)), Counter[str]()
+    names, tasks = list[str](), tasks_of_episodes(cfg, store, failed)
+    for task, n in zip(tasks, failed.tolist(), strict=True):
+        names.append(f"{task}-{store.episodes[n]['seed']}")
+        shown[task] += 1
+        if shown[task] <= _FILMED:
+            frames = store.frames(store.rows(torch.tensor([n]))).numpy()
+            write_film(folder / "media" / f"expert-{names[-1]}.mp4", side_by_side(frames), store.fps)
+    if not names:
+        return {"expert_failures": names}
+    told = ", ".join(f"{task} {n} of {counts[task]}" for task, n in shown.most_common())
+    text = f"the expert fails ({told} episodes); videos of some are in {folder / 'media'}"
+    tqdm.write(f"collect: {text}")
+    bad = [task for task, n in shown.items() if n > (1 - LEAST) * counts[task]]
+    alarm = f"{text}; `worldloop bench experts` tells more, a longer task.horizon or another rate may help"
+    return {"expert_failures": names, **({"alarm": alarm} if bad else {})}
 
 
 def scripted_jobs(cfg: Cfg) -> list[tuple[int, float, str]]:

@@ -24,13 +24,14 @@ from envs.episodes.formats.lerobot_writer import LeRobotWriter
 from envs.episodes.splits import TRAIN, write_splits
 from envs.episodes.write_behind import WriteBehind
 from envs.rng import Purpose, episode_seeds
+from pipeline.evaluation.by_task import tasks_of_seeds
 from pipeline.evaluation.statistics import rate, rate_entry
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.collect import SPLITS, run_recorded
 from pipeline.stages.given import PHYSICS, Cfg
 
-Rate = dict[str, Any]  # see rate_entry
+Rates = dict[str, dict[str, Any]]  # a rate entry (statistics.py) by task
 
 
 @stage(reads=(*PHYSICS, "explore"))
@@ -43,7 +44,8 @@ def explore(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
     Returns:
         level, which was chosen (the widest if the mode never succeeds, for then nothing can be told); mode
-        and levels, the successes of those that were tried; alarm, if no level keeps enough.
+        and levels, the successes of those that were tried, with the same by task under tasks; alarm, if no
+        level keeps enough.
     """
     section = cfg["explore"]
     prepare_process(cfg["seed"], cfg["threads"])
@@ -53,19 +55,18 @@ def explore(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     with WriteBehind(LeRobotWriter(data, world_spec(cfg).embodiment)) as behind:
         found = find_level(section["levels"], section["keep"], partial(_tried, cfg, inputs, seeds, behind))
     level, mode, tried = found
-    seen = [
-        f"mode {mode['successes']}",
-        *(f"x{factor:g} {one['successes']}" for factor, one in tried.items()),
-    ]
-    tqdm.write(f"explore: successes of {mode['episodes']} episodes each: {', '.join(seen)}")
-    episodes = sum(one["episodes"] for one in (mode, *tried.values()))
+    levels = {f"{factor:g}": _summed(rates) for factor, rates in tried.items()}
+    seen = ", ".join(f"x{name} {entry['successes']}" for name, entry in levels.items())
+    total = _summed(mode)
+    tqdm.write(f"explore: of {total['episodes']} episodes each succeed: mode {total['successes']}, {seen}")
+    episodes = sum(entry["episodes"] for entry in (total, *levels.values()))
     # Levels share starts, so no episode is fit to be held out.
     write_splits(data, {name: episodes if name == TRAIN else 0 for name in SPLITS})
     save_weights(_scaled(cfg, inputs, level), folder)
     return {
         "level": level,
-        "mode": mode,
-        "levels": {f"{factor:g}": one for factor, one in tried.items()},
+        "mode": total,
+        "levels": levels,
         **_alarm(mode, tried, section["keep"]),
         "episodes": episodes,
         "physics_episodes": {"own": episodes},
@@ -73,34 +74,55 @@ def explore(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 
 def find_level(
-    levels: Iterable[float], keep: float, trial: Callable[[float | None], Rate]
-) -> tuple[float, Rate, dict[float, Rate]]:
-    """The widest level whose success rate is at least `keep` times the mode's; see `explore`.
+    levels: Iterable[float], keep: float, trial: Callable[[float | None], Rates]
+) -> tuple[float, Rates, dict[float, Rates]]:
+    """The widest level that keeps the share `keep` of the mode's successes; see `explore` and `kept`.
 
     Args:
         levels: factors of how widely the policy explores.
-        trial: success of the policy at a level, or of its mode for None.
+        trial: success of the policy at a level, or of its mode for None, by task.
 
     Returns:
         The level, the mode's success, and that of each level that was tried.
     """
     widest_first = sorted(levels, reverse=True)
-    level, mode, tried = widest_first[0], trial(None), dict[float, Rate]()
-    for level in widest_first if mode["successes"] else ():
+    level, mode, tried = widest_first[0], trial(None), dict[float, Rates]()
+    for level in widest_first if _summed(mode)["successes"] else ():
         tried[level] = trial(level)
-        if rate(tried[level]) >= keep * rate(mode):
+        if kept(tried[level], mode) >= keep:
             break
     return level, mode, tried
 
 
-def _tried(cfg: Cfg, inputs: Inputs, seeds: list[int], behind: WriteBehind, level: float | None) -> Rate:
+def kept(rates: Rates, mode: Rates) -> float:
+    """The share of its mode's successes that a policy keeps, 0..1, as the mean over those tasks in which the
+    mode succeeds at all: what a hard task loses must not be made up for by an easy one.
+    """
+    shares = [min(1.0, rate(rates[task]) / rate(mode[task])) for task in mode if mode[task]["successes"]]
+    return sum(shares) / len(shares)
+
+
+def _tried(cfg: Cfg, inputs: Inputs, seeds: list[int], behind: WriteBehind, level: float | None) -> Rates:
     """Record episodes of the policy that explores so widely, or of its mode if `level` is None."""
     policy = _scaled(cfg, inputs, 1.0 if level is None else level)
-    robot, won = world_spec(cfg).embodiment, list[bool]()
+    robot, won, played = world_spec(cfg).embodiment, list[bool](), list[int]()
     for tracks in run_recorded(cfg, policy, seeds, stochastic=level is not None):
         behind.write([Episode.from_track(track, "policy-0", robot) for track in tracks])
         won += [bool(track.rows["success"][-1]) for track in tracks]
-    return rate_entry(torch.tensor(won))
+        played += [track.seed for track in tracks]
+    tasks, success = tasks_of_seeds(cfg, played), torch.tensor(won)
+    return {
+        task: rate_entry(success[torch.tensor([one == task for one in tasks])])
+        for task in dict.fromkeys(tasks)
+    }
+
+
+def _summed(rates: Rates) -> dict[str, Any]:
+    """The rate entry of all tasks together, with theirs under tasks if there are several."""
+    won = sum(entry["successes"] for entry in rates.values())
+    episodes = sum(entry["episodes"] for entry in rates.values())
+    whole = rate_entry(torch.arange(episodes) < won)
+    return {**whole, **({"tasks": rates} if len(rates) > 1 else {})}
 
 
 def _scaled(cfg: Cfg, inputs: Inputs, level: float) -> Any:
@@ -110,15 +132,15 @@ def _scaled(cfg: Cfg, inputs: Inputs, level: float) -> Any:
     return policy
 
 
-def _alarm(mode: Rate, tried: Mapping[float, Rate], keep: float) -> dict[str, str]:
+def _alarm(mode: Rates, tried: Mapping[float, Rates], keep: float) -> dict[str, str]:
     """What the user must know if no level keeps enough."""
     if not tried:
         return {
-            "alarm": f"by its mode the policy succeeds in none of {mode['episodes']} episodes, so how widely"
-            " it may explore is not known; give imitation more demonstrations or steps (imitation)"
+            "alarm": f"by its mode the policy succeeds in none of {_summed(mode)['episodes']} episodes, so"
+            " how widely it may explore is not known; give imitation more demonstrations or steps (imitation)"
         }
     narrowest = min(tried)
-    if rate(tried[narrowest]) >= keep * rate(mode):
+    if kept(tried[narrowest], mode) >= keep:
         return {}
     return {
         "alarm": f"even x{narrowest:g} keeps less than {keep:g} of the mode's successes; add narrower ones to"

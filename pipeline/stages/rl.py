@@ -157,7 +157,7 @@ def _warm_up(
 
 @stage(reads=(*PHYSICS, *LEARNING))
 def rl_in_physics(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """The same reinforcement learning in physics, from the first policy: a control of imagination.
+    """The same algorithm in physics, from the first policy: a control of imagination.
 
     Settings: iterations.
     """

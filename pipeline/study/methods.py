@@ -131,7 +131,7 @@ class Loop(Method):
 
 
 class RLInPhysics(Method):
-    """The same RL from the same first policy, in physics instead of imagination.
+    """The same algorithm from the same first policy, in physics instead of imagination.
 
     Args:
         equal: it takes as many "episodes" as the loop deploys, or as many environment "steps" as it imagines.
@@ -185,6 +185,9 @@ def add_rl_in_physics(graph: Graph, cfg: Cfg, equal: Equal) -> str:
 
 
 def privileged_note(cfg: Cfg) -> str:
-    """What RL in physics is rewarded by."""
+    """What RL in physics is rewarded by, and how else it differs from the loop's."""
     rewarded = "progress and success" if rewards_of(cfg).progress else "success"
-    return f"rewarded by the suite's true {rewarded}, which are privileged, not by a judge"
+    return (
+        f"rewarded by the suite's true {rewarded}, which are privileged, not by a judge; it has no anchor to"
+        " cloned episodes (rl.anchor) and takes whole batches, so it plays some more episodes than asked"
+    )

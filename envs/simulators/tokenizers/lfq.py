@@ -80,7 +80,7 @@ class LookupFreeQuantiser(nn.Module):
 
     def use(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """How tokens [..., factors] use the codebook: the share of the codes that occur, and their
-        perplexity, exp of the entropy of their frequencies, each a mean over the factors.
+        perplexity, exp of the entropy of their frequencies, each of the factor that uses fewest.
         """
         shares, perplexities = [], []
         for factor in tokens.reshape(-1, self.factors).unbind(-1):
@@ -88,7 +88,7 @@ class LookupFreeQuantiser(nn.Module):
             frequency = count / count.sum()
             shares.append((count > 0).float().mean())
             perplexities.append(torch.special.entr(frequency).sum().exp())
-        return torch.stack(shares).mean(), torch.stack(perplexities).mean()
+        return torch.stack(shares).min(), torch.stack(perplexities).min()
 
 
 def bit_signs(bits: int) -> Tensor:
@@ -178,8 +178,9 @@ class LookupFreeTokenizer(nn.Module):
             return ""
         return (
             f"the codebook has collapsed: of {self.quantiser.codes} codes a factor, as if"
-            f" {figures['perplexity']:.2f} were in use (least {floor:.2f}); raise simulator.codec.entropy,"
-            " lower tokenizer_fit.lr or simulator.codec.bits, or see whether all pictures are alike"
+            f" {figures['perplexity']:.2f} were in use (least {floor:.2f}); raise the codec's entropy,"
+            " lower its bits (simulator.codec, of a text world judge.text_world.codec) or the rate of its"
+            " training (tokenizer_fit.lr, text_world_fit.tokenizer.lr), or see whether all pictures are alike"
         )
 
     def _numbers(self, frames: Tensor) -> Tensor:

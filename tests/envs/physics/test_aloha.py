@@ -45,7 +45,7 @@ def test_experts_succeed(suite: Aloha, task: str) -> None:
                 rewards.append(suite.observe().progress)
         won += suite.observe().success
         assert set(rewards) <= {0.0, 0.25, 0.5, 0.75, 1.0}
-        assert not suite.observe().success or rewards[-3:] == [1.0] * 3  # 0.3 s at 10 Hz
+        assert not suite.observe().success or rewards[-1] == 1.0
     assert won >= 3
 
 

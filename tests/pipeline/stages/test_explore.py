@@ -13,7 +13,7 @@ from actors.factory import open_clips
 from pipeline.config import load_config
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.loop import build_loop
-from pipeline.stages.explore import find_level
+from pipeline.stages.explore import find_level, kept
 from pipeline.study.methods import add_rl_in_physics
 
 WORDS = ["experiment=soak", "track=disabled", "explore.levels=[0.5,1.0]", "explore.episodes=3"]
@@ -32,10 +32,21 @@ def test_the_widest_level_that_keeps_enough_of_the_modes_successes(
     successes: dict[float | None, int], level: float, tried: list[float]
 ) -> None:
     def trial(factor: float | None) -> dict[str, Any]:
-        return rate_entry(torch.arange(100) < successes[factor])
+        return {"": rate_entry(torch.arange(100) < successes[factor])}
 
     found, mode, seen = find_level([0.25, 1.0, 0.5], 0.6, trial)
-    assert found == level and list(seen) == tried and mode["successes"] == successes[None]
+    assert found == level and list(seen) == tried and mode[""]["successes"] == successes[None]
+
+
+def test_easy_tasks_do_not_make_up_for_hard_ones() -> None:
+    def rates(push: int, grasp: int, never: int = 0) -> dict[str, dict[str, Any]]:
+        won = {"push": push, "grasp": grasp, "never": never}
+        return {task: rate_entry(torch.arange(100) < count) for task, count in won.items()}
+
+    mode = rates(90, 10)
+    assert kept(rates(90, 1), mode) == pytest.approx(0.55)  # 91 of 100 successes
+    assert kept(rates(45, 9), mode) == pytest.approx(0.7)
+    assert kept(rates(99, 10, 5), mode) == 1.0  # more than the mode is no more than all
 
 
 def test_trials_are_recorded_and_the_policy_goes_on_with_what_was_found(tmp_path: Path) -> None:
