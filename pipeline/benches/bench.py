@@ -9,18 +9,25 @@ from envs.targets import ConfigError
 from pipeline.cli.words import without_given
 from pipeline.config import load_config
 
+# Where a third of the episodes fail, a judge can be wrong both ways, and there are long rollouts.
+JUDGED = (
+    *("judge_fit.first.fit.steps=300", "collect.episodes.held_out=48"),
+    "collect.mix={expert: 0.3, noisy: 0.2, random: 0.5}",
+)
 # The smallest world on which the figures of few steps mean anything: minutes of one core.
 DISTIL = (
     *("experiment=smoke", "simulator=dit_small", "name=distil", "task.horizon=64", "task.size=[32,32]"),
     *("task.suite.cameras=[head]", "simulator.denoising.steps=15", "distill.steps=4"),
     "tokenizer_fit={steps: 250, batch: 16, lr: 3e-3}",
     "simulator_fit.first={single_chunk_fraction: 0.9, fit: {steps: 400, batch: 16, lr: 3e-3}}",
-    *("distill.first.fit.steps=200", "state_fit.first.fit={steps: 120, batch: 16, lr: 4e-3}"),
+    *("distill.first.fit.steps=500", "state_fit.first.fit={steps: 120, batch: 16, lr: 4e-3}"),
+    *JUDGED,
 )
 STRIDES = (
     *("experiment=smoke", "simulator=unet_small", "simulator.width=16", "name=strides", "task.horizon=48"),
     *("task.size=[32,32]", "task.suite.cameras=[head]"),
     "simulator_fit.first={single_chunk_fraction: 0.9, strides: [1,2,4], fit: {steps: 400, batch: 12}}",
+    *JUDGED,
 )
 
 # Where each benchmark is, and what it takes for granted unless the command line says otherwise.

@@ -1,5 +1,6 @@
 """worldloop bench strides: one world that shows every, every second or every fourth frame: how far a chunk
-reaches, what a rollout costs, and how well it agrees with the truth at the frames that all of them show.
+reaches, what a rollout costs, how well it agrees with the truth at the frames that all of them show, and how
+many verdicts of the judge are right.
 
 Open loop, under recorded actions. Every part is a stage of a graph of its own, so the bench goes on where it
 was stopped.
@@ -15,19 +16,26 @@ from typing import Any
 
 import torch
 
-from actors.factory import build_simulator
+from actors.factory import build_judge, build_simulator
 from actors.process import prepare_process
 from envs.files import write_text
 from envs.simulators.replay import replay
 from envs.targets import ConfigError
 from pipeline.cli.words import root_of
+from pipeline.evaluation.fidelity.strides import VERDICTS, common_stride
+from pipeline.evaluation.fidelity.verdicts import judged, verdict_tables, verdict_text
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.loop import has_physics
 from pipeline.stages import collect, world
-from pipeline.stages.given import TASK, Cfg, open_store
+from pipeline.stages.given import WORLD, Cfg, open_store
+from pipeline.stages.judge_cost import priced
 
-_EPISODES = 16  # held-out ones that are measured
+_EPISODES = 48  # held-out ones that are measured
+_HEADINGS = (
+    *("stride", "a chunk covers", "seconds per episode", "PSNR, all shown", "PSNR, frames shown by all"),
+    *VERDICTS,
+)
 
 
 def strides(cfg: dict[str, Any]) -> dict[int, dict[str, Any]]:
@@ -42,12 +50,12 @@ def strides(cfg: dict[str, Any]) -> dict[int, dict[str, Any]]:
     graph.run(list(rows.values()))
     found = {number: graph.result(name) for number, name in rows.items()}
     write_text(root / "strides.json", json.dumps(found, indent=1))
-    print("| stride | a chunk covers | seconds per episode | PSNR, all shown | PSNR, frames shown by all |")
-    print("| --- | --- | --- | --- | --- |")
+    print(f"| {' | '.join(_HEADINGS)} |\n|{' --- |' * len(_HEADINGS)}")
     for number, row in found.items():
+        verdicts = (verdict_text(row["verdicts"], video) for video in ("generated", "recorded"))
         print(
             f"| {number} | {row['covers']:.1f} s | {row['seconds']:.3f} | {row['psnr']:.2f} |"
-            f" {row['psnr_common']:.2f} |"
+            f" {row['psnr_common']:.2f} | {' | '.join(verdicts)} |"
         )
     return found
 
@@ -62,13 +70,21 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[int, st
     roles = {"data": data, "warm": warm}
     simulator = graph.add("simulator", world.simulator, roles, phase="first")
     numbers = sorted(cfg["simulator_fit"]["first"]["strides"])
-    roles = {"data": data, "simulator": simulator}
-    return graph, {n: graph.add(f"stride-{n}", measure, roles, stride=n, common=numbers[-1]) for n in numbers}
+    golden = (
+        graph.add("text_world", world.text_world, {"data": data}, phase="first")
+        if "text_world" in cfg["judge"]
+        else ""
+    )
+    roles = {"data": data, "simulator": simulator, "text_world": golden}
+    judge = graph.add("judge", world.judge, roles, phase="first")
+    roles, common = {"data": data, "simulator": simulator, "judge": judge}, common_stride(numbers)
+    return graph, {n: graph.add(f"stride-{n}", measure, roles, stride=n, common=common) for n in numbers}
 
 
-@stage(reads=("seed", "threads", *TASK, "simulator"), place=Place.EVALUATOR)
+@stage(reads=WORLD, place=Place.EVALUATOR)
+@priced
 def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """Rollouts of held-out episodes.
+    """Rollouts of held-out episodes, and what the judge says of them and of the same recorded frames.
 
     Settings: stride, and common, a multiple of it, at whose frames strides are compared.
     """
@@ -80,10 +96,11 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     began = time.perf_counter()
     made = replay(simulator, store, held, bf16=bf16, stride=stride)
     seconds = (time.perf_counter() - began) / len(held)
+    true, judge = store.frames(made.rows), build_judge(cfg, inputs.weights("judge")).eval()
     error = torch.stack(
         [
             ((a.float() - b.float()) / 255).square().mean((-4, -3, -2, -1))
-            for a, b in zip(made.frames, store.frames(made.rows), strict=True)
+            for a, b in zip(made.frames, true, strict=True)
         ]
     )
     psnr = -10 * error.clamp(min=1e-8).log10()
@@ -94,4 +111,5 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         "seconds": seconds,
         "psnr": float(psnr[made.valid].mean()),
         "psnr_common": float(psnr[alike].mean()),
+        "verdicts": verdict_tables(judge, store, held, [judged(judge, store, held, made, true)], made.valid),
     }

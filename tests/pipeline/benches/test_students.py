@@ -20,7 +20,7 @@ TINY = (
 )
 STUDENTS = (
     *("simulator=dit_small", "distill.steps=2", "tokenizer_fit={steps: 2, batch: 4}"),
-    *("distill.first.fit={steps: 3, batch: 2}", "distill.method.critic_updates=1"),
+    *("distill.first.fit={steps: 4, batch: 2}", "distill.method.critic_updates=1"),
     "state_fit.first.fit={steps: 2, batch: 4}",
 )
 
@@ -32,7 +32,8 @@ def test_students_and_teacher_stand_in_one_table(
     monkeypatch.setattr(students, "STUDENT", (2, 1))
     cfg = load_config([*TINY, *STUDENTS, f"runs={tmp_path}"])
     found = distil(cfg)
-    titles = ["teacher, 2", "DMD2, 2", "DMD2, 1", "TrajectoryRegression, 2", "TrajectoryRegression, 1"]
+    few = ["not distilled", "DMD2", "TrajectoryRegression"]
+    titles = ["teacher, 2", *(f"{name}, {steps}" for name in few for steps in (2, 1))]
     assert list(found) == titles
     assert all(math.isfinite(value) for row in found.values() for value in row.values())
     assert json.loads((tmp_path / "bench/distil.json").read_text()) == found
@@ -41,23 +42,41 @@ def test_students_and_teacher_stand_in_one_table(
     for row in found.values():
         assert sum(row[f"judge_{name}"] for name in ("tp", "fp", "fn", "tn")) > 0
     assert said.count("TrajectoryRegression, 1: m") == 1 and "teacher, 2: m" not in said
+    assert "not distilled, 1: m" not in said
+    graph, _ = students.build_table(cfg, tmp_path)
+    made = [graph.nodes[f"student-{name}"].cfg["distill"]["first"]["fit"] for name in few[1:]]
+    assert [fit["steps"] for fit in made] == [4, 2]  # two updates of the student, and two of DMD2's critic
     assert distil(cfg) == found and "is finished, reused" in capsys.readouterr().out
 
 
 def test_a_student_meets_all_that_it_should_or_it_is_said_what_it_missed() -> None:
-    teacher = {"evaluations": 0, "speed_1": 10.0, "speed_32": 20.0, "rollout_psnr": 25.0, "judge_gap": -4.0}
-    good = {"evaluations": 4, "speed_1": 41.0, "speed_32": 80.0, "rollout_psnr": 24.5, "judge_gap": 4.0}
-    bad = {"evaluations": 8, "speed_1": 41.0, "speed_32": 79.0, "rollout_psnr": 24.4, "judge_gap": 4.1}
-    met, missed = reached({"teacher, 15": teacher, "DMD2, 4": good, "DMD2, 8": bad})
-    assert met.startswith("DMD2, 4: met (4.1 and 4.0 times the frames/s of teacher, 15 at 1 and 32, 0.50 dB")
+    def row(evaluations: int, *figures: float) -> dict[str, float]:
+        names = ("speed_1", "speed_32", "rollout_psnr", "rollout_detail", "judge_gap")
+        return {"evaluations": evaluations, **dict(zip(names, figures, strict=True))}
+
+    teacher = row(0, 10.0, 20.0, 25.0, 0.9, -4.0)
+    rows = {
+        "DMD2, 3": row(3, 41.0, 80.0, 24.5, 0.75, 4.0),
+        "DMD2, 8": row(8, 41.0, 79.0, 24.4, 0.75, 4.1),
+        "mean picture": row(1, 90.0, 90.0, 26.0, 0.5, 0.0),
+        "nobody judged": row(3, 41.0, 80.0, 24.5, 0.75, math.nan),
+    }
+    met, missed, mean, unknown = reached({"teacher, 15": teacher, "not distilled, 1": teacher, **rows})
+    assert met.startswith("DMD2, 3: met (4.1 and 4.0 times the frames/s of teacher, 15 at 1 and 32, 0.50 dB")
     assert missed.startswith("DMD2, 8: missed by 8 evaluations, frames/s, PSNR, gap to truth (")
+    assert mean.startswith("mean picture: missed by detail (") and "56% of its detail" in mean
+    assert unknown.startswith("nobody judged: missed by gap to truth (")
 
 
-def test_strides_reach_as_many_times_further(tmp_path: Path) -> None:
+def test_strides_reach_as_many_times_further(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = [*TINY, "simulator_fit.first.strides=[1,2]", f"runs={tmp_path}"]
     found = strides(load_config(words))
     assert list(found) == [1, 2] and found[2]["covers"] == 2 * found[1]["covers"]
-    assert all(math.isfinite(value) for row in found.values() for value in row.values())
+    for row in found.values():
+        verdicts = row.pop("verdicts")
+        assert all(math.isfinite(value) for value in row.values())
+        assert verdicts.keys() == {"generated", "recorded"}
+    assert "| verdicts right |" in capsys.readouterr().out
 
 
 def test_benches_say_what_they_cannot_do() -> None:
