@@ -40,7 +40,7 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     table = worldloop(tmp_path, "compare", str(run), str(run)).output
     assert "| algorithm; seed | PPO; 0 | PPO; 0 |" in table
     again = worldloop(tmp_path, "run", *words)
-    assert again.output.count("is finished, reused") == 24
+    assert again.output.count("is finished, reused") == 25
     one = worldloop(tmp_path, "controls", *words, "controls.only=[filtered_bc]")
     assert one.status == 0, one.output[-3000:]
     assert set(json.loads((run / "controls.json").read_text())) == {"before", "loop", "filtered BC"}
@@ -50,7 +50,7 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     rows = json.loads((run / "controls.json").read_text())
     assert set(rows) > {"before", "loop", "loop without imagined decisions", "filtered BC"}
     note = "rewarded by the suite's true progress and success, which are privileged, not by a judge"
-    noted = {title for title, row in rows.items() if row.get("note") == note}
+    noted = {title for title, row in rows.items() if note in row.get("note", "")}
     assert noted == {"RL in physics, equal episodes", "RL in physics, equal steps"}
     assert "equal steps" in (run / "report.html").read_text() and controls.output.count(note) == 2
     later = json.loads((run / "wandb.json").read_text())["rows"]
