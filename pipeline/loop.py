@@ -18,7 +18,8 @@ from pipeline.acting import acting
 from pipeline.graph.graph import Graph
 from pipeline.graph.workers import learners_of
 from pipeline.outside import CHECKPOINT, KINEMATICS, STATE_CHECKPOINT, files_at, fingerprint, judge_files
-from pipeline.stages import collect, explore, imitation, keep, pace, prove, rl, show, world
+from pipeline.stages import collect, imitation, keep, pace, prove, rl, show, world
+from pipeline.stages.measured import explore
 
 Cfg = Mapping[str, Any]
 T = TypeVar("T")

@@ -1,1 +1,1 @@
-"""Stages that only studies have: what is measured of worlds and judges beside what a run measures of them."""
+"""Stages that measure: worlds and judges for studies, and how widely a first policy may explore."""

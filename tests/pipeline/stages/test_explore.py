@@ -13,7 +13,7 @@ from actors.factory import open_clips
 from pipeline.config import load_config
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.loop import build_loop
-from pipeline.stages.explore import find_level, kept
+from pipeline.stages.measured.explore import find_level, kept
 from pipeline.study.methods import add_rl_in_physics
 
 WORDS = ["experiment=soak", "track=disabled", "explore.levels=[0.5,1.0]", "explore.episodes=3"]
