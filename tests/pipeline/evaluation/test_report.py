@@ -57,6 +57,7 @@ def result(**changes: Any) -> dict[str, Any]:
         "frames_per_second": {"batch 1": 30.0, "batch 32": 300.0},
         "tasks": {},
         "scenes": [],
+        "exploration": None,
         "rounds": [{"round": 1, "true": entry(40), "imagined": entry(44), "gap": 0.04, "replayed": table}],
         "episodes_used": 60,
         "episodes_held_out": 10,
@@ -171,6 +172,16 @@ def test_the_page_shows_tasks(inputs: Inputs) -> None:
     title = "Before and after, task by task"
     assert title in page and "+25.0" in page and "77.0%" in page and "88.0%" in page
     assert title not in build_report({}, inputs, {**result(), "verdict": "gain"})
+
+
+def test_the_page_shows_how_widely_the_policy_explores_by_task(inputs: Inputs) -> None:
+    level = {**entry(31), "tasks": {"open": entry(13), "close": entry(18)}}
+    page = build_report({}, inputs, {**result(), "verdict": "gain"})
+    assert "Exploration" not in page
+    found = {"level": 0.35, "mode": {**level, **entry(44)}, "levels": {"1": entry(3), "0.35": level}}
+    page = build_report({}, inputs, {**result(exploration=found), "verdict": "gain"})
+    assert "<b>×0.35</b>" in page and "44/100" in page and "3/100" in page and "31/100" in page
+    assert page.count("18/100") == 2  # of the mode and of the level
 
 
 def test_the_page_shows_controls_and_runs_without_physics(inputs: Inputs) -> None:
