@@ -15,26 +15,28 @@ OGBENCH := dm_control==1.0.41 ogbench==1.2.2
 
 setup: gl $(VENV)/.ready
 
-$(VENV)/.ready: pyproject.toml constraints.txt
+$(BIN)/pip:
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 10) else "Worldloop needs Python 3.10 or newer: make PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV) || { echo "python venv is missing: sudo apt-get install -y python3-venv"; exit 1; }
 	$(BIN)/python -m pip install --upgrade pip --quiet
+
+$(VENV)/.ready: pyproject.toml constraints.txt | $(BIN)/pip
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[dev,metaworld,aloha]"
 	# These two ask for an old numpy and an old mujoco, which nothing in them needs; their real needs are ours.
 	# The third and fourth ask for a video encoder and a compiled maze, which we do not use.
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps openpi-client==0.1.2 $(METAWORLD) $(ALOHA)
 	touch $@
 
-# One suite alone, for an environment that was set up without it; ogbench is not part of the set-up.
-metaworld:
+# One suite alone, for an environment that was set up without it or not at all; ogbench is not part of the set-up.
+metaworld: gl | $(BIN)/pip
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[metaworld]"
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps $(METAWORLD)
 
-aloha:
+aloha: gl | $(BIN)/pip
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[aloha]"
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps $(ALOHA)
 
-ogbench:
+ogbench: gl | $(BIN)/pip
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[ogbench]"
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps $(OGBENCH)
 

@@ -77,16 +77,17 @@ def stages(words: Words) -> None:
 
 
 def evaluate(words: Words) -> None:
-    """success of a policy: worldloop evaluate policy=<stage|folder> world=physics|imagined experiment=...;
-    one that needs no weights is a choice of configs/policy: policy=openpi policy.url=ws://...
+    """success of a policy: worldloop evaluate policy=<stage|folder> [world=physics|imagined]
+    [variant=<one of task.variants>] experiment=...; one that needs no weights is a choice of
+    configs/policy: policy=openpi policy.url=ws://...
     """
     from pipeline.config import offered
 
-    own, rest = {"weights": "", "world": "physics"}, []
+    own, rest = {"weights": "", "world": "physics", "variant": ""}, []
     for word in words:
         key, _, value = word.partition("=")
-        if key == "world":
-            own["world"] = value
+        if key in ("world", "variant"):
+            own[key] = value
         elif key == "policy" and not offered("policy", value, words):
             own["weights"] = value
         else:

@@ -6,57 +6,74 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from actors.factory import build_physics, build_policy
 from actors.rollouts.evaluate import evaluate
 from envs.rng import Purpose, episode_seeds
 from envs.targets import ConfigError
+from pipeline.evaluation.by_task import by_task, evenly, tasks_of_episodes, tasks_of_seeds, variant_of
 from pipeline.evaluation.statistics import rate_entry, rate_line
 from pipeline.graph.graph import Graph
 from pipeline.loop import build_loop
 from pipeline.stages.given import load_world, open_store
 
+Cfg = Mapping[str, Any]
 _SIDE_BY_SIDE = 64  # imagined episodes
 
 
-def evaluate_policy(cfg: Mapping[str, Any], root: Path, weights: str = "", world: str = "physics") -> str:
-    """One line: successes of episodes, with their interval.
+def evaluate_policy(
+    cfg: Mapping[str, Any], root: Path, weights: str = "", world: str = "physics", variant: str = ""
+) -> str:
+    """Successes of episodes, with their interval, in one line, and one more for each of several tasks.
 
     Args:
         cfg: the resolved config.
         root: the run's folder.
         weights: a stage of the run, or a folder with weights; "" evaluates the policy as it is built.
         world: physics or imagined; the latter is the one that the run's last RL learned in.
+        variant: one of task.variants, in physics; "" for the task as it is.
 
     Raises:
-        ConfigError: for unknown weights and worlds.
+        ConfigError: for unknown weights, worlds and variants.
     """
     graph = build_loop(cfg, root)
     cfg = graph.cfg  # of the world that is acted in
     if world not in _WORLDS:
         raise ConfigError(f"world={world!r} must be one of {sorted(_WORLDS)}")
+    changes = variant_of(cfg, variant)
+    if variant and world != "physics":
+        raise ConfigError(f"variant={variant} is known in physics alone; leave world={world} out")
     folder = graph.folder(weights) if weights in graph.nodes else Path(weights)
     actor = build_policy(cfg, folder / "weights.safetensors" if weights else None)
-    env, seeds = _WORLDS[world](cfg, graph)
+    env, seeds, tasks = _WORLDS[world](cfg, graph, changes)
     try:
         outcome = evaluate(env, actor, seeds, label=world)
     finally:
         env.close()
-    line = rate_line(rate_entry(outcome.success[outcome.counted]))
-    name, dropped = weights or cfg["policy"]["_target_"], int((~outcome.counted).sum())
-    return f"{name} in {world}: {line}, {dropped} dropped"
+    name = f"{weights or cfg['policy']['_target_']} in {world}{', ' if variant else ''}{variant}"
+    lines = {name: _line(outcome.success, outcome.counted)}
+    lines |= by_task(tasks, _line, outcome.success, outcome.counted)
+    return "\n".join(f"{'' if title == name else '  '}{title}: {line}" for title, line in lines.items())
 
 
-def _physics(cfg: Mapping[str, Any], graph: Graph) -> tuple[Any, list[int]]:
+def _line(success: Tensor, counted: Tensor) -> str:
+    return f"{rate_line(rate_entry(success[counted]))}, {int((~counted).sum())} dropped"
+
+
+def _physics(cfg: Cfg, graph: Graph, changes: Cfg) -> tuple[Any, list[int], list[str]]:
     section = cfg["evaluate"]
     seeds = episode_seeds(cfg["seed"], Purpose.EVALUATE, section["episodes"])
-    return build_physics(cfg, section["envs"]), seeds
+    return build_physics(cfg, section["envs"], changes=changes), seeds, tasks_of_seeds(cfg, seeds)
 
 
-def _imagined(cfg: Mapping[str, Any], graph: Graph) -> tuple[Any, list[int]]:
+def _imagined(cfg: Cfg, graph: Graph, changes: Cfg) -> tuple[Any, list[int], list[str]]:
     inputs = graph.inputs("evaluate-imagined")
     store = open_store(cfg, inputs)
-    count = min(cfg["evaluate"]["imagined"], len(store))
-    return load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, count)), list(range(count))
+    starts = evenly(cfg, store, torch.arange(len(store)), cfg["evaluate"]["imagined"])
+    world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(starts)), starts)
+    return world, list(range(len(starts))), tasks_of_episodes(cfg, store, starts)
 
 
 _WORLDS = {"physics": _physics, "imagined": _imagined}

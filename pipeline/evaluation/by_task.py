@@ -3,19 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from envs.episodes.clips import ClipStore
 from envs.physics.suite import build_suite, scene_of, task_names, task_of
+from envs.targets import ConfigError, nearest
+
+T = TypeVar("T")
 
 
 def tasks_of_seeds(cfg: Mapping[str, Any], seeds: Iterable[int]) -> list[str]:
     """The task of each episode in physics, by its seed."""
     names = task_names(cfg["task"]["name"])
     return [task_of(names, int(seed)) for seed in seeds]
+
+
+def variant_of(cfg: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """The options of the suite that a variant of the task changes; of "", the task as it is, none.
+
+    Raises:
+        ConfigError: for a variant that the task does not have.
+    """
+    known = {"": {}, **(cfg["task"].get("variants") or {})}
+    if name not in known:
+        raise ConfigError(f"variant={name} is not one of task.variants{nearest(name, known)}")
+    return dict(known[name])
 
 
 def tasks_of_episodes(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor) -> list[str]:
@@ -41,9 +56,7 @@ def evenly(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor, count: in
     return episodes[first.sort().values]
 
 
-def by_task(
-    tasks: Sequence[str], summarise: Callable[..., Mapping[str, Any]], *values: Tensor
-) -> dict[str, Mapping[str, Any]]:
+def by_task(tasks: Sequence[str], summarise: Callable[..., T], *values: Tensor) -> dict[str, T]:
     """What `summarise` says of each task's part of `values`, tensors [N] beside tasks [N]; {} if all are of
     one task, of which the whole says everything.
     """

@@ -12,8 +12,7 @@ import torch
 from markupsafe import Markup
 
 from envs.physics.suite import task_names
-from envs.targets import ConfigError, nearest
-from pipeline.evaluation.by_task import tasks_of_seeds
+from pipeline.evaluation.by_task import tasks_of_seeds, variant_of
 from pipeline.evaluation.result import outcomes
 from pipeline.evaluation.statistics import rate, rate_entry, rate_line
 from pipeline.stages import prove
@@ -119,10 +118,7 @@ class Success(Column):
         inputs = {"policy": made.policy}  # the loop proves its own first and last policy
         if not self.variant:
             return (made.add_once(f"evaluate-{made.policy}", prove.evaluate_physics, inputs),)
-        known = cfg["task"].get("variants") or {}
-        if self.variant not in known:
-            near = nearest(self.variant, known)
-            raise ConfigError(f"variant={self.variant} is not one of task.variants{near}")
+        variant_of(cfg, self.variant)  # or says that there is none
         name = f"evaluate-{made.policy}-{self.variant}"
         return (made.add_once(name, prove.evaluate_variant, inputs, variant=self.variant),)
 
