@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -69,6 +70,7 @@ class OGBench(MujocoSuite):
     """
 
     tasks = tuple(TASKS)
+    offers = MappingProxyType({"cameras": tuple(CAMERAS)})
 
     def __init__(
         self,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import warnings
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,7 @@ class Aloha(MujocoSuite):
     """
 
     tasks = tuple(_INSTRUCTIONS)
+    offers = MappingProxyType({"cameras": tuple(CAMERAS)})
 
     def __init__(
         self,

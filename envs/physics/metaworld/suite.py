@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -66,6 +67,8 @@ class MetaWorld(MujocoSuite):
     Raises:
         SuiteError: if metaworld is not installed, or an option does not fit.
     """
+
+    offers = MappingProxyType({"cameras": tuple(CAMERAS)})
 
     def __init__(
         self,

@@ -5,6 +5,8 @@ What all its suites share stands in `TwoArmSuite`; `Tabletop` is the smallest of
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import numpy as np
 
 from envs.embodiment import Camera, Embodiment
@@ -41,6 +43,8 @@ class TwoArmSuite(MujocoSuite):
     """
 
     instruction: str
+
+    offers = MappingProxyType({"actions": tuple(ACTIONS), "cameras": tuple(CAMERAS)})
 
     def __init__(
         self,

@@ -71,6 +71,10 @@ def check_equal(one: Track, two: Track) -> None:
 def test_shapes_are_those_of_the_embodiment(task: dict[str, Any], suite: TaskSuite) -> None:
     robot = suite.embodiment
     assert task["name"] in suite.tasks
+    for option in ("cameras", "actions"):
+        chosen = task["suite"].get(option, ())
+        chosen = {chosen} if isinstance(chosen, str) else set(chosen)
+        assert chosen <= set(suite.offers.get(option, chosen))
     suite.reset(task["name"], 1)
     seen, pictures = suite.observe(), suite.render()
     assert pictures.dtype == np.uint8

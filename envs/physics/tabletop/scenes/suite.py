@@ -48,7 +48,7 @@ class TabletopScenes(TwoArmSuite):
     """
 
     tasks = tuple(TASKS)
-    offers = MappingProxyType({"scenes": tuple(SCENES), "phrasings": STYLES})
+    offers = MappingProxyType({**TwoArmSuite.offers, "scenes": tuple(SCENES), "phrasings": STYLES})
 
     def __init__(
         self,
