@@ -15,6 +15,7 @@ from pipeline.evaluation.statistics import mcnemar, rate, rate_entry
 from pipeline.graph.stage import Inputs
 
 _BLIND = 0.3  # imagined minus true success from which on imagination says nothing of the truth
+_CHANCE = 0.05  # below it a difference is more than that
 _ENTRY = ("successes", "episodes", "low", "high")
 
 
@@ -142,6 +143,12 @@ def _why(result: Mapping[str, Any], points: float, imagined: float) -> str:
     alarms = [text for text in result["alarms"] if text.startswith("rl-")]
     if imagined > -2 and alarms:
         return f"RL did not improve even imagined success; {alarms[0]}"
+    if points < 0 and result["paired"]["p"] < _CHANCE:
+        return (
+            f"the policy got worse, and imagined success moved by {imagined:+.0f} points only: RL followed noise"
+            " or forgot; give it shorter steps (rl.lr), more episodes an iteration (rl.envs) or a stronger hold"
+            " on what worked (rl.anchor), and look whether cloning did it (rounds.clone=0)"
+        )
     return (
         f"RL moved imagined success by {imagined:+.0f} points only; give it more iterations"
         " (rounds.iterations) or a higher rl.lr"

@@ -108,6 +108,9 @@ def test_the_verdict_can_say_no_and_why() -> None:
     alarms = ["tokenizer: collapsed", "rl-2: no reward variance"]
     alarmed = verdict(result(physics_after=entry(39), imagined_after=entry(40), alarms=alarms, **small))
     assert "even imagined success; rl-2: no reward variance" in alarmed
+    lost = {"paired": {"gained": 5, "lost": 25, "p": 0.0003}}
+    worse = verdict(result(physics_after=entry(20), imagined_after=entry(40), **lost))
+    assert "followed noise" in worse and "rl.lr" in worse and "higher" not in worse
     alone = verdict(result(physics_before=None, physics_after=None, paired=None))
     assert "without physics" in alone
 
