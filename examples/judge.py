@@ -32,6 +32,7 @@ class GoalPicture(Judge):
         ConfigError: if the picture cannot be read.
     """
 
+    reads_instruction = False
     goal: Tensor
 
     def __init__(self, spec: WorldSpec, hold: int, picture: str, sharpness: float):

@@ -46,6 +46,8 @@ class Judge(nn.Module):
     Attributes:
         needs_labels: whether it is taught by recorded success, and cannot do without.
         reads_features: whether `score` must be given the simulator's features of the frames.
+        reads_instruction: whether its scores depend on the words; one that is blind to them cannot tell tasks
+            apart.
         discount: per frame, of the progress that `loss` is given: discount ** (frames until success).
         calibrates: whether the threshold is to be set on recorded video (learners/stages/judge.py).
 
@@ -56,6 +58,7 @@ class Judge(nn.Module):
     threshold: Tensor
     needs_labels = False
     reads_features = False
+    reads_instruction = True
     discount = 1.0
     calibrates = True
 

@@ -28,6 +28,7 @@ class GoalImageJudge(GoalJudge):
         ConfigError: if the picture cannot be read.
     """
 
+    reads_instruction = False
     goal: Tensor
 
     def __init__(

@@ -32,6 +32,8 @@ class ProxyJudge(FrameJudge):
         cameras: which it looks through: "all", "main", or names.
     """
 
+    reads_instruction = False
+
     def __init__(
         self,
         spec: WorldSpec,

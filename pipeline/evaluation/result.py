@@ -145,9 +145,9 @@ def _why(result: Mapping[str, Any], points: float, imagined: float) -> str:
         return f"RL did not improve even imagined success; {alarms[0]}"
     if points < 0 and result["paired"]["p"] < _CHANCE:
         return (
-            f"the policy got worse, and imagined success moved by {imagined:+.0f} points only: RL followed noise"
-            " or forgot; give it shorter steps (rl.lr), more episodes an iteration (rl.envs) or a stronger hold"
-            " on what worked (rl.anchor), and look whether cloning did it (rounds.clone=0)"
+            f"the policy got worse, and imagined success moved by {imagined:+.0f} points only: RL followed"
+            " noise or forgot; give it shorter steps (rl.lr), more episodes an iteration (rl.envs) or a"
+            " stronger hold on what worked (rl.anchor), and look whether cloning did it (rounds.clone=0)"
         )
     return (
         f"RL moved imagined success by {imagined:+.0f} points only; give it more iterations"

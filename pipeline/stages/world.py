@@ -236,18 +236,24 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         stats["generated_frames"] = len(generated)
     _calibrate(cfg, model, store, world, bf16)
     save_weights(model, folder)
-    return {**stats, "threshold": float(model.threshold), **model.facts(), **_unfinished(cfg, model)}
+    return {**stats, "threshold": float(model.threshold), **model.facts(), **_doubts(cfg, model, store)}
 
 
-def _unfinished(cfg: Cfg, model: Judge) -> dict[str, str]:
-    """{"alarm"}: most goals that the judge imagined for calibration never end, whatever stands in for them;
-    {} otherwise.
+def _doubts(cfg: Cfg, model: Judge, store: ClipStore) -> dict[str, str]:
+    """{"alarm"}: the judge is blind to the words, and there are several; or most goals that it imagined for
+    calibration never end, whatever stands in for them. {} otherwise.
     """
-    facts = model.facts()
+    facts, said = model.facts(), {row["instruction"] for row in store.episodes}
     goals, unfinished = facts.get("goals", 0), facts.get("goals_unfinished", 0)
-    if 2 * unfinished <= goals:
-        return {}
-    return {"alarm": f"{unfinished} of {goals} imagined goals never end; {type(model).remedy(cfg['judge'])}"}
+    doubts = []
+    if not model.reads_instruction and len(said) > 1:
+        doubts.append(
+            f"{type(model).__name__} reads no instruction, and recordings hold {len(said)} different ones: it"
+            " cannot tell what was asked for; where words decide, choose judge=learned"
+        )
+    if 2 * unfinished > goals:
+        doubts.append(f"{unfinished} of {goals} imagined goals never end; {type(model).remedy(cfg['judge'])}")
+    return {"alarm": "; ".join(doubts)} if doubts else {}
 
 
 def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor) -> TensorDict:
