@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from envs.embodiment import Embodiment
 from envs.language import FEATURES, TextEncoder
 from envs.ranges import Natural
-from envs.specs import text_to_bytes
+from envs.specs import TEXT_BYTES, text_to_bytes
 
 
 class ActionText(nn.Module):
@@ -33,9 +33,19 @@ class ActionText(nn.Module):
         """Text has no units to take."""
 
     def forward(self, commands: Tensor, now: Tensor) -> Tensor:
-        """float32 [..., K, size] of commands [..., K, A]; the command in force [..., A] is not told."""
-        rows = commands.flatten(0, -2).cpu()
-        text = text_to_bytes([self.describe(row) for row in rows.tolist()])
+        """float32 [..., K, size] of commands [..., K, A]; the command in force [..., A] is not told.
+
+        Raises:
+            ValueError: if a command takes more text than is read.
+        """
+        said = [self.describe(row) for row in commands.flatten(0, -2).cpu().tolist()]
+        longest = max(map(len, said), default=0)
+        if longest > TEXT_BYTES:
+            raise ValueError(
+                f"{commands.shape[-1]} numbers with {self.decimals} decimals take {longest} letters, and"
+                f" {TEXT_BYTES} are read; lower simulator.actions.decimals, or take ActionVector instead"
+            )
+        text = text_to_bytes(said)
         features = self.encoder.features(text.to(commands.device))
         return features.float().reshape(*commands.shape[:-1], -1)
 

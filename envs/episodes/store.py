@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,9 @@ from envs.episodes.cache import CachedSet, open_cached
 from envs.episodes.columns import Columns
 from envs.episodes.episode import EpisodeError
 from envs.episodes.splits import range_of
-from envs.specs import WorldSpec, text_to_bytes
+from envs.specs import TEXT_BYTES, WorldSpec, text_to_bytes
+
+log = logging.getLogger(__name__)
 
 
 class EpisodeStore:
@@ -63,6 +66,12 @@ class EpisodeStore:
         ]
         self.instructions = [str(row["instruction"]) for row in self.episodes]
         self.text = text_to_bytes(self.instructions)
+        if cut := sorted({text for text in self.instructions if len(text.encode()) > TEXT_BYTES}):
+            log.warning(
+                "%d instructions, the first of them %.60r..., have more than %d bytes; only so many are read"
+                " by policies, judges and worlds, so texts that differ later are the same to them",
+                *(len(cut), cut[0], TEXT_BYTES),
+            )
         self.length = torch.tensor([row["length"] for row in self.episodes])
         self.start = self.length.cumsum(0) - self.length
         self.arrays = Columns(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from envs.conditioning import ActionText, ActionVector
@@ -24,3 +25,9 @@ def test_it_stands_in_for_the_vector_and_nothing_of_it_learns() -> None:
     assert not torch.allclose(rows[0], rows[1])
     assert not torch.allclose(rows[1], text(commands.flip(-1), now)[0, 1])  # their order tells
     assert not [p for p in text.parameters() if p.requires_grad]
+
+
+def test_text_that_would_be_cut_is_refused() -> None:
+    many = ActionText(ARM_DELTAS, decimals=40)
+    with pytest.raises(ValueError, match=r"4 numbers with 40 decimals take 3\d\d letters, and 256 are read"):
+        many(torch.ones(1, 2, 4), torch.zeros(1, 4))

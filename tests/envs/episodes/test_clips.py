@@ -294,3 +294,13 @@ def test_noise_in_privileged_columns_changes_nothing_that_is_learned_from(
     assert torch.equal(a.frames(rows), b.frames(rows)) and torch.equal(a.pose_maps(rows), b.pose_maps(rows))
     one, two = read_privileged(a, "object_pose"), read_privileged(b, "object_pose")
     assert one is not None and two is not None and not torch.equal(one, two)
+
+
+def test_an_instruction_that_is_cut_is_told(
+    tmp_path: Path, episodes: list[Episode], caplog: pytest.LogCaptureFixture
+) -> None:
+    robot, wordy = BIMANUAL_POSES.at(SIZE), "put the cup " + "beside the other cup " * 20
+    LeRobotWriter(tmp_path, robot).write([replace(episodes[0], instruction=wordy), *episodes[1:3]])
+    ClipStore([tmp_path], world_spec(robot, SIZE))
+    (said,) = [entry.getMessage() for entry in caplog.records if "bytes" in entry.getMessage()]
+    assert said.startswith("1 instructions, the first of them 'put the cup") and "256 bytes" in said

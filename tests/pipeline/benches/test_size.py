@@ -10,8 +10,9 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from envs.embodiment import ActionKind, Camera, Embodiment
+from envs.simulators.base import WORLD_OPTIONS
 from envs.specs import WorldSpec
-from envs.targets import ConfigError
+from envs.targets import ConfigError, build
 from pipeline.benches.size import size, size_of, text_world_size
 from pipeline.config import load_config
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
@@ -42,6 +43,20 @@ def test_forcing_full_has_the_published_size_and_shapes() -> None:
     # Nine frames before are read once, nine frames ahead ten times.
     assert 1.0 < found.generating / (2 * met * (9 + 10 * 9) * 256) < 1.25
     assert found.activations > 20 * 256 * 1024 * 4 * 16 * 2
+
+
+def test_worlds_of_tokens_have_the_published_size() -> None:
+    two = replace(ARM, cameras=(ARM.cameras[0], replace(ARM.cameras[0], name="wrist")))
+    spec, half_a_billion = WorldSpec(two, (256, 256), 4), pytest.approx(515e6, rel=0.002)
+    cfg = load_config(["judge=golden_goal_full", "task=tabletop"])
+    engine = {key: value for key, value in section_of("tokens_full").items() if key not in WORLD_OPTIONS}
+    for options, key in (
+        (engine, "simulator"),
+        (cfg["judge"]["text_world"], "judge.text_world"),
+    ):
+        with torch.device("meta"):
+            made = build(options, key, spec=spec)
+        assert sum(p.numel() for p in made.parameters() if p.requires_grad) == half_a_billion, key
 
 
 @pytest.mark.parametrize("name", ["forcing_small", "dit_small", "unet_small", "tokens_small", "gesim_tiny"])
