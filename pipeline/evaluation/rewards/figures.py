@@ -145,4 +145,6 @@ def cell(found: Mapping[str, Any], name: str) -> str:
     value = found[name]
     if value is None:
         return "-"
+    if isinstance(value, int):
+        return str(value)
     return f"{value:.2f}" if isinstance(value, float) else f"{value[0]:.2f} [{value[1]:.2f}, {value[2]:.2f}]"

@@ -16,6 +16,7 @@ FIGURES = (
     ("within", "Spearman within episodes"),
     ("pooled", "Spearman over all frames"),
     ("auc", "AUC of success"),
+    ("dropped", "not judged"),
 )
 
 

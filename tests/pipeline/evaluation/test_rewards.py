@@ -21,6 +21,7 @@ from pipeline.commands.worlds.rewards import Plan, compare_rewards
 from pipeline.config import load_config
 from pipeline.evaluation.judging import Scores
 from pipeline.evaluation.rewards.figures import BY_PHYSICS, BY_TIME, Truth, auc, by_rule, figures, truth_of
+from pipeline.evaluation.rewards.page import lines_of
 from pipeline.graph.graph import Graph
 from pipeline.stages.variant import variant_episodes
 from tests.commands import worldloop
@@ -70,6 +71,9 @@ def test_what_could_not_be_judged_is_counted_and_left_out() -> None:
     wild[0] = torch.rand(wild.shape[1], generator=torch.Generator().manual_seed(2))
     found = figures(RuleJudge(1), Scores(scores.success, wild, status), true, 0)
     assert found["dropped"] == 1 and found["within"][0] == pytest.approx(1.0)
+    row = {"facts": {}, "figures": {"recorded": found}}
+    ((*_, dropped),) = lines_of({"rewards": {"mine": row}})
+    assert dropped == "1"
 
 
 def test_what_is_past_an_episodes_end_does_not_count() -> None:
