@@ -55,8 +55,11 @@ class Cell:
 
     @property
     def error(self) -> float | None:
-        """Standard error of `estimated` over repeats; None of fewer than two."""
-        if len(self.rates) < 2:
+        """Standard error of `estimated` over repeats; None of fewer than two, and where all went alike, as in
+        a world without noise, whose repeats say nothing of how sure it is.
+        """
+        alike = bool((self.imagined == self.imagined[:1]).all() and (self.judged == self.judged[:1]).all())
+        if len(self.rates) < 2 or alike:
             return None
         return float(np.std(self.rates, ddof=1) / math.sqrt(len(self.rates)))
 
@@ -70,6 +73,19 @@ class Cell:
         if self.true is None:
             raise ValueError(f"nobody tried {self.policy} on {self.task} in physics")
         return float(self.true.float().mean())
+
+    @property
+    def matched(self) -> float:
+        """The true value on the starts that `estimated` speaks of, each as often as it was judged; NaN if
+        nothing could be judged. Where a judge abstains from hard starts, all starts would be unlike them.
+
+        Raises:
+            ValueError: where it is unknown.
+        """
+        if self.true is None:
+            raise ValueError(f"nobody tried {self.policy} on {self.task} in physics")
+        truth = [float(self.true[known].float().mean()) for known in self.judged if known.any()]
+        return float(np.mean(truth)) if truth else math.nan
 
     @property
     def table(self) -> dict[str, Any]:
@@ -97,7 +113,7 @@ class Cell:
 
 
 def agreement(cells: Sequence[Cell]) -> dict[str, Any]:
-    """How far estimated and true values agree, over all cells and in each task.
+    """How far estimated and true values agree on the starts that were judged, over all cells and in each task.
 
     Returns:
         policies, cells; pearson and spearman over cells, None where one side does not vary; mmrv, the mean
@@ -142,8 +158,8 @@ def _together(cells: Sequence[Cell], tasks: Sequence[Sequence[Cell]]) -> dict[st
 
 
 def _values(cells: Sequence[Cell]) -> tuple[np.ndarray, np.ndarray]:
-    """True and estimated values, float64 [N] each."""
-    return np.array([cell.value for cell in cells]), np.array([cell.estimated for cell in cells])
+    """True values on the judged starts and estimated ones, float64 [N] each."""
+    return np.array([cell.matched for cell in cells]), np.array([cell.estimated for cell in cells])
 
 
 def correlation(kind: Callable[..., Any], true: np.ndarray, estimated: np.ndarray) -> float | None:

@@ -61,6 +61,8 @@ def test_a_cell_knows_its_value_and_how_sure_it_is() -> None:
     assert one.estimated == 0.5 and one.error == pytest.approx(0.25)
     assert one.table == {"tp": 3, "fp": 1, "fn": 1, "tn": 3, "accuracy": 0.75}
     assert cell("a", "1100", "1000").error is None
+    assert cell("a", "1100", "1000", "1000").error is None  # a world without noise says nothing of errors
+    assert cell("a", "1100", "1000", "0100").error == 0.0
     with pytest.raises(ValueError, match="nobody tried a on push"):
         _ = cell("a", None, "1000").value
 
@@ -72,6 +74,14 @@ def test_what_the_judge_dropped_counts_for_nothing() -> None:
     assert some.table == {"tp": 1, "fp": 0, "fn": 0, "tn": 2, "accuracy": 1.0}
     nothing = Cell("b", "push", True, bools("11")[None], torch.zeros(1, 2, dtype=torch.bool), bools("11"))
     assert nothing.row()["estimated"] is None and agreement([nothing]) == {}
+
+
+def test_values_are_compared_on_the_starts_that_were_judged() -> None:
+    """A judge that abstains where the policy fails must not seem to under- or over-estimate it."""
+    judged = torch.tensor([[True, True, False, False], [True, False, True, False]])
+    some = Cell("a", "push", True, bools("1100").repeat(2, 1), judged, bools("1100"))
+    assert some.value == 0.5 and some.matched == some.estimated == pytest.approx(0.75)
+    assert agreement([some])["difference"] == 0.0 and some.row()["true_value"] == 0.5
 
 
 def test_kind_outside_and_hard_inside() -> None:
