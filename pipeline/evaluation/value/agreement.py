@@ -113,7 +113,7 @@ class Cell:
 
 
 def agreement(cells: Sequence[Cell]) -> dict[str, Any]:
-    """How far estimated and true values agree on the starts that were judged, over all cells and in each task.
+    """How far estimated and true values agree on the starts that were judged, over all cells and by task.
 
     Returns:
         policies, cells; pearson and spearman over cells, None where one side does not vary; mmrv, the mean

@@ -56,7 +56,7 @@ def test_values_beside_true_ones_and_nothing_is_tried_twice(tmp_path: Path) -> N
     assert list(rows) == ["policy", "policy + noise 0.5", "expert 0", "expert 1"]
     assert rows["expert 0"]["true_value"] == 1.0 and rows["expert 1"]["true_value"] == 0.0
     assert rows["policy"]["inside"] and not rows["policy + noise 0.5"]["inside"]
-    assert all(row["episodes"] == 6 and row["standard_error"] is not None for row in rows.values())
+    assert all(row["episodes"] == 6 and row["dropped"] == 0 for row in rows.values())
     table = result["agreement"]["micro"]
     assert sum(table[name] for name in ("tp", "fp", "fn", "tn")) == 24
     assert any("open loop" in note for note in result["notes"])
