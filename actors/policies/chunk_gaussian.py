@@ -143,7 +143,7 @@ class ChunkGaussianHead(Head):
         super().__init__()
         if not 1 <= knots <= chunk:
             raise ValueError(f"knots={knots} must be between 1 and task.chunk={chunk}")
-        self.chunk, self.knots, self.actions = chunk, knots, actions
+        self.chunk, self.knots, self.actions, self.std = chunk, knots, actions, std
         self.mean = nn.Linear(width, knots * actions)
         nn.init.normal_(self.mean.weight, std=1e-2)
         nn.init.zeros_(self.mean.bias)
@@ -191,6 +191,11 @@ class ChunkGaussianHead(Head):
     def scale_exploration(self, factor: float) -> None:
         """Multiply the spread."""
         self.log_std.add_(math.log(factor))
+
+    @property
+    def exploration(self) -> float:
+        """See Head.exploration: the geometric mean of all spreads says it."""
+        return math.exp(float(self.log_std.detach().mean())) / self.std
 
     def _gap(self, one: Tensor, other: Tensor) -> Tensor:
         active = (self.gain > 0).float()

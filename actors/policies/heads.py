@@ -52,6 +52,13 @@ class Head(nn.Module, abc.ABC):
     def scale_exploration(self, factor: float) -> None:
         """Multiply how widely chunks are drawn around the mode, which stays."""
 
+    @property
+    def exploration(self) -> float:
+        """How widely chunks are drawn, over how widely the config says; 1 where a step of the parameters moves
+        the distribution as far however widely it is drawn.
+        """
+        return 1.0
+
 
 def varying(chunks: Tensor, robot: Embodiment) -> Tensor:
     """Which numbers of an action vary in demonstrated chunks [N, K, A]: bool [A].

@@ -270,6 +270,11 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         """Multiply how widely chunks are drawn around the mode, which stays."""
         self.head.scale_exploration(factor)
 
+    @property
+    def exploration(self) -> float:
+        """See Head.exploration."""
+        return self.head.exploration
+
     def disagreement(self, one: TensorDictBase, other: TensorDictBase) -> Tensor:
         """By how much the head says something else of observations [B] than of others."""
         return self.head.apart(self.policy_features(one), self.policy_features(other))

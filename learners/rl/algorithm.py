@@ -40,7 +40,8 @@ class RLConfig:
         minibatch: transitions per update.
         microbatches: parts a minibatch is cut into, each with a backward pass of its own, to save memory or
             to be shared out to workers.
-        lr: learning rate of the policy at first; all rates fall to zero over the iterations, so that what is
+        lr: learning rate of the policy at first, if it explores as widely as its config says (else see
+            actors.policies.contract.rl_rate); all rates fall to zero over the iterations, so that what is
             deployed is not one moment of a random walk.
         clip: largest gradient norm of the policy, and of the critic.
         kl_stop: mean KL to the behaviour policy at which an iteration's epochs end early.

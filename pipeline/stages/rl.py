@@ -10,7 +10,7 @@ import torch
 from actors.factory import build_algorithm, build_policy, open_clips
 from actors.fleets.fleet import Fleet, FleetError
 from actors.fleets.launch import build_fleet
-from actors.policies.contract import action_key, freeze_perception
+from actors.policies.contract import action_key, freeze_perception, rl_rate
 from actors.process import prepare_process
 from actors.rollouts.recipe import Recipe
 from actors.world_config import rewards_of
@@ -63,7 +63,10 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     prepare_process(cfg["seed"], cfg["threads"])
     store = open_store(cfg, inputs)
     policy = build_policy(cfg, inputs.weights("policy"))
-    settings = rl_options(cfg, iterations=inputs.settings["iterations"], seed=cfg["seed"] * 100 + number)
+    lr = rl_rate(policy, cfg["rl"]["lr"])
+    settings = rl_options(
+        cfg, iterations=inputs.settings["iterations"], seed=cfg["seed"] * 100 + number, lr=lr
+    )
     anchor = Cloning(policy, store, successful_episodes(cfg, store, deployed), mode_of(cfg))
     if settings.freeze_perception:
         freeze_perception(policy)
@@ -102,7 +105,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
             fleet.close()
     save_weights(policy, folder)
     last = {f"last_{key}": value for key, value in stats.pop("last").items()}
-    return {**knew, **stats, **last}
+    return {"lr": lr, **knew, **stats, **last}
 
 
 def starts_of(cfg: Cfg, begun: int, extra: int) -> Starts:
@@ -164,7 +167,8 @@ def rl_in_physics(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, An
     prepare_process(cfg["seed"], cfg["threads"])
     iterations = inputs.settings["iterations"]
     policy = build_policy(cfg, inputs.weights("policy"))
-    settings = rl_options(cfg, iterations=iterations, anchor=0.0, seed=cfg["seed"] * 100)
+    lr = rl_rate(policy, cfg["rl"]["lr"])
+    settings = rl_options(cfg, iterations=iterations, anchor=0.0, seed=cfg["seed"] * 100, lr=lr)
     if settings.freeze_perception:
         freeze_perception(policy)
     algorithm = build_algorithm(cfg, policy)

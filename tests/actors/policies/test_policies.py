@@ -18,6 +18,7 @@ from actors.policies.contract import (
     imitation_loss,
     input_keys,
     inputs_for,
+    rl_rate,
     trained_part,
     with_text,
     writes_features,
@@ -100,6 +101,15 @@ def test_explores_more_narrowly_around_the_same_mode(name: str) -> None:
         policy.scale_exploration(4.0)
         again = distribution(policy, seen).entropy()
     assert bool((narrow < wide).all()) and torch.allclose(again, wide, atol=1e-3)
+
+
+@pytest.mark.parametrize(("name", "share"), [("chunk_gaussian", 0.25), ("chunk_tokens", 1.0)])
+def test_a_mean_steps_as_far_as_it_was_explored(name: str, share: float) -> None:
+    policy = policy_of(name, world_spec(ARM_DELTAS))
+    assert rl_rate(policy, 3e-4) == pytest.approx(3e-4)
+    policy.scale_exploration(0.25)
+    assert rl_rate(policy, 3e-4) == pytest.approx(share * 3e-4)
+    assert rl_rate(torch.nn.Identity(), 3e-4) == 3e-4  # of anybody's policy, which says nothing of it
 
 
 def said(policy: TensorDictModuleBase, observed: TensorDict, action: torch.Tensor) -> torch.Tensor:
