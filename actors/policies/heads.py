@@ -54,7 +54,7 @@ class Head(nn.Module, abc.ABC):
 
     @property
     def exploration(self) -> float:
-        """How widely chunks are drawn, over how widely the config says; 1 where a step of the parameters moves
+        """How widely chunks are drawn, over how widely the config says; 1 where a step of parameters moves
         the distribution as far however widely it is drawn.
         """
         return 1.0
