@@ -38,7 +38,9 @@ class RecordedDecisions:
         ConfigError: if the policy is scored on action tokens, which no recording holds.
 
     Chunks are those that were carried out. Some the robot's limits have cut short of what the policy said; it
-    would hardly ever say those, and they are left out.
+    would hardly ever say those, and they are left out. So are those, iteration by iteration, that the policy
+    would hardly say any more: a chunk at ten spreads from the mean pulls ten times as hard as one at a single
+    spread, and a few of them would say where all steps go.
     """
 
     def __init__(self, policy: TensorDictModuleBase, store: ClipStore, rollout: TensorDict, mode: ActionMode):
@@ -48,36 +50,39 @@ class RecordedDecisions:
         pick = (rollout["valid"] & rollout["whole"]).flatten()
         self.known = rollout.exclude("next", "valid", "whole").flatten(0, 1)[pick].cpu()
         self.known[CHUNK] = chunks_ahead(store, self.known["row"], mode)
-        usual = torch.cat([self._usual(part) for part in self.known.split(_AT_ONCE)])
-        self.known = self.known[usual]
+        usual = [self._likely(self._seen(some))[1] for some in self.known.split(_AT_ONCE)]
+        self.known = self.known[torch.cat(usual)]
 
     def __len__(self) -> int:
         return len(self.known)
 
     @torch.no_grad()
-    def _usual(self, some: TensorDict) -> torch.Tensor:
-        """Whether the policy might well have said the chunks of decisions [N]: bool [N]."""
-        seen = distribution(self.policy, inputs_for(self._seen(some), self.policy))
-        expected = torch.stack([seen.log_prob(seen.sample()) for _ in range(_SAMPLES)]).mean(0)
-        return (seen.log_prob(some[CHUNK].to(expected.device)) > expected - _UNLIKELY).cpu()
+    def _likely(self, seen: TensorDict) -> tuple[torch.Tensor, torch.Tensor]:
+        """How likely the policy finds the chunks of decisions [N], with what it reads: float32 [N]; and
+        whether it might well say them, bool [N].
+        """
+        device = device_of(self.policy)
+        said = distribution(self.policy, inputs_for(seen, self.policy))
+        likely = said.log_prob(seen[CHUNK].to(device))
+        # What is usual is told by the same draws each time, so that a resumed run tells the same.
+        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+            torch.manual_seed(0)
+            usual = torch.stack([said.log_prob(said.sample()) for _ in range(_SAMPLES)]).mean(0)
+        return likely.cpu(), (likely > usual - _UNLIKELY).cpu()
 
     def _seen(self, some: TensorDict) -> TensorDict:
         """Decisions [N] with what the policy reads: no pictures if it was left its features alone."""
         seen = observe(self.store, some["row"], pictures=IMAGE in self.policy.in_keys)
         return seen.update(some)
 
-    @torch.no_grad()
     def sample(self, count: int, like: TensorDict, generator: torch.Generator) -> TensorDict:
-        """Random ones, with the keys and on the device of the transitions `like`."""
-        some = self.known[torch.randperm(len(self.known), generator=generator)[:count]]
-        seen = self._seen(some)
-        device = device_of(self.policy)
-        likely = [
-            distribution(self.policy, inputs_for(part, self.policy)).log_prob(part[CHUNK].to(device)).cpu()
-            for part in seen.split(_AT_ONCE)
-        ]
+        """Random ones, `count` at most, that the policy might still say; with the keys and on the device of
+        the transitions `like`.
+        """
+        seen = self._seen(self.known[torch.randperm(len(self.known), generator=generator)[:count]])
+        likely, usual = zip(*(self._likely(some) for some in seen.split(_AT_ONCE)), strict=True)
         seen[LOG_PROB] = torch.cat(likely)
-        return seen.select(*like.keys(True, True)).to(device)
+        return seen[torch.cat(usual)].select(*like.keys(True, True)).to(device_of(self.policy))
 
 
 @dataclass(frozen=True)

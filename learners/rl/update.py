@@ -42,6 +42,7 @@ def update(
     known = None
     if true is not None and true.decisions is not None and config.recorded:
         known = trainee(true.decisions.sample, config.recorded, data, shuffle)
+        figures["recorded"] = float(len(known))
     sums: dict[str, float] = {}
     count, planned, reached = 0, 0, 0.0
     for _ in range(config.epochs):
@@ -86,7 +87,9 @@ def _loss(
 ) -> tuple[Tensor, dict[str, float]]:
     loss, row = algorithm.loss(minibatch)
     loss = config.imagined * loss
-    if known is not None:  # by itself, for its likelihood ratios do not say how far the policy has come
+    if known is not None and len(
+        known
+    ):  # by itself, for its likelihood ratios do not say how far the policy has come
         pick = torch.randint(len(known), (len(minibatch),), generator=generator)
         recorded_loss, recorded_figures = algorithm.loss(known[pick])
         loss = loss + recorded_loss

@@ -101,6 +101,29 @@ def test_a_sample_repeats_itself_and_is_scored_by_the_policy_of_now(tiny_store: 
     assert not torch.allclose(later[LOG_PROB], one[LOG_PROB], atol=1e-2)
 
 
+def test_decisions_that_the_policy_would_hardly_take_any_more_are_left_out(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    policy = policy_of("chunk_gaussian", store.spec, ActionMode.ABSOLUTE)
+    ppo, decisions = known(store, policy)
+    keys = like(policy, ppo)
+
+    def kept() -> TensorDict:
+        return decisions.sample(len(decisions), keys, torch.Generator().manual_seed(3))
+
+    everything, state = kept(), torch.get_rng_state()
+    assert len(everything) == len(decisions)
+    decisions.known[CHUNK][0] += 100.0 * decisions.known[CHUNK].std()
+    assert len(kept()) == len(decisions) - 1
+    with torch.no_grad():
+        for value in trained(policy):
+            value.fill_(-4.0)
+    few = kept()
+    assert len(few) < len(decisions) - 1
+    expected = distribution(policy, inputs_for(few, policy)).log_prob(few[CHUNK])
+    assert torch.allclose(few[LOG_PROB], expected, atol=1e-4)
+    assert torch.equal(torch.get_rng_state(), state)  # nobody else's draws change by it
+
+
 def test_with_frozen_perception_features_stand_for_pictures(tiny_store: Stores) -> None:
     store = tiny_store(ARM_DELTAS)
     policy = policy_of("chunk_gaussian", store.spec, ActionMode.ABSOLUTE)
