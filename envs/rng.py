@@ -88,6 +88,20 @@ def step_generator(seed: int, step: int, part: int = 0) -> torch.Generator:
     return _generator((seed * 1_000_003 + step + part * 7_368_787_000_003) & _MASK)
 
 
+class Shared(IntEnum):
+    """What is drawn once for all microbatches of a training step; each has numbers of its own."""
+
+    DEPTH = 1  # of the chunk in its clip that is learned from
+    STEPS = 2  # of a student's chunk, and the one of them that it learns
+
+
+def shared_generator(seed: int, step: int, drawn: Shared) -> torch.Generator:
+    """The generator of what all microbatches of a training step share: how often networks are run. Workers
+    gather weights together, so one that ran them more often would wait for the others for ever.
+    """
+    return step_generator(seed, step, -int(drawn))
+
+
 def update_seed(seed: int, iteration: int) -> int:
     """Seed of an RL iteration's minibatches, whatever collecting has used up."""
     return seed * 2_000_003 + iteration

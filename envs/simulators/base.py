@@ -84,7 +84,11 @@ class Simulator(nn.Module):
         raise NotImplementedError
 
     def loss(self, clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        """Training loss of a clip (see episodes/clips.py) and figures to log."""
+        """Training loss of a clip (see episodes/clips.py) and figures to log.
+
+        A clip of several chunks has depth float32 [], too, 0 to below 1 and the same for all: where among
+        them an engine learns that learns from one of them.
+        """
         raise NotImplementedError
 
     @classmethod

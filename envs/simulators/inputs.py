@@ -25,7 +25,7 @@ def build_inputs(
 
     Args:
         drawn: uint8 [B, number * K, V, 3, H, W], the model's own frames of the chunks before; memory then
-            shows these instead of true ones.
+            shows these instead of true ones. Later ones may follow, and are not looked at.
         generator: draws the noise seeds; without one they are zero.
     """
     size = clip.shape
@@ -63,14 +63,18 @@ def build_inputs(
 
 
 def own_frames(simulator: Simulator, clip: TensorDict, generator: torch.Generator) -> tuple[int, TensorDict]:
-    """A chunk of a clip, any of those that are not wholly past the end of every episode, and its inputs,
-    whose memory shows the simulator's own frames of the chunks before it.
+    """A chunk of a clip, and its inputs, whose memory shows the simulator's own frames of the chunks before.
+
+    Of the chunks that are not wholly past the end of every episode it is the one at clip["depth"]. As many
+    are predicted as lie before that depth in a clip without an end, used or not: all microbatches of a step
+    share the depth, and run the network as often, whatever episodes they hold.
     """
     chunk = simulator.spec.chunk
     whole = clip["future", "valid"].bool().any(0).unflatten(0, (-1, chunk)).any(1)
-    chosen = int(torch.randint(max(1, int(whole.long().sum())), (1,), generator=generator))
+    depth = float(clip["depth"][0]) if len(whole) > 1 else 0.0
+    chosen, before = int(depth * int(whole.sum())), int(depth * len(whole))
     own: Tensor | None = None
-    for number in range(chosen):
+    for number in range(before):
         with torch.no_grad():
             frames = simulator.predict(build_inputs(simulator.spec, clip, number, own, generator))[0]
         own = frames if own is None else torch.cat([own, frames], 1)

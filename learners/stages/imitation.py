@@ -30,6 +30,7 @@ from learners.stages.observed import observe
 from learners.stages.pictures import augment
 from learners.stages.simulator import last_rows
 from learners.training.fit import FitConfig, fit
+from learners.training.parallel import Trainee
 
 _STATE_NOISE = 0.05  # of each number's spread
 _AT_ONCE = 256  # frames per pass of `encode`
@@ -155,4 +156,5 @@ def train_imitation(
     def batch(step: int, generator: torch.Generator) -> TensorDict:
         return cloning.sample(options.part, generator)
 
-    return fit("imitation", policy, batch, loss, options, folder)
+    # A policy is a list of parts that are asked for more than their forward pass.
+    return fit("imitation", Trainee(policy, apart=False), batch, loss, options, folder)

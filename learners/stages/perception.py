@@ -25,6 +25,7 @@ from learners.stages.judge import frame_targets
 from learners.stages.observed import observe
 from learners.stages.traces import Hands, trace_loss
 from learners.training.fit import FitConfig, fit
+from learners.training.parallel import Trainee
 
 _TRACES = 0.1  # weight of where hands will be, beside the others
 _SPREAD = 1e-3  # of a number of the chunk below which it is a constant that nobody need predict
@@ -135,4 +136,6 @@ def train_perception(
         seen = with_text(observed, policy)  # type: ignore[arg-type]
         return tasks.loss(seen, data["target"], data["progress"], data.get("hands", None))
 
-    return fit("perception", tasks, batch, loss, options, folder, watch="action_error")
+    # A policy is a list of parts that are asked for more than their forward pass.
+    trainee = Trainee(tasks, apart=False)
+    return fit("perception", trainee, batch, loss, options, folder, watch="action_error")

@@ -17,7 +17,7 @@ from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
 from envs.episodes.episode import EpisodeError
 from envs.ranges import Count, Natural, Share
-from envs.rng import step_generator
+from envs.rng import Shared, shared_generator, step_generator
 from envs.simulators.base import Simulator
 from learners.training.fit import FitConfig, fit
 from learners.training.lora import low_rank
@@ -110,7 +110,9 @@ class ClipBatches:
     newest: Tensor | None = None
 
     def __call__(self, step: int, generator: torch.Generator) -> TensorDict:
-        """The clips [B] of one microbatch of a step."""
+        """The clips [B] of one microbatch of a step: what ClipStore.clips says, and depth float32 [], how far
+        into their chunks they are learned from, 0 to below 1: the same for all microbatches of the step.
+        """
         config = self.config
         chunks = 1 if step < config.single_chunk_fraction * self.options.steps else config.unroll
         count = max(1, self.options.part // chunks)
@@ -120,7 +122,10 @@ class ClipBatches:
         parts = list(self._sampled(self.episodes, count - recent, chunks, first, generator))
         if newest is not None:
             parts += self._sampled(newest, recent, chunks, first + count - recent, generator)
-        return torch.cat(parts) if len(parts) > 1 else parts[0]
+        clips: TensorDict = torch.cat(parts) if len(parts) > 1 else parts[0]
+        drawn = shared_generator(self.options.seed, step, Shared.DEPTH)
+        clips["depth"] = torch.rand(1, generator=drawn).expand(clips.shape)
+        return clips
 
     def _sampled(
         self, episodes: Tensor, count: int, chunks: int, first: int, generator: torch.Generator

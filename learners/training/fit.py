@@ -102,7 +102,7 @@ def _rate(config: FitConfig, step: int) -> float:
 
 def fit(
     name: str,
-    module: nn.Module,
+    module: nn.Module | Trainee,
     batch: Batch,
     loss: Callable[[Any, torch.Generator], tuple[Tensor, dict[str, Any]]],
     config: FitConfig,
@@ -115,7 +115,8 @@ def fit(
 
     Args:
         name: shown in the progress bar and used as the metrics' prefix.
-        module: what is trained; parameters without gradient are left alone.
+        module: what is trained; parameters without gradient are left alone. A Trainee, where it is to be
+            gathered otherwise than those are by default.
         batch: (step, generator) -> config.part samples of anything `loss` understands; made ahead in another
             thread, see ahead.py.
         loss: (batch, generator) -> scalar loss and figures to log.
@@ -136,10 +137,10 @@ def fit(
     """
     folder.mkdir(parents=True, exist_ok=True)
     checkpoints, log = Checkpoints(folder), folder / "metrics.jsonl"
-    device = next(module.parameters()).device
-    trainee, mine = Trainee(module), my_share(config.microbatches)
-    trained = trainee.trained
-    hidden = getattr(module, "hidden", ())
+    trainee = module if isinstance(module, Trainee) else Trainee(module)
+    network, mine, trained = trainee.module, my_share(config.microbatches), trainee.trained
+    device = next(network.parameters()).device
+    hidden = getattr(network, "hidden", ())
     optimise = optimise or partial(OPTIMISERS[config.optimiser], hidden=hidden)
     optimisers = optimise(trained, config.lr, config.weight_decay)
     average = twin(trained)
@@ -149,7 +150,7 @@ def fit(
     def state() -> dict[str, Any]:
         return {
             "module": trainee.parameters,
-            "buffers": buffers_of(module),
+            "buffers": buffers_of(network),
             "average": average,
             "optimiser": optimiser_state(optimisers, trained),
         }
@@ -160,7 +161,7 @@ def fit(
         first, spent, smooth = int(facts["step"]), dict(facts["spent"]), facts["smooth"]
     if leads():
         truncate_log(log, first)
-    module.train()
+    network.train()
     bar = tqdm(
         total=config.steps,
         initial=first,
@@ -223,7 +224,7 @@ def fit(
             due = (step + 1) % config.checkpoint_every == 0 or step + 1 == config.steps
             # before the checkpoint: whoever goes on from there does not look at that step again
             if due and look is not None:
-                with averaged_weights(module, trained, average if config.ema else {}):
+                with averaged_weights(network, trained, average if config.ema else {}):
                     trainee(look, step + 1)
             if stop or due:
                 stream.flush()
@@ -240,7 +241,7 @@ def fit(
             for key, parameter in trained.items():
                 parameter.copy_(average[key])
     trainee.release()
-    module.eval()
+    network.eval()
     return {
         **{f"{key}_seconds": value for key, value in spent.items()},
         "samples_per_second": config.steps * config.batch / max(1e-9, sum(spent.values())),

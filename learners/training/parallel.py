@@ -10,6 +10,7 @@ started by pipeline/graph/workers.py.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -21,8 +22,8 @@ from torch.distributed.tensor import DTensor
 
 T = TypeVar("T")
 
-# Parameters from which on a block of a module list is gathered by itself; below, a round of messages costs
-# more than the memory it saves.
+# Parameters from which on a block of a module list is gathered by itself, with the lists inside it; below, a
+# round of messages costs more than the memory it saves.
 BLOCK = 500_000
 
 
@@ -114,15 +115,20 @@ class _Scope(nn.Module):
 
 class _Block(nn.Module):
     """Stands around a block that is gathered by itself, so that the block comes out of training as it went
-    in.
+    in. The block's methods are its own, and run while it is gathered.
     """
 
     def __init__(self, block: nn.Module):
         super().__init__()
         self.block = block
 
-    def forward(self, *arguments: Any, **named: Any) -> Any:
-        return self.block(*arguments, **named)
+    def forward(self, *arguments: Any, method: str = "__call__", **named: Any) -> Any:
+        return getattr(self.block, method)(*arguments, **named)
+
+    def __getattr__(self, name: str) -> Any:
+        if name != "block" and callable(getattr(type(self.block), name, None)):
+            return partial(self, method=name)
+        return super().__getattr__(name)
 
 
 class Trainee:
@@ -132,8 +138,8 @@ class Trainee:
 
     Args:
         module: all of whose parameters belong to the training, frozen ones included.
-        apart: whether large blocks are gathered one by one, each as it runs. Functions that read weights of
-            blocks which they do not run want all of them whole.
+        apart: whether large blocks are gathered one by one, each as it or a method of it runs. Functions
+            that ask a block for anything else, such as its weights, want all of them whole.
     """
 
     def __init__(self, module: nn.Module, apart: bool = True):
@@ -144,6 +150,7 @@ class Trainee:
             for attribute, parameter in owner.named_parameters(recurse=False):
                 name = names.setdefault(id(parameter), f"{prefix}.{attribute}" if prefix else attribute)
                 self._homes.setdefault(name, []).append((owner, attribute))
+        self._strides = {name: value.stride() for name, value in self.parameters.items()}
         self._wrapped: list[tuple[nn.ModuleList, int, nn.Module]] = []
         self._scope = _Scope(module)
         if workers() > 1:
@@ -151,9 +158,13 @@ class Trainee:
 
     def _shard(self) -> None:
         mesh = init_device_mesh(_device(), (workers(),))
+        for parameter in self.module.parameters():  # FSDP2 takes no other layout, such as channels_last
+            parameter.data = parameter.data.contiguous()
+        inside = set[nn.Module]()  # of a block; FSDP2 takes no parameter into two groups
         for blocks in [m for m in self.module.modules() if self.apart and isinstance(m, nn.ModuleList)]:
             for number, block in enumerate(blocks):
-                if sum(p.numel() for p in block.parameters()) >= BLOCK:
+                if blocks not in inside and sum(p.numel() for p in block.parameters()) >= BLOCK:
+                    inside.update(block.modules())
                     self._wrapped.append((blocks, number, block))
                     blocks[number] = _Block(block)
                     fully_shard(blocks[number], mesh=mesh, reshard_after_forward=True)
@@ -177,9 +188,13 @@ class Trainee:
         if workers() == 1:
             return
         for name, shard in self.parameters.items():
-            value = nn.Parameter(whole(shard.detach()).clone(), requires_grad=shard.requires_grad)
+            value = whole(shard.detach())
+            laid = torch.empty_strided(
+                value.shape, self._strides[name], dtype=value.dtype, device=value.device
+            ).copy_(value)
+            parameter = nn.Parameter(laid, requires_grad=shard.requires_grad)
             for owner, attribute in self._homes[name]:
-                setattr(owner, attribute, value)
+                setattr(owner, attribute, parameter)
         for blocks, number, block in self._wrapped:
             blocks[number] = block
 

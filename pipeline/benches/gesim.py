@@ -1,5 +1,5 @@
-"""worldloop bench gesim: seconds a chunk of a GE-Sim world with random weights, where they go, and what the
-silicon would allow.
+"""worldloop bench gesim: seconds a chunk of a GE-Sim world and its state expert with random weights, where
+they go, and what the silicon would allow.
 
 On a GPU (launch.device) it is the 2B configuration at 3 x 384 x 512 and 25 frames; elsewhere the same code at
 a small size, and for the 2B one its floor: floating-point operations and bytes, counted on the network itself
@@ -12,6 +12,7 @@ import resource
 import shutil
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -23,8 +24,9 @@ from envs.embodiment import ActionKind, Arm, Camera, Embodiment, Robot
 from envs.precision import mixed_precision
 from envs.rng import constant_generator, seed_process
 from envs.simulators.gesim.engine import GESimulator
+from envs.simulators.gesim.state_expert import GESimStateExpert
 from envs.specs import WorldSpec
-from pipeline.benches.gesim_floor import GOAL, floor
+from pipeline.benches.gesim_floor import GOAL, PROMPT, floor
 
 _JOINTS = tuple(f"{side}_joint_{k}" for side in ("left", "right") for k in range(8))
 # GE-Sim's robot; what its kinematics are does not matter where pose maps are given.
@@ -56,9 +58,11 @@ _TRAINING = {"shift": 1.0, "foreground": 0.0, "augment": 0.0, "checkpointing": F
 
 
 def build(spec: WorldSpec, net: dict[str, Any], vae: dict[str, Any]) -> GESimulator:
-    """GE-Sim with random weights and the released sampler."""
+    """GE-Sim with random weights, the released sampler and a prompt as long as the floor's."""
     sampling = {"kind": "distilled", "steps": 0}
-    return GESimulator(spec, _MEMORY, None, "right", sampling, _TRAINING, {"net": net, "vae": vae})
+    world = GESimulator(spec, _MEMORY, None, "right", sampling, _TRAINING, {"net": net, "vae": vae})
+    world.prompt = torch.zeros(1, PROMPT, world.net.shape.text_embed_dim)
+    return world
 
 
 def _inputs(world: GESimulator, batch: int, device: torch.device) -> tuple[TensorDict, TensorDict]:
@@ -131,6 +135,27 @@ class Watch:
         return min(times)
 
 
+@dataclass(frozen=True)
+class Served:
+    """A world and its state expert, as they are served, on the watch's device."""
+
+    world: GESimulator
+    expert: GESimStateExpert
+    watch: Watch
+
+    def step(self, state: TensorDict, future: TensorDict) -> None:
+        """One chunk of sessions that stay as they are."""
+        _, features, after = self.world.step(state.clone(), future)
+        with torch.no_grad():
+            self.expert.follow(after, self.world.spec.chunk, features)
+
+    def seconds(self, batch: int, repeats: int) -> float:
+        """Least seconds of a chunk of so many sessions."""
+        state, future = _inputs(self.world, batch, self.watch.device)
+        with mixed_precision(self.watch.device, True):
+            return self.watch.measure(partial(self.step, state, future), repeats)
+
+
 def gesim(cfg: Mapping[str, Any]) -> None:
     """Seconds a chunk and frames per second at batch 1, 2, 4, 8, memory, parts, and variants, each as a ratio
     to the plain run; on launch.device.
@@ -142,22 +167,21 @@ def gesim(cfg: Mapping[str, Any]) -> None:
     big = device.type == "cuda"
     seed_process(0)
     spec, sizes = (FULL, ({}, {})) if big else (SMALL, (SMALL_NET, SMALL_VAE))
-    world = build(spec, *sizes).to(device).eval()
-    if big:
-        world.to(torch.bfloat16)
-    count = sum(p.numel() for p in world.net.parameters())
+    world = build(spec, *sizes)
+    expert = GESimStateExpert(world, None)
+    for part in (world, expert):
+        part.to(device, torch.bfloat16 if big else torch.float32).eval()
+    served = Served(world, expert, Watch(device))
+    count = sum(p.numel() for part in (world.net, expert) for p in part.parameters())
     chip = torch.cuda.get_device_name(device) if big else "CPU"
     size = f"{spec.views} x {spec.size[0]} x {spec.size[1]}"
     print(f"{count / 1e6:.0f}M parameters, {size}, {spec.chunk} frames, {chip}")
-    watch = Watch(device)
     repeats = 5 if big else 2
     plain = 0.0
     for batch in (1, 2, 4, 8):
         if big:
             torch.cuda.reset_peak_memory_stats(device)
-        state, future = _inputs(world, batch, device)
-        with mixed_precision(device, True):
-            seconds = watch.measure(partial(_step, world, state, future), repeats)
+        seconds = served.seconds(batch, repeats)
         memory = (
             torch.cuda.max_memory_allocated(device) / 2**30
             if big
@@ -169,32 +193,30 @@ def gesim(cfg: Mapping[str, Any]) -> None:
             f"batch {batch}: {seconds:.2f} s a chunk{note}, {batch * spec.chunk / seconds:.1f} frames/s,"
             f" {plain * batch / seconds:.2f}x the frames per second of batch 1, {memory:.1f} GiB at most"
         )
-    _parts(world, device, watch)
-    _variants(world, device, watch, plain, repeats)
+    _parts(served)
+    _variants(served, plain, repeats)
     floor(FULL, _MEMORY, chip)
 
 
-def _step(world: GESimulator, state: TensorDict, future: TensorDict) -> None:
-    """One chunk of sessions that stay as they are."""
-    world.step(state.clone(), future)
-
-
-def _parts(world: GESimulator, device: torch.device, watch: Watch) -> None:
+def _parts(served: Served) -> None:
     """Where the seconds of one chunk go at batch 1."""
-    state, future = _inputs(world, 1, device)
+    world, watch = served.world, served.watch
+    state, future = _inputs(world, 1, watch.device)
     names = (
         (world, "encode_stills", "memory encoded"),
         (world, "conditioning", "conditioning"),
+        (world.net, "text_keys", "prompt read"),
+        (world, "noise", "noise"),
         (world, "_run", "trunk"),
         (world, "decode", "chunk decoded"),
-        (world, "_noise", "noise"),
+        (served.expert, "follow", "state expert"),
     )
-    with mixed_precision(device, True):
-        _step(world, state, future)
+    with mixed_precision(watch.device, True):
+        served.step(state, future)
         undo = [watch.wrap(*name) for name in names]
         watch.spent.clear()
         began = watch._now()
-        _step(world, state, future)
+        served.step(state, future)
         total = watch._now() - began
     for call in undo:
         call()
@@ -208,32 +230,29 @@ def _parts(world: GESimulator, device: torch.device, watch: Watch) -> None:
     )
 
 
-def _variants(world: GESimulator, device: torch.device, watch: Watch, plain: float, repeats: int) -> None:
+def _variants(served: Served, plain: float, repeats: int) -> None:
     """What single changes are worth at batch 1."""
-    state, future = _inputs(world, 1, device)
+    world = served.world
 
     def ratio(name: str) -> None:
-        with mixed_precision(device, True):
-            seconds = watch.measure(partial(_step, world, state, future), repeats)
+        seconds = served.seconds(1, repeats)
         print(f"  {name}: {seconds:.2f} s, {plain / seconds:.2f}x")
 
     print("one change at a time, against the plain run:")
-    known = world.net._known
-    # type: ignore[method-assign, assignment]
-    blocks_of: Any = world.net
-    blocks_of._known = lambda text, batch: [text[:1].repeat(batch, 1, 1)] * len(blocks_of.transformer_blocks)
+    net: Any = world.net
+    blocks, keys = list(net.transformer_blocks), net.text_keys
+    net.text_keys = lambda text: [text.repeat(world.spec.views, 1, 1)] * len(blocks)
     ratio("the text's keys computed anew for every view, block and step")
-    world.net._known = known  # type: ignore[method-assign]
+    net.text_keys = keys
     codec: Any = world.codec
     pixels, codec.pixels = codec.pixels, 1
     ratio("views encoded and decoded one after another")
     codec.pixels = pixels
-    if device.type == "cuda" or shutil.which("g++"):
-        blocks = list(world.net.transformer_blocks)
+    if served.watch.device.type == "cuda" or shutil.which("g++"):
         for number, block in enumerate(blocks):
-            world.net.transformer_blocks[number] = torch.compile(block)  # type: ignore[assignment]
+            net.transformer_blocks[number] = torch.compile(block)
         ratio("blocks compiled (torch.compile)")
         for number, block in enumerate(blocks):
-            world.net.transformer_blocks[number] = block
+            net.transformer_blocks[number] = block
     else:
         print("  torch.compile was not tried: this machine has no C++ compiler")

@@ -14,6 +14,7 @@ from envs.simulators.dit.shape import DiTShape
 from envs.simulators.dit.state_network import StateDiT
 from envs.specs import WorldSpec
 
+PROMPT = 512  # tokens of the text that GE-Sim's trunk reads
 # Dense bf16 FLOP/s and bytes/s of what the goal is set for (NVIDIA's data sheets).
 CHIPS = {"H100": (989e12, 3.35e12), "H200": (989e12, 4.8e12)}
 GOAL, _GOAL_CHIP = 1.15, "H200"  # s a chunk at batch 1 on one of these
@@ -30,12 +31,12 @@ def count_flops(
     height, width = spec.size[0] // 8, spec.size[1] // 8
     with torch.device("meta"):
         expert = StateDiT(net)
-        trunk = MultiViewDiT(net)  # not eval: what it keeps between steps has no meaning without numbers
+        trunk = MultiViewDiT(net)
         codec = AutoencoderKLWan(**vae).eval()
         z = torch.zeros(spec.views, net.in_channels, memory + latents, height, width)
         times, text = (
             torch.zeros(spec.views, memory + latents),
-            torch.zeros(1, 512, net.text_embed_dim),
+            torch.zeros(1, PROMPT, net.text_embed_dim),
         )
         states, state_times = (
             torch.zeros(1, 2 * memory + 2 * spec.chunk, net.pose_in_channels),
@@ -51,13 +52,14 @@ def count_flops(
             out = work()
         return float(counter.get_total_flops()), out
 
-    once, (_, fused) = counted(lambda: trunk(z, times, text, spec.fps))
+    read, prompt = counted(lambda: trunk.text_keys(text))
+    once, (_, fused) = counted(lambda: trunk(z, times, prompt, spec.fps))
     keys, known = counted(lambda: expert.feature_keys(fused.unflatten(0, (-1, spec.views))))
     decoding, _ = counted(lambda: expert(states, state_times, known))
     encoded, _ = counted(lambda: codec.encode(still).latent_dist.mode())
     decoded, _ = counted(lambda: codec.decode(clip))
     return {
-        "trunk": steps * once,
+        "trunk": read + steps * once,
         "state expert": keys + steps * decoding,
         "memory encoded": spec.views * memory * encoded,
         "chunk decoded": spec.views * decoded,

@@ -8,6 +8,7 @@ import torch
 
 from envs.rng import (
     Purpose,
+    Shared,
     Stream,
     constant_generator,
     episode_rng,
@@ -19,6 +20,7 @@ from envs.rng import (
     resampling_generator,
     sampling_seed,
     seed_process,
+    shared_generator,
     step_generator,
     update_seed,
 )
@@ -51,6 +53,7 @@ def test_a_start_is_what_the_seed_alone_draws() -> None:
 def test_generators_of_chunks_steps_and_iterations() -> None:
     assert drawn(noise_generator(9, 2)) == drawn(iteration_generator(9, 2)) == [252, 120, 984, 977]
     assert drawn(step_generator(9, 2, 1)) == [386, 313, 466, 870]
+    assert [drawn(shared_generator(9, 2, shared))[:2] for shared in Shared] == [[905, 623], [482, 556]]
     assert (update_seed(9, 2), sampling_seed(9, 2, 3)) == (18_000_029, 3_000_071_294)
     seed_process(4)
     assert torch.randint(1000, (4,)).tolist() == [530, 694, 631, 773]

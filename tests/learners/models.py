@@ -14,7 +14,8 @@ from envs.simulators.base import WORLD_OPTIONS, Simulator
 from envs.simulators.dit.engine import DiTSimulator
 from envs.simulators.state_experts.base import StateDecoder
 from envs.specs import ActionMode, WorldSpec
-from envs.targets import build
+from envs.targets import build, target
+from tests.sections import offered
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 POLICIES = ("chunk_gaussian", "chunk_tokens", "tiny_vla")
@@ -48,6 +49,31 @@ def distilled(spec: WorldSpec, steps: int = 2) -> Simulator:
     section = section_of("simulator", "dit_small")
     own = {key: value for key, value in section.items() if key not in WORLD_OPTIONS}
     return build(DiTSimulator.student_section(own, steps), "simulator", spec=spec)  # type: ignore[no-any-return]
+
+
+def stepwise_engines() -> list[str]:
+    """The small configs of configs/simulator whose engine denoises in steps."""
+    small = [name for name in offered("simulator") if name.endswith(("_small", "_tiny"))]
+    kinds = {name: target(section_of("simulator", name), "simulator") for name in small}
+    return [name for name in small if hasattr(kinds[name], "few_steps")]
+
+
+def stepwise_pair(name: str, spec: WorldSpec) -> tuple[Simulator, Simulator]:
+    """An untrained teacher of four steps whose frames are not trivial, and a student of two."""
+    own = {k: v for k, v in section_of("simulator", name).items() if k not in WORLD_OPTIONS}
+    if "sampling" in own:
+        own["sampling"] = {"kind": "edm", "steps": 4}
+    torch.manual_seed(0)
+    teacher: Simulator = build(own, "simulator", spec=spec)
+    few = target(own, "simulator").student_section(own, 2)  # type: ignore[attr-defined]
+    student: Simulator = build(few, "simulator", spec=spec)
+    with torch.no_grad():
+        for parameter in teacher.parameters():
+            # what begins at zero, or near it, makes frames that nothing moves
+            if float(parameter.abs().max()) < 0.02:
+                parameter.normal_(std=0.05)
+    student.load_state_dict(teacher.state_dict())
+    return teacher, student
 
 
 def decoder_of(name: str, simulator: Simulator) -> StateDecoder:

@@ -48,11 +48,15 @@ class VisionBlock(nn.Module):
         shift, scale, gate = self.norm3.parts(embedded, temb)
         return _add_gated(x, gate, self.ff(self.norm3(x, shift, scale)))
 
+    def text_keys(self, text: Tensor) -> tuple[Tensor, Tensor]:
+        """Keys and values of a prompt [B, L, D]."""
+        return self.attn2.keys_of(text)
+
     def _read_text(
         self, x: Tensor, text: Tensor | tuple[Tensor, Tensor], embedded: Tensor, temb: Tensor
     ) -> Tensor:
         shift, scale, gate = self.norm2.parts(embedded, temb)
-        known = self.attn2.keys_of(text) if isinstance(text, Tensor) else text
+        known = self.text_keys(text) if isinstance(text, Tensor) else text
         if known[1].shape[2] == 1:
             return _add_gated(x, gate, self.attn2.of_one_token(known[1]))
         return _add_gated(x, gate, self.attn2(self.norm2(x, shift, scale), known=known))

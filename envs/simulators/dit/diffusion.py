@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -40,9 +41,11 @@ class Given:
         channels: beside the latents, [B, V, C', M + T', h, w].
         actions: action vectors [B, M + T', action_size], of a network that reads them.
         fps: shown frames per second, one for all or [B].
+        text: prompt [1, L, D], or its keys and values for every block; None of a network that reads none.
     """
 
     memory: Tensor
     channels: Tensor
     actions: Tensor | None
     fps: float | Tensor
+    text: Tensor | Sequence[tuple[Tensor, Tensor]] | None

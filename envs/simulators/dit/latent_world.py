@@ -202,7 +202,11 @@ class LatentWorld(Simulator):
         stride = inputs["stride"]
         alike = bool((stride == stride[0]).all())  # as in sessions: one set of positions serves all
         fps = self.spec.fps / (int(stride[0]) if alike else stride)
-        return Given(memory, self.conditioning(inputs, latent_hw), self.actions(inputs), fps)
+        # In training each step reads the prompt itself: its keys keep gradients of that step alone.
+        text: Tensor | list[tuple[Tensor, Tensor]] | None = self.prompt
+        if self.prompt is not None and not (self.training or torch.is_grad_enabled()):
+            text = self.net.text_keys(self.prompt)
+        return Given(memory, self.conditioning(inputs, latent_hw), self.actions(inputs), fps, text)
 
     def _weight(self, truth: Tensor, valid: Tensor) -> Tensor:
         """Loss weights [B, V, 1, T', h, w] of true frames [B, K, V, 3, H, W] and valid [B, K]."""
@@ -224,7 +228,7 @@ class LatentWorld(Simulator):
         output, fused = self.net(
             latents.flatten(0, 1),
             self.diffusion.time_scale * steps.repeat_interleave(views, 0),
-            None if self.prompt is None else self.prompt.expand(len(future), -1, -1),
+            given.text,
             given.fps.repeat_interleave(views, 0) if isinstance(given.fps, Tensor) else given.fps,
             None if actions is None else actions.repeat_interleave(views, 0),
             layers,

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from envs.simulators.dit.blocks import VisionBlock
-from envs.simulators.dit.layers import AdaLN, Attention, RMSNorm, TimestepMLP, sinusoid
+from envs.simulators.dit.layers import AdaLN, RMSNorm, TimestepMLP, sinusoid
 from envs.simulators.dit.shape import DiTShape, video_rope
 
 
@@ -82,7 +82,6 @@ class MultiViewDiT(nn.Module):
     def __init__(self, shape: DiTShape):
         super().__init__()
         self.shape, self.checkpointing = shape, False
-        self._text: tuple[Tensor, int, list[tuple[Tensor, Tensor]]] | None = None
         width, patch = shape.width, math.prod(shape.patch_size)
         self.stem = Stem(shape.in_channels, shape.stem) if shape.stem else nn.Identity()
         channels = shape.in_channels + shape.stem + shape.concat_padding_mask
@@ -102,7 +101,7 @@ class MultiViewDiT(nn.Module):
         self,
         latents: Tensor,
         timestep: Tensor,
-        text: Tensor | None,
+        text: Tensor | Sequence[tuple[Tensor, Tensor]] | None,
         fps: float | Tensor,
         actions: Tensor | None = None,
         layers: list[Tensor] | None = None,
@@ -113,7 +112,8 @@ class MultiViewDiT(nn.Module):
             latents: [B * V, C, T, H, W] latents with their conditioning channels, views of a session side by
                 side.
             timestep: [B * V, 1, T, 1, 1] or [B * V, T] noise level of every latent frame.
-            text: [B, L, D] or [B * V, L, D] prompt embedding; None where the network reads no text.
+            text: [1, L, D], [B, L, D] or [B * V, L, D] prompt embedding, or what `text_keys` made of one;
+                None where the network reads no text.
             fps: of the video, or [B * V] of each.
             actions: [B * V, T, action_size] action vector of every latent frame, embedded and added to the
                 time step's embedding, which modulates every block (adaLN); None where there are none.
@@ -163,36 +163,16 @@ class MultiViewDiT(nn.Module):
         of_views = self.view_ada(self.view_embed).repeat(batch // self.shape.views, 1)
         return embedded, temb + of_views[:, None]
 
-    def _known(self, text: Tensor | None, batch: int) -> Sequence[Tensor | tuple[Tensor, Tensor] | None]:
-        """The text for every block. Sessions that share one prompt share its keys and values, which outside
-        training are computed once.
-        """
-        if text is None:
-            return [None] * len(self.transformer_blocks)
-        if len(text) > 1 and text.stride(0):
-            return [text.repeat_interleave(batch // len(text), 0)] * len(self.transformer_blocks)
-        one = text[:1]
-        if torch.is_grad_enabled() or self.training:
-            return [one] * len(self.transformer_blocks)
-        if self._text is None or self._text[0].data_ptr() != one.data_ptr() or self._text[1] != self._stamp():
-            self._text = (one, self._stamp(), [attention.keys_of(one) for attention in self._to_text()])
-        return self._text[2]
+    def text_keys(self, text: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Keys and values of a prompt [1, L, D] for every block: the same for all views and steps."""
+        return [cast(VisionBlock, block).text_keys(text) for block in self.transformer_blocks]
 
-    def _to_text(self) -> list[Attention]:
-        return [cast(VisionBlock, block).attn2 for block in self.transformer_blocks]
-
-    def _stamp(self) -> int:
-        """Changes whenever weights do that the kept keys depend on, and with the precision they are computed
-        in.
-        """
-        precision = torch.is_autocast_enabled(self.view_embed.device.type)
-        return hash(
-            (
-                precision,
-                *(
-                    (p.data_ptr(), p._version)
-                    for attention in self._to_text()
-                    for p in attention.parameters()
-                ),
-            )
-        )
+    def _known(
+        self, text: Tensor | Sequence[tuple[Tensor, Tensor]] | None, batch: int
+    ) -> Sequence[Tensor | tuple[Tensor, Tensor] | None]:
+        """The text for every block."""
+        if not (text is None or isinstance(text, Tensor)):
+            return text
+        if text is not None and len(text) > 1:
+            text = text.repeat_interleave(batch // len(text), 0)
+        return [text] * len(self.transformer_blocks)

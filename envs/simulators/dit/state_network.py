@@ -41,6 +41,10 @@ class StateBlock(nn.Module):
         self.ff = FeedForward(width, 4.0, bias=True, approximate="tanh")
         self.scale_shift_table = nn.Parameter(torch.randn(6, width) / width**0.5)
 
+    def feature_keys(self, context: Tensor) -> tuple[Tensor, Tensor]:
+        """Keys and values of features [B, L, width]."""
+        return self.attn2.keys_of(context)
+
     def forward(
         self, x: Tensor, context: tuple[Tensor, Tensor], temb: Tensor, rope: tuple[Tensor, Tensor]
     ) -> Tensor:
@@ -84,7 +88,7 @@ class StateDiT(nn.Module):
     def feature_keys(self, features: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Keys and values of features [B, V, L, width] for every block, the same at all steps."""
         context = features.flatten(1, 2)
-        return [cast(StateBlock, block).attn2.keys_of(context) for block in self.pose_blocks]
+        return [cast(StateBlock, block).feature_keys(context) for block in self.pose_blocks]
 
     def forward(
         self,

@@ -75,7 +75,7 @@ class DMD2(Method):
         students = turn.step % (self.critic_updates + 1) == self.critic_updates
         with torch.set_grad_enabled(students):
             inputs, weight = self.student.chunk_of(turn.clip, generator)
-            made = self.generated(inputs, generator)
+            made = self.generated(inputs, turn.step)
         known = (weight > 0).to(made.latents.dtype)  # nothing is asked past an episode's end
         if students:
             value = self._matching(made, inputs, known, generator)

@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from envs.rng import Shared, shared_generator
 from envs.simulators.stepwise import Stepwise
 from learners.training.fit import FitConfig
 from learners.training.optimisers import OPTIMISERS, Parameters
@@ -23,7 +24,7 @@ class Turn:
     """A microbatch, and whose turn it is.
 
     Args:
-        clip: [B], see ClipStore.clips.
+        clip: [B], see ClipBatches.
         step: of training.
     """
 
@@ -67,14 +68,18 @@ class Method(nn.Module):
         """The optimisers of what learns, as `fit` takes them; hidden layers are the student's own."""
         return OPTIMISERS[self.config.optimiser](trained, lr, weight_decay, self.student.hidden)
 
-    def generated(self, inputs: TensorDict, generator: torch.Generator) -> Generated:
-        """What the student makes of a chunk.
+    def generated(self, inputs: TensorDict, step: int) -> Generated:
+        """What the student makes of a chunk at a step of training.
 
         Of a random number of steps, one to all of its own, it learns at a random one: what this step sees
         comes from the student's own steps before, with the same noise each time, as when it samples (DMD2's
-        backward simulation). Only the last of these calls keeps gradients.
+        backward simulation). Both numbers are those of all microbatches of the step. Only the last of these
+        calls keeps gradients.
+
+        Args:
+            inputs: of `predict`, [B].
         """
-        student = self.student
+        student, generator = self.student, shared_generator(self.config.seed, step, Shared.STEPS)
         steps = 1 + int(torch.randint(self.steps, (1,), generator=generator))
         number = int(torch.randint(steps, (1,), generator=generator))
         sampler, given = student.few_steps(steps), student.prepare(inputs)

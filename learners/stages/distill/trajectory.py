@@ -32,7 +32,7 @@ class TrajectoryRegression(Method):
     def loss(self, turn: Turn, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
         """See Method."""
         inputs, weight = self.student.chunk_of(turn.clip, generator)
-        made, teacher = self.generated(inputs, generator), self.teacher
+        made, teacher = self.generated(inputs, turn.step), self.teacher
         with torch.no_grad():
             given = teacher.prepare(inputs)
             goal = teacher.sampler(

@@ -30,7 +30,8 @@ def blocks(shape: torch.Size, generator: torch.Generator) -> Tensor:
 
 def clip(spec: WorldSpec, batch: int, memory: int, chunks: int = 1, seed: int = 0) -> TensorDict:
     """A clip [batch] as ClipStore.clips gives it; the square moves by a twentieth of the action's first
-    number, and the task is done in the right half. Nobody labelled every third episode.
+    number, and the task is done in the right half. Nobody labelled every third episode. It is learned from in
+    the middle.
     """
     generator = torch.Generator().manual_seed(seed)
     total, begin = chunks * spec.chunk, 2
@@ -66,6 +67,7 @@ def clip(spec: WorldSpec, batch: int, memory: int, chunks: int = 1, seed: int = 
             ),
             "begin": torch.full((batch,), begin),
             "stride": torch.ones(batch, dtype=torch.int64),
+            "depth": torch.full((batch,), 0.5),
         },
         [batch],
     )

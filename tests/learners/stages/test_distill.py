@@ -22,26 +22,28 @@ from envs.simulators.base import WORLD_OPTIONS, Simulator
 from envs.simulators.samplers import Distilled, Euler, Sampler, shifted_levels
 from envs.simulators.stepwise import Stepwise
 from envs.specs import WorldSpec
-from envs.targets import ConfigError, build, target
+from envs.targets import ConfigError, build
+from learners.stages.distill.method import Method
 from learners.stages.distill.stage import check_pair, train_student
 from learners.stages.simulator import ClipBatches, SimulatorFitConfig
 from learners.training.fit import FitConfig
+from learners.training.lora import TARGETS
 from learners.training.optimisers import optimiser_state
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
-from tests.learners.models import section_of, simulator_of
+from tests.learners.models import section_of, simulator_of, stepwise_engines, stepwise_pair
 from tests.moving_square import SIZE
-from tests.sections import offered, section
+from tests.sections import section
 
 Stores = Callable[[Embodiment], ClipStore]
-METHODS = ("dmd2", "trajectory")
+METHODS, SMALL = ("dmd2", "trajectory"), stepwise_engines()
 # Matching by critics circles around its goal, the less the slower its student goes.
-PACE = {"dmd2": (900, 3e-3, 0.99), "trajectory": (100, 1e-2, 0.98)}  # steps, learning rate, EMA
+PACE = {"dmd2": (900, 3e-3, 0.99), "trajectory": (200, 1e-2, 0.98)}  # steps, learning rate, EMA
 CLIPS = SimulatorFitConfig(single_chunk_fraction=1.0, unroll=1, strides=(1,), recent_fraction=0.0, lora=0)
 
 
 class Bell(Simulator):
     """A world of 32 normal numbers, each of mean 2 and spread 1/2. What it begins with is exact in many
-    steps; in one it makes the mean, and nothing else. (Of several DMD2 matches the mixture, not each.)
+    steps; in one it makes the mean, and nothing else.
     """
 
     def __init__(self, spec: WorldSpec, sampler: Sampler):
@@ -76,66 +78,56 @@ class Bell(Simulator):
             return self.sampler(lambda z, s: self.velocity(z, torch.full((len(z),), s), None), noise)
 
 
-@pytest.mark.parametrize("name", ["dmd2", "trajectory"])
-def test_a_student_of_one_step_makes_what_the_teacher_makes(
-    name: str, tiny_store: Stores, tmp_path: Path
+def learned(student: Bell, options: FitConfig) -> Tensor:
+    """What a student makes at the steps that it learns, each as often as it is drawn."""
+    method, nothing = Method(deepcopy(student), student, options), torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        made = [method.generated(student.chunk_of(TensorDict(), nothing)[0], step) for step in range(64)]
+    return torch.cat([chunk.latents for chunk in made])
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_student_makes_what_the_teacher_makes(
+    count: int, name: str, tiny_store: Stores, tmp_path: Path
 ) -> None:
     store = tiny_store(ARM_DELTAS)
     torch.manual_seed(0)
     teacher = Bell(store.spec, Euler(32, 1.0))
-    student = Bell(store.spec, teacher.few_steps(1))
+    student = Bell(store.spec, teacher.few_steps(count))
     student.load_state_dict(teacher.state_dict())
     assert float(teacher.sample().std()) == pytest.approx(0.5, abs=0.05)
-    assert float(student.sample().std()) < 0.05
+    assert float(student.sample().std()) < (0.05 if count == 1 else 0.25)
     method = section(f"distiller/{name}", **({"critic_lr": 1e-2} if name == "dmd2" else {}))
     steps, lr, ema = PACE[name]
     options = FitConfig(steps, 1, lr, warmup=5, bf16=False, ema=ema, checkpoint_every=1000)
     train_student(teacher, method, ClipBatches(student, store, torch.arange(4), CLIPS, options), tmp_path)
-    made = student.sample()
+    # Of several steps DMD2 matches the mixture, not each: its critic does not know them apart.
+    made = learned(student, options) if name == "dmd2" else student.sample()
     assert float(made.mean()) == pytest.approx(2.0, abs=0.12)
     assert float(made.std()) == pytest.approx(0.5, abs=0.2 if name == "dmd2" else 0.1)
 
 
-def engines() -> list[str]:
-    """The small configs of configs/simulator whose engine denoises in steps."""
-    small = [name for name in offered("simulator") if name.endswith(("_small", "_tiny"))]
-    kinds = {name: target(section_of("simulator", name), "simulator") for name in small}
-    return [name for name in small if hasattr(kinds[name], "few_steps")]
-
-
-def pair(name: str, spec: WorldSpec) -> tuple[Simulator, Simulator]:
-    """An untrained teacher of four steps whose frames are not trivial, and a student of two."""
-    own = {k: v for k, v in section_of("simulator", name).items() if k not in WORLD_OPTIONS}
-    if "sampling" in own:
-        own["sampling"] = {"kind": "edm", "steps": 4}
-    torch.manual_seed(0)
-    teacher: Simulator = build(own, "simulator", spec=spec)
-    few = target(own, "simulator").student_section(own, 2)  # type: ignore[attr-defined]
-    student: Simulator = build(few, "simulator", spec=spec)
-    with torch.no_grad():
-        for parameter in teacher.parameters():
-            # what begins at zero, or near it, makes frames that nothing moves
-            if float(parameter.abs().max()) < 0.02:
-                parameter.normal_(std=0.05)
-    student.load_state_dict(teacher.state_dict())
-    return teacher, student
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("engine", engines())
+@pytest.mark.parametrize(
+    ("engine", "method", "lora"),
+    [
+        *((engine, method, 0) for engine in SMALL for method in METHODS),
+        *((engine, "dmd2", 2) for engine in SMALL),  # student and critic have adapters
+        ("gesim_tiny", "trajectory", 2),
+    ],
+)
 def test_a_killed_distillation_goes_on_bit_for_bit(
-    engine: str, method: str, tiny_store: Stores, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    engine: str, method: str, lora: int, tiny_store: Stores, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = ClipStore(
         [part.folder for part in tiny_store(BIMANUAL_POSES).parts],
         replace(world_spec(BIMANUAL_POSES.at(SIZE), SIZE), chunk=5),
     )
-    lora = 2 if engine == "gesim_tiny" else 0
     clips, how = replace(CLIPS, lora=lora), section(f"distiller/{method}")
     if "critic_updates" in how:
         how["critic_updates"] = 1
     options = FitConfig(4, 2, 1e-3, warmup=1, bf16=False, ema=0.5, checkpoint_every=2)
-    teacher, student = pair(engine, store.spec)
+    teacher, student = stepwise_pair(engine, store.spec)
     assert isinstance(teacher, Stepwise) and isinstance(student, Stepwise)
     begun = {name: value.clone() for name, value in student.state_dict().items()}
 
@@ -149,6 +141,7 @@ def test_a_killed_distillation_goes_on_bit_for_bit(
     whole = learn(tmp_path / "whole")
     changed = {name for name, value in whole.items() if not torch.equal(value, begun[name])}
     assert changed and not any(name.startswith("codec.") for name in changed)
+    assert not lora or all(name.removesuffix(".weight").endswith(TARGETS) for name in changed)
     assert list(whole) == list(begun)
     sample, seen = store.sample, []
 
@@ -170,7 +163,7 @@ def test_a_killed_distillation_goes_on_bit_for_bit(
 
 @pytest.mark.parametrize("method", METHODS)
 def test_muon_moves_the_hidden_layers_that_the_engine_names(method: str, tiny_store: Stores) -> None:
-    teacher, student = pair("forcing_small", tiny_store(BIMANUAL_POSES).spec)
+    teacher, student = stepwise_pair("forcing_small", tiny_store(BIMANUAL_POSES).spec)
     options = FitConfig(1, 2, 1e-3, bf16=False, optimiser="muon")
     made = build(
         section(f"distiller/{method}"), "distill.method", teacher=teacher, student=student, config=options
@@ -183,11 +176,11 @@ def test_muon_moves_the_hidden_layers_that_the_engine_names(method: str, tiny_st
 
 def test_teacher_and_student_must_belong_together(tiny_store: Stores) -> None:
     spec = tiny_store(BIMANUAL_POSES).spec
-    teacher, student = pair("dit_small", spec)
+    teacher, student = stepwise_pair("dit_small", spec)
     check_pair(teacher, student)
     with pytest.raises(ValueError, match=r"conditioned differently: simulator\.pose_map: True and False"):
-        check_pair(teacher, pair("dit_small", replace(spec, pose_map=False))[1])
-    forcing, words = pair("forcing_small", spec)[0], {"_target_": "envs.conditioning.ActionText"}
+        check_pair(teacher, stepwise_pair("dit_small", replace(spec, pose_map=False))[1])
+    forcing, words = stepwise_pair("forcing_small", spec)[0], {"_target_": "envs.conditioning.ActionText"}
     one = other_than("forcing_small", spec, {"actions": words})
     other = other_than("forcing_small", spec, {"actions": {**words, "decimals": 2}})
     with pytest.raises(ValueError, match=r"simulator\.actions: .*ActionVector .* and .*ActionText "):
@@ -212,7 +205,7 @@ def other_than(name: str, spec: WorldSpec, changes: dict[str, Any]) -> Simulator
 
 def test_jumps_are_no_trajectories(tiny_store: Stores, tmp_path: Path) -> None:
     store = tiny_store(BIMANUAL_POSES)
-    _, student = pair("dit_small", store.spec)
+    _, student = stepwise_pair("dit_small", store.spec)
     options = FitConfig(1, 2, 1e-3, bf16=False)
     with pytest.raises(ConfigError, match=r"simulator\.sampling\.kind=edm"):
         batches = ClipBatches(student, store, torch.arange(2), CLIPS, options)

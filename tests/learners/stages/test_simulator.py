@@ -13,8 +13,9 @@ from envs.conditioning import ActionVector
 from envs.embodiment import Embodiment
 from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
+from envs.rng import step_generator
 from envs.targets import options
-from learners.stages.simulator import SimulatorFitConfig, train_simulator, units
+from learners.stages.simulator import ClipBatches, SimulatorFitConfig, train_simulator, units
 from learners.stages.tokenizer import train_tokenizer
 from learners.training.fit import FitConfig
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_POSES
@@ -52,6 +53,19 @@ def test_moves_are_told_in_units_of_what_is_told(
     spread = units(store, episodes, most)[1].square().mean(0).sqrt()
     told = (vector.move_scale * spread)[spread > 1e-3]
     assert len(told) and torch.allclose(told, torch.ones_like(told), atol=1e-4)
+
+
+def test_the_microbatches_of_a_step_are_learned_from_at_one_depth(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    simulator, fit = simulator_of("unet_small", store.spec), FitConfig(4, 8, 1e-3, microbatches=2)
+    clips = ClipBatches(simulator, store, torch.arange(6), SimulatorFitConfig(0.0, 2, (1,), 0.0, 0), fit)
+    depths = []
+    for step in range(4):
+        one, other = (clips(step, step_generator(0, step, part)) for part in range(2))
+        assert not torch.equal(one["future", "frames"], other["future", "frames"])
+        depths.append({*one["depth"].tolist(), *other["depth"].tolist()})
+    assert [len(each) for each in depths] == [1] * 4 and len(set.union(*depths)) == 4
+    assert all(0 <= depth < 1 for depth in set.union(*depths))
 
 
 @pytest.mark.parametrize("unrolled", [False, True])

@@ -9,22 +9,26 @@ from typing import Any
 
 import pytest
 import torch
-import torch.distributed as dist
-import torch.multiprocessing as mp
 from torch import Tensor, nn
 
 from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
 from envs.specs import ActionMode
+from envs.targets import build
 from learners.stages.distill.stage import train_student
 from learners.stages.film import Film
 from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.judge import train_judge
+from learners.stages.perception import train_perception
 from learners.stages.simulator import ClipBatches, SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
+from learners.stages.text_world import train_text_world
+from learners.stages.traces import Hands
 from learners.training.fit import FitConfig, fit
 from tests.embodiments import ARM_DELTAS, world_spec
+from tests.envs.simulators.test_text_world import section as text_world_section
 from tests.learners.models import decoder_of, distilled, judge_of, policy_of, simulator_of
+from tests.learners.training.workers import gathered, two
 from tests.moving_square import SIZE
 from tests.sections import section
 
@@ -107,7 +111,7 @@ def whole_and_cut(folder: Path) -> list[float]:
 
 
 def stages(folder: Path, dataset: Path) -> list[float]:
-    """Losses of the first steps of every supervised stage, in a diffusion transformer."""
+    """Losses of the first steps of every supervised stage, in a diffusion transformer and in a text world."""
     torch.set_num_threads(1)
     spec = world_spec(ARM_DELTAS.at(SIZE), SIZE)
     store = ClipStore([dataset], spec)
@@ -119,8 +123,9 @@ def stages(folder: Path, dataset: Path) -> list[float]:
     )
     decoder, judge = decoder_of("dit_small", simulator), judge_of(spec)
     clips = SimulatorFitConfig(1.0, 1, (1,), 0.0, 0)
-    cloning = Cloning(policy, store, every, ActionMode.ABSOLUTE)
-    train_imitation(cloning, options, folder / "imitation")
+    learned = (policy, store, every, ActionMode.ABSOLUTE)
+    train_perception(*learned, options, folder / "perception", 0.9, Hands(0.0, None))
+    train_imitation(Cloning(*learned), options, folder / "imitation")
     film = Film(simulator, store, folder / "simulator", False)
     train_simulator(simulator, store, every, clips, options, folder / "simulator", look=film)
     train_state(decoder, simulator, store, every, options, folder / "state")
@@ -134,36 +139,20 @@ def stages(folder: Path, dataset: Path) -> list[float]:
     for stage in ("simulator", "distill"):
         names = [path.name for path in sorted((folder / stage / "media").iterdir())]
         assert [name.rpartition("-")[2] for name in names] == ["step000002.mp4", "step000003.mp4"]
+    torch.manual_seed(0)
+    text_world = build(text_world_section(), "judge.text_world", spec=spec)
+    train_text_world(text_world, store, every, 1, options, folder / "text_world", tokenizer=options)
+    logs = sorted(folder.rglob("metrics.jsonl"))
     return [
-        json.loads(line)[f"{name}/loss"]
-        for name in ("imitation", "simulator", "state", "judge", "distill")
-        for line in (folder / name / "metrics.jsonl").read_text().splitlines()
+        json.loads(line)[f"{log.parent.name}/loss"] for log in logs for line in log.read_text().splitlines()
     ]
-
-
-def worker(
-    rank: int, rendezvous: str, folder: str, work: Callable[..., list[float]], given: tuple[Any, ...]
-) -> None:
-    dist.init_process_group("gloo", init_method=f"file://{rendezvous}", rank=rank, world_size=2)
-    values = work(Path(folder), *given)
-    if values:
-        (Path(folder) / f"values-{rank}.json").write_text(json.dumps(values))
-    dist.destroy_process_group()
-
-
-def two(work: Callable[..., list[float]], folder: Path, *given: Any) -> list[list[float]]:
-    """What two workers say."""
-    folder.mkdir(exist_ok=True)
-    rendezvous = folder / "rendezvous"
-    rendezvous.unlink(missing_ok=True)
-    mp.spawn(worker, (str(rendezvous), str(folder), work, given), nprocs=2)
-    return [json.loads(path.read_text()) for path in sorted(folder.glob("values-*.json"))]
 
 
 def test_two_workers_follow_one_and_either_goes_on_from_the_others_checkpoint(tmp_path: Path) -> None:
     alone = train(tmp_path / "alone")
     leader, follower = two(whole_and_cut, tmp_path / "two")
     assert leader == follower == pytest.approx(alone, rel=1e-4)
+    assert gathered(tmp_path / "two") == {"Linear"}
     assert train(tmp_path / "two" / "cut") == pytest.approx(alone, rel=1e-4)
     assert train(tmp_path / "from-one", 5) == []
     assert two(train, tmp_path / "from-one")[1] == pytest.approx(alone, rel=1e-4)
@@ -180,7 +169,9 @@ def test_two_workers_follow_one_in_every_supervised_stage(
 ) -> None:
     dataset = tiny_data(ARM_DELTAS)
     alone = stages(tmp_path / "alone", dataset)
-    assert len(alone) == 15 and two(stages, tmp_path / "two", dataset)[0] == pytest.approx(alone, rel=1e-3)
+    leader, follower = two(stages, tmp_path / "two", dataset, limit=2_000)
+    assert len(alone) == 8 * 3 and leader == follower == pytest.approx(alone, rel=1e-3)
+    assert gathered(tmp_path / "two") >= {"VisionBlock", "StateBlock"}
 
 
 def test_microbatches_that_cannot_be_shared_out_are_refused() -> None:
