@@ -54,23 +54,35 @@ def heat_maps(cells: Sequence[Entry]) -> HeatMaps | None:
     """
     if not cells:
         return None
-    found = {(cell["task"], cell["scene"]): cell for cell in cells}
-    tasks, scenes = (sorted({where[n] for where in found}) for n in (0, 1))
+    fields: dict[str, Callable[[Entry], Cell | None]] = {
+        "true before": lambda cell: _rate(cell, "physics_before"),
+        "true after": lambda cell: _rate(cell, "physics_after"),
+        "imagined after": lambda cell: _rate(cell, "imagined_after"),
+        "imagined − true": _gap,
+    }
+    return _maps({title: (cells, field) for title, field in fields.items()})
 
-    def heat_map(title: str, field: Callable[[Entry], Cell | None]) -> HeatMap:
-        rows = {
-            task: [field(found[task, scene]) if (task, scene) in found else None for scene in scenes]
-            for task in tasks
-        }
-        return HeatMap(title, rows)
 
-    maps = [
-        heat_map("true before", lambda cell: _rate(cell, "physics_before")),
-        heat_map("true after", lambda cell: _rate(cell, "physics_after")),
-        heat_map("imagined after", lambda cell: _rate(cell, "imagined_after")),
-        heat_map("imagined − true", _gap),
-    ]
-    return HeatMaps(scenes, [one for one in maps if any(cell for row in one.rows.values() for cell in row)])
+def heat_maps_of(found: Mapping[str, Sequence[Entry]]) -> HeatMaps | None:
+    """A heat map for each title, of cells with task, scene and the rate entry `success`; None if none of them
+    has several scenes.
+    """
+    if all(len({cell["scene"] for cell in cells}) < 2 for cells in found.values()):
+        return None
+    return _maps({title: (cells, lambda cell: _rate(cell, "success")) for title, cells in found.items()})
+
+
+def _maps(drawn: Mapping[str, tuple[Sequence[Entry], Callable[[Entry], Cell | None]]]) -> HeatMaps:
+    """Maps over the same tasks and scenes, without those in which nothing was tried."""
+    every = {(cell["task"], cell["scene"]) for cells, _ in drawn.values() for cell in cells}
+    tasks, scenes = (sorted({where[n] for where in every}) for n in (0, 1))
+    maps = []
+    for title, (cells, field) in drawn.items():
+        found = {(cell["task"], cell["scene"]): field(cell) for cell in cells}
+        rows = {task: [found.get((task, scene)) for scene in scenes] for task in tasks}
+        if any(cell for row in rows.values() for cell in row):
+            maps.append(HeatMap(title, rows))
+    return HeatMaps(scenes, maps)
 
 
 def _where(cell: Entry) -> str:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from markupsafe import Markup
 
 from envs.physics.suite import task_names
-from pipeline.evaluation.by_task import tasks_of_seeds, variant_of
+from pipeline.evaluation.by_task import scenes_of_seeds, tasks_of_seeds, variant_of
+from pipeline.evaluation.heat import heat_maps_of
+from pipeline.evaluation.report import templates
 from pipeline.evaluation.result import outcomes
 from pipeline.evaluation.statistics import rate, rate_entry, rate_line
 from pipeline.stages import prove
@@ -21,6 +23,7 @@ from pipeline.study.methods import Made
 Cfg = Mapping[str, Any]
 Cell = Mapping[str, Any]
 Outcomes = Mapping[tuple[str, int], bool]
+T = TypeVar("T")
 ALL = "all"  # label of the cell over all tasks
 
 
@@ -32,23 +35,26 @@ class Measured:
         cells: figures by label; `text` of the column says them in words.
         outcomes: success by task and episode seed, by which rows are compared; {} if there are none.
         before: the same of a policy that the row began with, where a column compares the two.
+        scenes: in which of the suite's scenes the episodes of `outcomes` were, if that was asked.
         curve: (x, y) of a line that the column draws; [] if there is none.
     """
 
     cells: Mapping[str, Cell]
     outcomes: Outcomes = field(default_factory=dict)
     before: Outcomes = field(default_factory=dict)
+    scenes: Mapping[tuple[str, int], str] = field(default_factory=dict)
     curve: Sequence[tuple[float, float]] = ()
 
     @classmethod
-    def of_success(cls, success: Outcomes) -> Measured:
+    def of_success(cls, success: Outcomes, scenes: Mapping[tuple[str, int], str] | None = None) -> Measured:
         """Rates of each task, and of all."""
         tasks = dict.fromkeys(task for task, _ in success)
         cells = {
             task: rate_entry(torch.tensor([won for (name, _), won in success.items() if name == task]))
             for task in tasks
         }
-        return cls({**cells, ALL: rate_entry(torch.tensor(list(success.values())))}, success)
+        whole = rate_entry(torch.tensor(list(success.values())))
+        return cls({**cells, ALL: whole}, success, scenes=scenes or {})
 
 
 class Column(ABC):
@@ -129,7 +135,9 @@ class Success(Column):
 
     def read(self, cfg: Cfg, folders: Sequence[Path]) -> Measured:
         """See Column.read."""
-        return Measured.of_success(outcomes_of(cfg, folders[0]))
+        success = outcomes_of(cfg, folders[0])
+        scenes = scenes_of_seeds(cfg, (seed for _, seed in success), self.variant)
+        return Measured.of_success(success, dict(zip(success, scenes, strict=True)))
 
     def text(self, cell: Cell) -> str:
         """See Column.text."""
@@ -137,11 +145,32 @@ class Success(Column):
 
     def pool(self, several: Sequence[Measured]) -> Measured:
         """Success over all seeds of training, each on the same episodes."""
-        return Measured.of_success(together([one.outcomes for one in several]))
+        return Measured.of_success(*(together(parts) for parts in _outcomes_and_scenes(several)))
+
+    def chart(self, found: Mapping[str, Measured]) -> Markup:
+        """Success of each row by task and scene as heat maps, where the suite has several scenes."""
+        maps = heat_maps_of({title: list(_by_scene(one)) for title, one in found.items()})
+        if maps is None:
+            return Markup("")
+        drawn = templates().get_template("macros.html.j2").module.heats(maps)  # type: ignore[attr-defined]
+        return Markup("<h2>{}, by task and scene</h2>{}").format(self.title, Markup(drawn))
 
     def merit(self, cell: Cell) -> float | None:
         """See Column.merit."""
         return rate(cell)
+
+
+def _outcomes_and_scenes(several: Sequence[Measured]) -> tuple[list[Any], list[Any]]:
+    return [one.outcomes for one in several], [one.scenes for one in several]
+
+
+def _by_scene(found: Measured) -> Iterator[dict[str, Any]]:
+    """Cells of heat.heat_maps_of."""
+    won: dict[tuple[str, str], list[bool]] = {}
+    for (task, seed), scene in found.scenes.items():
+        won.setdefault((task, scene), []).append(found.outcomes[task, seed])
+    for (task, scene), some in won.items():
+        yield {"task": task, "scene": scene, "success": rate_entry(torch.tensor(some))}
 
 
 def outcomes_of(cfg: Cfg, folder: Path) -> dict[tuple[str, int], bool]:
@@ -150,8 +179,8 @@ def outcomes_of(cfg: Cfg, folder: Path) -> dict[tuple[str, int], bool]:
     return dict(zip(zip(tasks_of_seeds(cfg, seeds), seeds, strict=True), success.tolist(), strict=True))
 
 
-def together(several: Sequence[Outcomes]) -> dict[tuple[str, int], bool]:
-    """Outcomes of several seeds of training as those of as many times the episodes."""
+def together(several: Sequence[Mapping[tuple[str, int], T]]) -> dict[tuple[str, int], T]:
+    """What is known of episodes with several seeds of training as of as many times the episodes."""
     return {
         (task, number * _APART + seed): won
         for number, one in enumerate(several)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
+from pipeline.evaluation.report import templates
 from pipeline.study.columns import Column
 from pipeline.study.side_by_side import NOT_RUN, best_of, headlines
 
@@ -49,20 +49,17 @@ def markdown(table: Mapping[str, Any], columns: Columns) -> str:
 
 def page(table: Mapping[str, Any], columns: Columns, charts: Sequence[Markup]) -> str:
     """One self-contained HTML page."""
-    made = Environment(
-        loader=PackageLoader("pipeline", "evaluation/page"),
-        autoescape=select_autoescape(["j2"]),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return made.get_template("study.html.j2").render(
-        name=table["name"],
-        sections=sections_of(table, columns),
-        best=best_of(table, columns),
-        charts=charts,
-        notes=notes_of(table),
-        not_run=NOT_RUN,
+    return (
+        templates()
+        .get_template("study.html.j2")
+        .render(
+            name=table["name"],
+            sections=sections_of(table, columns),
+            best=best_of(table, columns),
+            charts=charts,
+            notes=notes_of(table),
+            not_run=NOT_RUN,
+        )
     )
 
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from envs.manifest import write_manifest
+from envs.physics.suite import build_suite
 from envs.targets import ConfigError
 from pipeline.config import load_config
 from pipeline.stages import pace
@@ -178,3 +179,17 @@ def test_seconds_are_shared_out_among_the_parts_that_there_are(
     assert pace.seconds_of(load_config(["experiment=soak"]), "state", "first") == {}
     with pytest.raises(ConfigError, match=r"equal_time\.tokenizer=0\.9 and equal_time\.state=0\.15"):
         load_config(["equal_time.tokenizer=0.9"])
+
+
+def test_success_is_drawn_by_task_and_scene_of_a_variant(tmp_path: Path, cfg: dict[str, Any]) -> None:
+    words = ["experiment=soak", "task=tabletop", "task.name=[push,pull]", "task.size=[32,32]"]
+    many, column = load_config(words), Success("out of domain", "out_of_domain")
+    one = column.read(many, [outcome(tmp_path / "one", [True, False, True, True])])
+    both = column.pool([one, column.read(many, [outcome(tmp_path / "two", [False] * 4)])])
+    unseen = build_suite({**many["task"]["suite"], **many["task"]["variants"]["out_of_domain"]}).scenes
+    assert set(one.scenes.values()) <= set(unseen) and len(both.outcomes) == len(both.scenes) == 8
+    page = str(column.chart({"mine": both}))
+    assert "out of domain, by task and scene" in page and "<figcaption>mine</figcaption>" in page
+    assert f"push, {one.scenes['push', 0]}: 1 of 2" in page
+    alone = Success("success").read(cfg, [outcome(tmp_path / "three", [True, False])])
+    assert Success("success").chart({"mine": alone}) == ""  # a suite without scenes
