@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from actors.policies.contract import action_key, device_of, distribution, inputs_for, trained_part
 from envs.episodes.clips import ClipStore
+from envs.rng import seed_process
 from envs.specs import CHUNK, IMAGE, LOG_PROB, ActionMode
 from envs.targets import ConfigError
 from learners.rl.algorithm import Anchor
@@ -66,7 +67,7 @@ class RecordedDecisions:
         likely = said.log_prob(seen[CHUNK].to(device))
         # What is usual is told by the same draws each time, so that a resumed run tells the same.
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
-            torch.manual_seed(0)
+            seed_process(0)
             usual = torch.stack([said.log_prob(said.sample()) for _ in range(_SAMPLES)]).mean(0)
         return likely.cpu(), (likely > usual - _UNLIKELY).cpu()
 

@@ -67,11 +67,13 @@ def by_task(tasks: Sequence[str], summarise: Callable[..., T], *values: Tensor) 
     return {name: summarise(*(value[mine[name]] for value in values)) for name in names}
 
 
-def scenes_of_seeds(cfg: Mapping[str, Any], seeds: Iterable[int], variant: str = "") -> list[str]:
-    """The scene of each episode in physics, by its seed, in a variant of the task or in the task as it is;
-    "" of suites without scenes.
+def scenes_of_seeds(
+    cfg: Mapping[str, Any], seeds: Iterable[int], changes: Mapping[str, Any] | None = None
+) -> list[str]:
+    """The scene of each episode in physics, by its seed, of the suite with options changed as a variant of
+    the task changes them; "" of suites without scenes.
     """
-    scenes = build_suite({**cfg["task"]["suite"], **variant_of(cfg, variant)}).scenes
+    scenes = build_suite({**cfg["task"]["suite"], **(changes or {})}).scenes
     return [scene_of(scenes, int(seed)) for seed in seeds]
 
 

@@ -136,7 +136,7 @@ class Success(Column):
     def read(self, cfg: Cfg, folders: Sequence[Path]) -> Measured:
         """See Column.read."""
         success = outcomes_of(cfg, folders[0])
-        scenes = scenes_of_seeds(cfg, (seed for _, seed in success), self.variant)
+        scenes = scenes_of_seeds(cfg, (seed for _, seed in success), variant_of(cfg, self.variant))
         return Measured.of_success(success, dict(zip(success, scenes, strict=True)))
 
     def text(self, cell: Cell) -> str:
