@@ -40,8 +40,8 @@ class RecordedDecisions:
 
     Chunks are those that were carried out. Some the robot's limits have cut short of what the policy said; it
     would hardly ever say those, and they are left out. So are those, iteration by iteration, that the policy
-    would hardly say any more: a chunk at ten spreads from the mean pulls ten times as hard as one at a single
-    spread, and a few of them would say where all steps go.
+    would hardly say any more: how likely a chunk is at ten spreads from the mean changes so fast that ratios
+    overflow within an iteration.
     """
 
     def __init__(self, policy: TensorDictModuleBase, store: ClipStore, rollout: TensorDict, mode: ActionMode):
