@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,7 +12,7 @@ import torch
 from markupsafe import Markup
 
 from envs.physics.suite import task_names
-from pipeline.evaluation.by_task import scenes_of_seeds, tasks_of_seeds, variant_of
+from pipeline.evaluation.by_task import by_scene, scenes_of_seeds, tasks_of_seeds, variant_of
 from pipeline.evaluation.heat import heat_maps_of
 from pipeline.evaluation.report import templates
 from pipeline.evaluation.result import outcomes
@@ -145,11 +145,13 @@ class Success(Column):
 
     def pool(self, several: Sequence[Measured]) -> Measured:
         """Success over all seeds of training, each on the same episodes."""
-        return Measured.of_success(*(together(parts) for parts in _outcomes_and_scenes(several)))
+        return Measured.of_success(
+            together([one.outcomes for one in several]), together([one.scenes for one in several])
+        )
 
     def chart(self, found: Mapping[str, Measured]) -> Markup:
         """Success of each row by task and scene as heat maps, where the suite has several scenes."""
-        maps = heat_maps_of({title: list(_by_scene(one)) for title, one in found.items()})
+        maps = heat_maps_of({title: _cells_of(one) for title, one in found.items()})
         if maps is None:
             return Markup("")
         drawn = templates().get_template("macros.html.j2").module.heats(maps)  # type: ignore[attr-defined]
@@ -160,17 +162,11 @@ class Success(Column):
         return rate(cell)
 
 
-def _outcomes_and_scenes(several: Sequence[Measured]) -> tuple[list[Any], list[Any]]:
-    return [one.outcomes for one in several], [one.scenes for one in several]
-
-
-def _by_scene(found: Measured) -> Iterator[dict[str, Any]]:
+def _cells_of(found: Measured) -> list[dict[str, Any]]:
     """Cells of heat.heat_maps_of."""
-    won: dict[tuple[str, str], list[bool]] = {}
-    for (task, seed), scene in found.scenes.items():
-        won.setdefault((task, scene), []).append(found.outcomes[task, seed])
-    for (task, scene), some in won.items():
-        yield {"task": task, "scene": scene, "success": rate_entry(torch.tensor(some))}
+    tasks, won = [task for task, _ in found.scenes], [found.outcomes[where] for where in found.scenes]
+    scenes = list(found.scenes.values())
+    return by_scene(tasks, scenes, lambda some: {"success": rate_entry(some)}, torch.tensor(won))
 
 
 def outcomes_of(cfg: Cfg, folder: Path) -> dict[tuple[str, int], bool]:
