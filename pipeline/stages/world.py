@@ -243,7 +243,7 @@ def _doubts(cfg: Cfg, model: Judge, store: ClipStore) -> dict[str, str]:
     """{"alarm"}: the judge is blind to the words, and there are several; or most goals that it imagined for
     calibration never end, whatever stands in for them. {} otherwise.
     """
-    facts, said = model.facts(), {row["instruction"] for row in store.episodes}
+    facts, said = model.facts(), set(store.instructions)
     goals, unfinished = facts.get("goals", 0), facts.get("goals_unfinished", 0)
     doubts = []
     if not model.reads_instruction and len(said) > 1:
