@@ -87,9 +87,8 @@ def _loss(
 ) -> tuple[Tensor, dict[str, float]]:
     loss, row = algorithm.loss(minibatch)
     loss = config.imagined * loss
-    if known is not None and len(
-        known
-    ):  # by itself, for its likelihood ratios do not say how far the policy has come
+    if known is not None and len(known):
+        # by itself, for its likelihood ratios do not say how far the policy has come
         pick = torch.randint(len(known), (len(minibatch),), generator=generator)
         recorded_loss, recorded_figures = algorithm.loss(known[pick])
         loss = loss + recorded_loss
