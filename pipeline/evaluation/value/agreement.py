@@ -76,16 +76,11 @@ class Cell:
 
     @property
     def matched(self) -> float:
-        """The true value on the starts that `estimated` speaks of, each as often as it was judged; NaN if
-        nothing could be judged. Where a judge abstains from hard starts, all starts would be unlike them.
-
-        Raises:
-            ValueError: where it is unknown.
+        """The true value on the starts that `estimated` speaks of, each as often as it was judged. Where
+        a judge abstains from hard starts, all starts would be unlike them.
         """
-        if self.true is None:
-            raise ValueError(f"nobody tried {self.policy} on {self.task} in physics")
-        truth = [float(self.true[known].float().mean()) for known in self.judged if known.any()]
-        return float(np.mean(truth)) if truth else math.nan
+        assert self.true is not None and self.rates
+        return float(np.mean([float(self.true[known].float().mean()) for known in self.judged if known.any()]))
 
     @property
     def table(self) -> dict[str, Any]:
