@@ -20,6 +20,7 @@ from pipeline.loop import build_loop
 from pipeline.stages.given import load_world, open_store
 
 Cfg = Mapping[str, Any]
+_WORLDS = ["imagined", "physics"]
 _SIDE_BY_SIDE = 64  # imagined episodes
 
 
@@ -41,39 +42,36 @@ def evaluate_policy(
     graph = build_loop(cfg, root)
     cfg = graph.cfg  # of the world that is acted in
     if world not in _WORLDS:
-        raise ConfigError(f"world={world!r} must be one of {sorted(_WORLDS)}")
+        raise ConfigError(f"world={world!r} must be one of {_WORLDS}")
     changes = variant_of(cfg, variant)
     if variant and world != "physics":
         raise ConfigError(f"variant={variant} is known in physics alone; leave world={world} out")
     folder = graph.folder(weights) if weights in graph.nodes else Path(weights)
     actor = build_policy(cfg, folder / "weights.safetensors" if weights else None)
-    env, seeds, tasks = _WORLDS[world](cfg, graph, changes)
+    env, seeds, tasks = _physics(cfg, changes) if world == "physics" else _imagined(cfg, graph)
     try:
         outcome = evaluate(env, actor, seeds, label=world)
     finally:
         env.close()
     name = f"{weights or cfg['policy']['_target_']} in {world}{', ' if variant else ''}{variant}"
-    lines = {name: _line(outcome.success, outcome.counted)}
-    lines |= by_task(tasks, _line, outcome.success, outcome.counted)
-    return "\n".join(f"{'' if title == name else '  '}{title}: {line}" for title, line in lines.items())
+    parts = by_task(tasks, _line, outcome.success, outcome.counted)
+    lines = [f"{name}: {_line(outcome.success, outcome.counted)}"]
+    return "\n".join([*lines, *(f"  {task}: {line}" for task, line in parts.items())])
 
 
 def _line(success: Tensor, counted: Tensor) -> str:
     return f"{rate_line(rate_entry(success[counted]))}, {int((~counted).sum())} dropped"
 
 
-def _physics(cfg: Cfg, graph: Graph, changes: Cfg) -> tuple[Any, list[int], list[str]]:
+def _physics(cfg: Cfg, changes: Cfg) -> tuple[Any, list[int], list[str]]:
     section = cfg["evaluate"]
     seeds = episode_seeds(cfg["seed"], Purpose.EVALUATE, section["episodes"])
     return build_physics(cfg, section["envs"], changes=changes), seeds, tasks_of_seeds(cfg, seeds)
 
 
-def _imagined(cfg: Cfg, graph: Graph, changes: Cfg) -> tuple[Any, list[int], list[str]]:
+def _imagined(cfg: Cfg, graph: Graph) -> tuple[Any, list[int], list[str]]:
     inputs = graph.inputs("evaluate-imagined")
     store = open_store(cfg, inputs)
     starts = evenly(cfg, store, torch.arange(len(store)), cfg["evaluate"]["imagined"])
     world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(starts)), starts)
     return world, list(range(len(starts))), tasks_of_episodes(cfg, store, starts)
-
-
-_WORLDS = {"physics": _physics, "imagined": _imagined}
