@@ -80,7 +80,9 @@ class Cell:
         a judge abstains from hard starts, all starts would be unlike them.
         """
         assert self.true is not None and self.rates
-        return float(np.mean([float(self.true[known].float().mean()) for known in self.judged if known.any()]))
+        return float(
+            np.mean([float(self.true[known].float().mean()) for known in self.judged if known.any()])
+        )
 
     @property
     def table(self) -> dict[str, Any]:
