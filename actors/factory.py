@@ -26,6 +26,7 @@ from envs.physics.env import PhysicsEnv
 from envs.physics.pool import TaskPool, available_cores
 from envs.physics.suite import SuiteError
 from envs.simulators.base import WORLD_OPTIONS, Simulator
+from envs.simulators.compiling import compile_parts
 from envs.simulators.state_experts.base import StateDecoder
 from envs.simulators.tokens.text_world import TextWorld
 from envs.specs import ActionMode
@@ -45,7 +46,7 @@ def build_simulator(cfg: Mapping[str, Any], weights: Path | None = None) -> Simu
     """The learned world of the simulator section, with weights if given."""
     section = {name: value for name, value in cfg["simulator"].items() if name not in WORLD_OPTIONS}
     model: Simulator = build(section, "simulator", spec=world_spec(cfg))
-    return load(model, weights).to(device_of(cfg))
+    return compile_parts(load(model, weights).to(device_of(cfg)), cfg["launch"]["compile"])
 
 
 def build_state_decoder(
@@ -55,7 +56,7 @@ def build_state_decoder(
     decoder: StateDecoder = build(
         cfg["simulator"]["state_expert"], "simulator.state_expert", simulator=simulator
     )
-    decoder = load(decoder, weights).to(device_of(cfg))
+    decoder = compile_parts(load(decoder, weights).to(device_of(cfg)), cfg["launch"]["compile"])
     decoder.attach(simulator)
     return decoder
 

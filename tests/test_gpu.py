@@ -37,11 +37,16 @@ def test_the_loop_at_its_smallest(tmp_path: Path) -> None:
     assert result["physics_after"]["episodes"] == 20 and len(result["rounds"]) == 2
 
 
-@pytest.mark.parametrize("simulator", ["unet_small", "dit_small"])
-def test_finetune(simulator: str, tiny_data: Callable[[Embodiment], Path], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("simulator", "compiled"), [("unet_small", "null"), ("dit_small", "null"), ("dit_small", "graphs")]
+)
+def test_finetune(
+    simulator: str, compiled: str, tiny_data: Callable[[Embodiment], Path], tmp_path: Path
+) -> None:
     data = tiny_data(ARM_JOINTS)
     worldloop(
         *("finetune", f"simulator={simulator}", "task=lerobot", f"task.data=[{data}]"),
+        f"launch.compile={compiled}",
         *(f"finetune.data=[{data}]", "task.size=[32,32]", f"runs={tmp_path}", "name=tuned"),
         *("finetune.simulator.fit.steps=2", "finetune.state.fit.steps=2"),
     )

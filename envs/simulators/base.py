@@ -13,10 +13,11 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 
 from envs.rng import noise_generator
 from envs.simulators import memory
+from envs.simulators.compiling import Repeated, begin_step
 from envs.specs import WorldSpec
 
 __all__ = ["WORLD_OPTIONS", "Simulator", "noise_generator", "to_bytes"]
@@ -33,7 +34,7 @@ WORLD_OPTIONS = (
 )
 
 
-class Simulator(nn.Module):
+class Simulator(Repeated):
     """Base of all learned worlds; an engine implements `predict` and `loss`.
 
     Args:
@@ -202,6 +203,8 @@ class Simulator(nn.Module):
             the new frames are unknown here and repeat the last; the state expert fills them in
             (`memory.write_states`).
         """
+        if self.compiled == "graphs":
+            begin_step()
         inputs = memory.build_inputs(state, self.recall(state, future), future)
         frames, features = self.predict(inputs)
         return frames, features.float(), memory.append(state, frames, future)

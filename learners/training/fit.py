@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from envs.precision import mixed_precision
 from envs.ranges import Count, Decay, Natural, NonNegative, Positive
+from envs.simulators.compiling import begin_step, replays
 from learners.training.ahead import Batch, BatchesAhead
 from learners.training.checkpoint import Checkpoints, buffers_of, truncate_log
 from learners.training.interrupt import deferred_signals, leave
@@ -140,7 +141,7 @@ def fit(
     trainee = module if isinstance(module, Trainee) else Trainee(module)
     network, mine, trained = trainee.module, my_share(config.microbatches), trainee.trained
     device = next(network.parameters()).device
-    hidden = getattr(network, "hidden", ())
+    hidden, graphs = getattr(network, "hidden", ()), replays(network)
     optimise = optimise or partial(OPTIMISERS[config.optimiser], hidden=hidden)
     optimisers = optimise(trained, config.lr, config.weight_decay)
     average = twin(trained)
@@ -183,6 +184,8 @@ def fit(
                 for group in optimiser.param_groups:
                     group["lr"] = _rate(config, step) * group.get("lr_scale", 1.0)
                 optimiser.zero_grad(set_to_none=True)
+            if graphs:
+                begin_step()
             rows = []
             for _ in mine:
                 waiting_since = time.perf_counter()

@@ -96,7 +96,7 @@ def pretrained(
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         old, new, kept = (
-            _scripted(cfg, folder / part, base, count)
+            scripted(cfg, folder / part, base, count)
             for part, base, count in (("old", 0, 48), ("new", 1000, 8), ("kept", 2000, 12))
         )
         for seed in seeds:
@@ -130,7 +130,7 @@ def _share_codec(first: nn.Module, world: nn.Module) -> None:
         world.get_submodule("codec").load_state_dict(codec.state_dict())
 
 
-def _scripted(cfg: Mapping[str, Any], folder: Path, base: int, count: int) -> ClipStore:
+def scripted(cfg: Mapping[str, Any], folder: Path, base: int, count: int) -> ClipStore:
     """Scripted episodes of growing noise."""
     pool, robot = build_pool(cfg), world_spec(cfg).embodiment
     try:

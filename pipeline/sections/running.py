@@ -38,6 +38,7 @@ class LocalSection:
 
     backend: Literal["local"]
     device: Annotated[str, MinLen(1)]
+    compile: Literal["blocks", "graphs"] | None
     workers: Natural
 
 
@@ -47,6 +48,7 @@ class RaySection:
 
     backend: Literal["ray"]
     device: Annotated[str, MinLen(1)]
+    compile: Literal["blocks", "graphs"] | None
     workers: Natural
     address: Name
     cpus: Natural

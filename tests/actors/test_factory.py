@@ -62,7 +62,7 @@ def config(*folders: Path, **simulator: Any) -> dict[str, Any]:
         "task": {**task, "mode": "absolute"},
         "simulator": {**AROUND, **simulator},
         "policy": section("policy/chunk_gaussian", "absolute"),
-        "launch": {"device": "cpu"},
+        "launch": {"device": "cpu", "compile": None},
     }
 
 

@@ -7,10 +7,12 @@ clean, the future is denoised along the flow.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 
 from envs.simulators.base import Simulator, noise_generator, to_bytes
 from envs.simulators.dit.augment import augment_memory_frames, augment_memory_latents, chosen_clips
@@ -23,6 +25,7 @@ from envs.simulators.stepwise import lost_jumps
 from envs.simulators.tokenizers.autoencoder import STRIDE, Codec
 from envs.specs import WorldSpec
 
+_BUSY = 1024  # width from which a block's launches take less time than its work
 MEMORY_NOISE = 1e-4 / (1 + 1e-4)  # the noise level at which memory stands, as released
 
 
@@ -111,6 +114,12 @@ class LatentWorld(Simulator):
         return clips.unflatten(0, latents.shape[:2]).transpose(1, 2)
 
     # -- contract
+    def repeated(self) -> Iterator[tuple[nn.Module, bool]]:
+        """See Repeated; the blocks of a large trunk keep a GPU busy, those of a small one do not."""
+        small = self.net.shape.width < _BUSY
+        yield from ((block, small) for block in self.net.transformer_blocks)
+        yield from ((part, False) for part in self.codec.repeated())
+
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; noise comes from (seed, chunk_index), features from the last step."""
         latents, features = self._denoise(inputs)

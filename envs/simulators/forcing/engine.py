@@ -7,13 +7,13 @@ their h actions, which are denoised at once; then the window moves by h.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 
 from envs.conditioning import Pace, pose_map_cells, pose_map_channels, render_ray_map
 from envs.ranges import Count
@@ -113,6 +113,10 @@ class ForcingSimulator(Blockwise):
         return memory.recall(state, self.context, newest=True)
 
     # -- generating
+    def repeated(self) -> Iterator[tuple[nn.Module, bool]]:
+        """See Repeated; the keys that blocks keep grow with the window, so no graph can replay them."""
+        yield from ((block, False) for block in self.net.blocks)
+
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; features are those of the last step, means over each view of each frame."""
         latents, features = self._generate(inputs)

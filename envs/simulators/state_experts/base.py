@@ -7,14 +7,15 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 
 from envs.embodiment import Embodiment
 from envs.simulators import memory
 from envs.simulators.base import Simulator
+from envs.simulators.compiling import Repeated
 
 
-class StateDecoder(nn.Module):
+class StateDecoder(Repeated):
     """Turns features and commands into robot states.
 
     Args:

@@ -6,6 +6,7 @@ actions and states is padded with zeros.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import cast
 
@@ -112,6 +113,10 @@ class FlowStateDecoder(StateDecoder):
         self.net, self.sampler, self.time_scale, self.prediction = net, sampler, time_scale, prediction
         self.read_tokens = slice(None if read_last is None else -read_last, None)
         self.tokens = StateTokens(simulator.spec.embodiment)
+
+    def repeated(self) -> Iterator[tuple[nn.Module, bool]]:
+        """See Repeated; a chunk's few tokens keep no GPU busy."""
+        yield from ((block, True) for block in self.net.pose_blocks)
 
     def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
         """See StateDecoder.normalise."""

@@ -4,7 +4,7 @@ pixels to 16 channels.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import torch
 import torch.nn.functional as F
@@ -39,6 +39,10 @@ class Codec(nn.Module):
                 f"task.chunk={frames} must be 1 + a multiple of {self.period} for this autoencoder"
             )
         return 1 + (frames - 1) // self.period
+
+    def repeated(self) -> Iterator[nn.Module]:
+        """Parts that are worth compiling (compiling.py); here none is."""
+        return iter(())
 
     def encode(self, frames: Tensor) -> Tensor:
         """Stills [N, 3, H, W] -> normalised latents [N, C, H / 8, W / 8]."""

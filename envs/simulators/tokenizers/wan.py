@@ -4,11 +4,13 @@ first.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
 from diffusers import AutoencoderKLWan
-from torch import Tensor
+from diffusers.models.autoencoders.autoencoder_kl_wan import WanCausalConv3d, WanRMS_norm
+from torch import Tensor, nn
 
 from envs.simulators.tokenizers.autoencoder import STRIDE, Codec
 
@@ -28,6 +30,8 @@ class WanCodec(Codec):
     def __init__(self, vae: AutoencoderKLWan, pixels: int = 3 * 384 * 512):
         super().__init__()
         self.vae, self.pixels = vae.requires_grad_(False), pixels
+        # cuDNN's convolutions then need not turn what they read
+        nn.utils.convert_conv3d_weight_memory_format(vae, torch.channels_last_3d)
         self.channels, self.period = int(vae.config.z_dim), int(vae.config.scale_factor_temporal)
         if int(vae.config.scale_factor_spatial) != STRIDE:
             raise ValueError(
@@ -41,6 +45,13 @@ class WanCodec(Codec):
             self.register_buffer(
                 name, torch.tensor(values, dtype=torch.float32).view(1, -1, 1, 1, 1), persistent=False
             )
+
+    def repeated(self) -> Iterator[nn.Module]:
+        """See Codec; norms, and convolutions with their padding and the frames kept from before. A residual
+        block would be compiled anew for each place it has in the list of kept frames.
+        """
+        kinds = (WanCausalConv3d, WanRMS_norm)
+        return (part for part in self.vae.modules() if isinstance(part, kinds))
 
     @classmethod
     def load(cls, folder: Path) -> WanCodec:

@@ -11,13 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 
 from envs.ranges import Count, Decay, NonNegative, Positive
+from envs.simulators.base import Simulator
+from envs.simulators.compiling import compile_parts
 from envs.simulators.stepwise import Stepwise
 from learners.stages.distill.method import Generated, Method, Turn, spread
 from learners.training.fit import FitConfig
@@ -51,7 +53,8 @@ class DMD2(Method):
         critic_betas: tuple[Decay, Decay],
         critic_weight_decay: NonNegative,
     ):
-        critic = deepcopy(teacher)
+        copied = cast(Simulator, deepcopy(teacher))
+        critic: Any = compile_parts(copied, cast(Simulator, teacher).compiled)
         super().__init__(teacher, student, config)
         critic.codec, self.critic = self.student.codec, critic
         self.critic_updates, self.shift, self.critic_shift = critic_updates, shift, critic_shift

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.benches import gesim as bench
-from pipeline.benches.gesim_floor import goal_line
+from pipeline.benches.gesim import chunk as bench
+from pipeline.benches.gesim.floor import goal_line
 from pipeline.config import load_config
 from tests.envs.simulators.gesim_tiny import NET, SPEC, VAE
 
@@ -34,4 +34,6 @@ def test_the_bench_times_chunks_their_parts_and_single_changes(
         "the text's keys computed anew for every view, block and step",
         "views encoded and decoded one after another",
     ]
-    assert "torch.compile was not tried" in said[8] and said[-1] == goal_line(bench.FULL, "CPU")
+    assert "torch.compile was not tried" in said[8]
+    assert [line.partition(":")[0].strip() for line in said[10:12]] == ["all weights", "adapters of rank 16"]
+    assert said[-1] == goal_line(bench.FULL, "CPU")

@@ -17,8 +17,9 @@ from envs.episodes.formats.foreign import Cut, read_foreign
 from envs.simulators.dit.shape import DiTShape
 from envs.simulators.samplers import DISTILLED, Distilled
 from envs.targets import ConfigError
-from pipeline.benches.gesim import FULL, gesim
-from pipeline.benches.gesim_floor import count_flops, goal_line
+from pipeline.benches.gesim.chunk import gesim
+from pipeline.benches.gesim.floor import count_flops, goal_line
+from pipeline.benches.gesim.world import FULL
 from pipeline.cli import tools
 from pipeline.commands.finetune import build_finetune
 from pipeline.commands.serving import build_session_host

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import resource
 import shutil
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -20,84 +19,17 @@ import torch
 from tensordict import TensorDict
 
 from actors.process import device_of
-from envs.embodiment import ActionKind, Arm, Camera, Embodiment, Robot
 from envs.precision import mixed_precision
-from envs.rng import constant_generator, seed_process
+from envs.rng import seed_process
+from envs.simulators.compiling import Compile, compile_parts
 from envs.simulators.gesim.engine import GESimulator
 from envs.simulators.gesim.state_expert import GESimStateExpert
-from envs.specs import WorldSpec
-from pipeline.benches.gesim_floor import GOAL, PROMPT, floor
+from pipeline.benches.gesim.floor import GOAL, floor
+from pipeline.benches.gesim.updates import updates
+from pipeline.benches.gesim.world import FULL, MEMORY, SMALL, SMALL_NET, SMALL_VAE, build, sessions
+from pipeline.benches.timing import best, now
 
-_JOINTS = tuple(f"{side}_joint_{k}" for side in ("left", "right") for k in range(8))
-# GE-Sim's robot; what its kinematics are does not matter where pose maps are given.
-_ROBOT = Embodiment(
-    robot="gesim",
-    action_names=_JOINTS,
-    action_kind=ActionKind.JOINTS,
-    delta=False,
-    arms=(Arm("left", tuple(range(7)), 7), Arm("right", tuple(range(8, 15)), 15)),
-    state_names=_JOINTS,
-    cameras=tuple(Camera(name, (384, 512), calibrated=True) for name in ("head", "left", "right")),
-    fps=30.0,
-    kinematics=Robot("", ((), ()), ("", "")),
-)
-_MEMORY = 4
-FULL = WorldSpec(_ROBOT, (384, 512), 25, pose_map=True, ray_map=True)
-SMALL = WorldSpec(_ROBOT, (96, 128), 25, pose_map=True, ray_map=True)
-SMALL_NET: dict[str, Any] = {
-    "num_attention_heads": 4,
-    "attention_head_dim": 64,
-    "num_layers": 6,
-    "text_embed_dim": 64,
-    "adaln_lora_dim": 64,
-    "pose_num_attention_heads": 4,
-    "pose_attention_head_dim": 32,
-}
-SMALL_VAE: dict[str, Any] = {"base_dim": 16}
-_TRAINING = {"shift": 1.0, "foreground": 0.0, "augment": 0.0, "checkpointing": False}
-
-
-def build(spec: WorldSpec, net: dict[str, Any], vae: dict[str, Any]) -> GESimulator:
-    """GE-Sim with random weights, the released sampler and a prompt as long as the floor's."""
-    sampling = {"kind": "distilled", "steps": 0}
-    world = GESimulator(spec, _MEMORY, None, "right", sampling, _TRAINING, {"net": net, "vae": vae})
-    world.prompt = torch.zeros(1, PROMPT, world.net.shape.text_embed_dim)
-    return world
-
-
-def _inputs(world: GESimulator, batch: int, device: torch.device) -> tuple[TensorDict, TensorDict]:
-    """Sessions that have begun, and the next chunk's future."""
-    spec = world.spec
-    generator = constant_generator(0)
-    height, width = spec.size
-
-    def pictures(*lead: int) -> torch.Tensor:
-        return torch.randint(
-            0, 255, (*lead, spec.views, 3, height, width), dtype=torch.uint8, generator=generator
-        )
-
-    intrinsic = torch.tensor([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1.0]])
-    first = TensorDict(
-        {
-            "frames": pictures(batch),
-            "command": torch.zeros(batch, spec.action_dim),
-            "state": torch.zeros(batch, spec.state_dim),
-            "intrinsic": intrinsic.expand(batch, spec.views, 3, 3).contiguous(),
-            "c2w": torch.eye(4).expand(batch, spec.views, 4, 4).contiguous(),
-            "pose_map": pictures(batch),
-        },
-        [batch],
-    )
-    future = TensorDict(
-        {
-            "commands": torch.zeros(batch, spec.chunk, spec.action_dim),
-            "pose_map": pictures(batch, spec.chunk),
-            "c2w": torch.eye(4).expand(batch, spec.chunk, spec.views, 4, 4).contiguous(),
-        },
-        [batch],
-    )
-    state = world.reset(first.to(device), torch.arange(batch, device=device))
-    return state, future.to(device)
+_COMPILED: tuple[Compile, ...] = ("blocks", "graphs")
 
 
 class Watch:
@@ -106,33 +38,18 @@ class Watch:
     def __init__(self, device: torch.device):
         self.device, self.spent = device, dict[str, float]()
 
-    def _now(self) -> float:
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-        return time.perf_counter()
-
     def wrap(self, owner: Any, method: str, name: str) -> Callable[[], None]:
         """Time a method from now on; returns what undoes it."""
         call = getattr(owner, method)
 
         def timed(*args: Any, **more: Any) -> Any:
-            began = self._now()
+            began = now(self.device)
             out = call(*args, **more)
-            self.spent[name] = self.spent.get(name, 0.0) + self._now() - began
+            self.spent[name] = self.spent.get(name, 0.0) + now(self.device) - began
             return out
 
         setattr(owner, method, timed)
         return lambda: setattr(owner, method, call)
-
-    def measure(self, work: Callable[[], Any], repeats: int) -> float:
-        """Least seconds of a run, after one to warm up."""
-        work()
-        times = []
-        for _ in range(repeats):
-            began = self._now()
-            work()
-            times.append(self._now() - began)
-        return min(times)
 
 
 @dataclass(frozen=True)
@@ -151,14 +68,14 @@ class Served:
 
     def seconds(self, batch: int, repeats: int) -> float:
         """Least seconds of a chunk of so many sessions."""
-        state, future = _inputs(self.world, batch, self.watch.device)
+        state, future = sessions(self.world, batch, self.watch.device)
         with mixed_precision(self.watch.device, True):
-            return self.watch.measure(partial(self.step, state, future), repeats)
+            return best(partial(self.step, state, future), repeats, self.watch.device)
 
 
 def gesim(cfg: Mapping[str, Any]) -> None:
-    """Seconds a chunk and frames per second at batch 1, 2, 4, 8, memory, parts, and variants, each as a ratio
-    to the plain run; on launch.device.
+    """Seconds a chunk and frames per second at several batches, memory, parts, and variants, each as a ratio
+    to the plain run; then what an update of distilling takes; on launch.device.
 
     Raises:
         ConfigError: if launch.device asks for a GPU that is not there.
@@ -167,8 +84,9 @@ def gesim(cfg: Mapping[str, Any]) -> None:
     big = device.type == "cuda"
     seed_process(0)
     spec, sizes = (FULL, ({}, {})) if big else (SMALL, (SMALL_NET, SMALL_VAE))
-    world = build(spec, *sizes)
-    expert = GESimStateExpert(world, None)
+    with device:
+        world = build(spec, *sizes)
+        expert = GESimStateExpert(world, None)
     for part in (world, expert):
         part.to(device, torch.bfloat16 if big else torch.float32).eval()
     served = Served(world, expert, Watch(device))
@@ -176,9 +94,9 @@ def gesim(cfg: Mapping[str, Any]) -> None:
     chip = torch.cuda.get_device_name(device) if big else "CPU"
     size = f"{spec.views} x {spec.size[0]} x {spec.size[1]}"
     print(f"{count / 1e6:.0f}M parameters, {size}, {spec.chunk} frames, {chip}")
-    repeats = 5 if big else 2
+    repeats = 3 if big else 2
     plain = 0.0
-    for batch in (1, 2, 4, 8):
+    for batch in (1, 2) if big else (1, 2, 4, 8):
         if big:
             torch.cuda.reset_peak_memory_stats(device)
         seconds = served.seconds(batch, repeats)
@@ -195,13 +113,16 @@ def gesim(cfg: Mapping[str, Any]) -> None:
         )
     _parts(served)
     _variants(served, plain, repeats)
-    floor(FULL, _MEMORY, chip)
+    del served, world, expert, part
+    print("an update of distilling (DMD2), one clip:")
+    updates(spec, sizes, device, "blocks" if big else None)
+    floor(FULL, MEMORY, chip)
 
 
 def _parts(served: Served) -> None:
     """Where the seconds of one chunk go at batch 1."""
     world, watch = served.world, served.watch
-    state, future = _inputs(world, 1, watch.device)
+    state, future = sessions(world, 1, watch.device)
     names = (
         (world, "encode_stills", "memory encoded"),
         (world, "conditioning", "conditioning"),
@@ -215,9 +136,9 @@ def _parts(served: Served) -> None:
         served.step(state, future)
         undo = [watch.wrap(*name) for name in names]
         watch.spent.clear()
-        began = watch._now()
+        began = now(watch.device)
         served.step(state, future)
-        total = watch._now() - began
+        total = now(watch.device) - began
     for call in undo:
         call()
     parts = {**watch.spent, "bookkeeping": total - sum(watch.spent.values())}
@@ -248,11 +169,11 @@ def _variants(served: Served, plain: float, repeats: int) -> None:
     pixels, codec.pixels = codec.pixels, 1
     ratio("views encoded and decoded one after another")
     codec.pixels = pixels
-    if served.watch.device.type == "cuda" or shutil.which("g++"):
-        for number, block in enumerate(blocks):
-            net.transformer_blocks[number] = torch.compile(block)
-        ratio("blocks compiled (torch.compile)")
-        for number, block in enumerate(blocks):
-            net.transformer_blocks[number] = block
-    else:
+    if not shutil.which("g++"):
         print("  torch.compile was not tried: this machine has no C++ compiler")
+        return
+    for how in _COMPILED:
+        for part in (world, served.expert):
+            compile_parts(part, how)
+        ratio(f"launch.compile={how}")
+        _parts(served)
