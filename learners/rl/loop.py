@@ -75,7 +75,8 @@ def train_rl(
 
     Raises:
         TrainingDiverged: on numbers that are not finite.
-        FleetError: if too many episodes are lost.
+        FleetError: if too many episodes are lost. Whatever stops a rollout, a checkpoint of the iterations
+            before it is written first.
         KeyboardInterrupt, SystemExit: after SIGINT and SIGTERM, once a checkpoint is written.
     """
     if fleet is not None:
@@ -129,7 +130,7 @@ def train_rl(
         assert feed is not None, "only the leading worker is asked"
         return feed.gather(iteration, weights)
 
-    def save(iteration: int) -> None:
+    def facts_of(iteration: int) -> dict[str, Any]:
         facts = {
             "iteration": iteration,
             "over": over,
@@ -141,7 +142,7 @@ def train_rl(
         }
         if feed is not None:
             facts |= {"wave": feed.upcoming(iteration), "episodes_per_job": feed.fleet.episodes}
-        checkpoints.save(iteration, state(), facts)
+        return facts
 
     bar = tqdm(
         total=config.iterations, initial=first, desc=name, unit="it", dynamic_ncols=True, disable=not leads()
@@ -156,7 +157,15 @@ def train_rl(
             began = time.perf_counter()
             for group, lr in zip(optimiser.param_groups, rates, strict=True):
                 group["lr"] = lr * (1 - iteration / config.iterations)
-            batch, supply = from_leader(partial(gather, iteration, trainee(trained_weights, policy)))
+            before = facts_of(iteration)
+            try:
+                batch, supply = from_leader(partial(gather, iteration, trainee(trained_weights, policy)))
+            except Exception:
+                # nothing was learned yet of this iteration, as where a judge's budget is used up; what was
+                # learned before is kept, and what was lost is asked for again
+                if iteration > first and iteration % config.checkpoint_every:
+                    checkpoints.save(iteration, state(), before)
+                raise
             collected = time.perf_counter()
             starts.check_groups(batch, algorithm.group_size)
             seed = update_seed(config.seed, iteration)
@@ -210,7 +219,7 @@ def train_rl(
             over = enough or iteration + 1 == config.iterations
             stop = from_leader(stop_requested)
             if (iteration + 1) % config.checkpoint_every == 0 or over or stop:
-                save(iteration + 1)
+                checkpoints.save(iteration + 1, state(), facts_of(iteration + 1))
             if stop:
                 bar.close()
                 tqdm.write(
