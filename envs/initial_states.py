@@ -7,6 +7,7 @@ lies beyond their end is the critic's to say.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -90,13 +91,13 @@ class DecisionPoints(InitialStates):
         return self.store.until(self.episode[which], now, capacity), now + 1
 
 
-def shared_out(inside: int, extra: int, share: float) -> list[int]:
-    """Numbers of starts, `inside` ones and then `extra` ones, each as often as makes the extra ones about
-    `share` of them all.
+def shared_out(inside: Sequence[int], extra: Sequence[int], share: float) -> list[int]:
+    """Numbers of starts, the `inside` ones and then the `extra` ones, each as often as makes the extra ones
+    about `share` of them all.
     """
-    odds = share / (1 - share) * inside / extra
+    odds = share / (1 - share) * len(inside) / len(extra)
     often, rare = max(1, round(1 / odds)), max(1, round(odds))
-    return list(range(inside)) * often + list(range(inside, inside + extra)) * rare
+    return list(inside) * often + list(extra) * rare
 
 
 def decision_points(store: ClipStore, episodes: Tensor) -> tuple[Tensor, Tensor]:

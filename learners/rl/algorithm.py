@@ -27,9 +27,9 @@ class RLConfig:
             who runs them.
         threads: that torch computes one job's rollout with, on whatever machine; with another number sums are
             taken in another order and the last bits differ.
-        starts: imagined episodes begin "inside" the newest recorded ones, at any of their chunks, or at the
-            "first" frames of all. A world errs more with every chunk it builds on its own; from inside, short
-            episodes meet every stage of the task.
+        starts: imagined episodes begin "inside" the newest recorded ones, at any of their chunks, at those
+            of "key" frames (episodes/key_frames.py), or at the "first" frames of all. A world errs more with
+            every chunk it builds on its own; from inside, short episodes meet every stage of the task.
         chunks: of an imagined episode, None for as many as the task has. What the judge's progress, and a
             critic if there is one, expect of the rest stands in for it.
         schedule: "sync" learns from rollouts of the newest policy only; "async" lets hosts run on meanwhile.
@@ -67,7 +67,7 @@ class RLConfig:
     envs: Count
     shards: Count
     threads: Count
-    starts: Literal["inside", "first"]
+    starts: Literal["inside", "key", "first"]
     chunks: Count | None
     schedule: Literal["sync", "async"]
     max_policy_lag: Natural

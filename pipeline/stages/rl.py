@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from actors.factory import build_algorithm, build_policy, open_clips
 from actors.fleets.fleet import Fleet, FleetError
@@ -15,6 +17,7 @@ from actors.process import prepare_process
 from actors.rollouts.recipe import Recipe
 from actors.world_config import rewards_of
 from envs.episodes.clips import ClipStore
+from envs.episodes.key_frames import key_points
 from envs.initial_states import decision_points, shared_out
 from envs.rng import Purpose, episode_seeds
 from envs.specs import CHUNK
@@ -72,7 +75,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         freeze_perception(policy)
         anchor.encode()
     algorithm = build_algorithm(cfg, policy)
-    inside = newest_episodes(store, learning_episodes(store)) if settings.starts == "inside" else None
+    inside = None if settings.starts == "first" else newest_episodes(store, learning_episodes(store))
     data, more = (datasets(inputs.folders(role)) for role in ("data", "starts"))
     extra = range(len(store), len(store) + (len(open_clips(cfg, more)) if more else 0))
     knew, decisions = _warm_up(cfg, policy, algorithm, store, settings.seed, number)
@@ -93,8 +96,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     )
     fleet = build_fleet(recipe) if leads() else None
     try:
-        begun = len(store) if inside is None else len(decision_points(store, inside)[0])
-        starts = starts_of(cfg, begun, len(extra))
+        starts = starts_of(cfg, *_begun(store, inside, settings.starts == "key"), len(extra))
         true = TrueExperience(anchor, decisions)
         watch = true_success(cfg, settings, inputs.weights("policy"))
         stats = train_rl(fleet, policy, algorithm, settings, folder, starts, true=true, watch=watch)
@@ -108,11 +110,22 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return {"lr": lr, **knew, **stats, **last}
 
 
-def starts_of(cfg: Cfg, begun: int, extra: int) -> Starts:
-    """Where imagined episodes begin: at `begun` starts and the `extra` ones that stand after them."""
+def _begun(store: ClipStore, inside: Tensor | None, key: bool) -> tuple[int, Sequence[int]]:
+    """How many starts recorded episodes offer, and the numbers of those that are taken."""
+    if inside is None:
+        return len(store), range(len(store))
+    episode, frame = decision_points(store, inside)
+    chosen = key_points(store, episode, frame).nonzero().flatten().tolist() if key else range(len(frame))
+    return len(frame), chosen
+
+
+def starts_of(cfg: Cfg, begun: int, chosen: Sequence[int], extra: int) -> Starts:
+    """Where imagined episodes begin: at the `chosen` ones of `begun` starts, and at the `extra` ones that
+    stand after all of these.
+    """
     share, shared = cfg["extra_starts"]["share"], cfg["simulator"]["shared_noise"]
-    chosen = shared_out(begun, extra, share) if extra else range(begun)
-    return Starts(chosen, 0 if shared else begun + extra)
+    pool = shared_out(chosen, range(begun, begun + extra), share) if extra else chosen
+    return Starts(pool, 0 if shared else begun + extra)
 
 
 def what_the_judge_needs(cfg: Cfg, fleet: Fleet | None) -> str:

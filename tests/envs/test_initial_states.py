@@ -65,7 +65,7 @@ def test_first_frames_of_further_episodes_are_starts(tiny_store: Stores, robot: 
 @pytest.mark.parametrize(("inside", "extra"), [(4000, 320), (300, 300), (50, 1000)])
 def test_extra_starts_get_about_their_share(inside: int, extra: int) -> None:
     for share in (0.2, 0.5):
-        pool = shared_out(inside, extra, share)
+        pool = shared_out(range(inside), range(inside, inside + extra), share)
         assert set(pool) == set(range(inside + extra))
         assert sum(number >= inside for number in pool) / len(pool) == pytest.approx(share, abs=0.12)
 

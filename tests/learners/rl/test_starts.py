@@ -44,7 +44,9 @@ def asked_for(starts: Starts, folder: Path) -> list[list[int]]:
     return fleet.asked
 
 
-@pytest.mark.parametrize("pool", [range(7), shared_out(4, 3, 0.5)], ids=["plain", "with extra starts"])
+@pytest.mark.parametrize(
+    "pool", [range(7), shared_out(range(4), range(4, 7), 0.5)], ids=["plain", "with extra starts"]
+)
 def test_groups_meet_noise_of_their_own_only_where_it_is_not_shared(pool: list[int], tmp_path: Path) -> None:
     shared, own = (asked_for(Starts(pool, count), tmp_path / str(count)) for count in (0, 7))
     for alike, apart in zip(shared, own, strict=True):
@@ -56,8 +58,9 @@ def test_groups_meet_noise_of_their_own_only_where_it_is_not_shared(pool: list[i
 def test_the_config_says_whether_noise_is_shared() -> None:
     for words, count in (([], 0), (["simulator.shared_noise=false"], 7)):
         cfg = load_config(words)
-        assert starts_of(cfg, 7, 0) == Starts(range(7), count)
-        assert starts_of(cfg, 4, 3) == Starts(shared_out(4, 3, cfg["extra_starts"]["share"]), count)
+        share = cfg["extra_starts"]["share"]
+        assert starts_of(cfg, 7, range(7), 0) == Starts(range(7), count)
+        assert starts_of(cfg, 4, [0, 2], 3) == Starts(shared_out([0, 2], range(4, 7), share), count)
 
 
 def test_a_group_that_was_torn_apart_is_found() -> None:
