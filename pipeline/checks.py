@@ -229,6 +229,12 @@ def _together(cfg: Cfg) -> Iterator[str]:
         )
     if rl["evaluate_every"] and not task.get("suite"):
         yield f"rl.evaluate_every={rl['evaluate_every']} needs physics, which this task has not; set it to 0"
+    judge, world = target(cfg["judge"], "judge"), target(cfg["simulator"], "simulator")
+    if getattr(judge, "asks_world", False) and not getattr(world, "says_done", True):
+        yield (
+            f"judge={cfg['judge']['_target_']} goes by what the simulator says of a task's end, and"
+            f" {world.__name__} says nothing; choose simulator=tokens, or judge=golden_goal"
+        )
     yield from _learning(cfg)
     yield from _distilling(cfg["distill"])
     try:

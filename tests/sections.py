@@ -24,8 +24,12 @@ def section(choice: str, mode: str = "relative", root: Path = CONFIGS, **changes
         changes: values for keys of the section; of nested sections, dictionaries of what differs there.
     """
     text = (root / f"{choice}.yaml").read_text().replace("${task.mode}", mode)
-    text = text.replace("${cameras}", "all")
-    return merged(yaml.safe_load(text), changes)
+    loaded = yaml.safe_load(text.replace("${cameras}", "all"))
+    group = choice.rpartition("/")[0]
+    for base in loaded.pop("defaults", []):
+        if base != "_self_":
+            loaded = merged(section(f"{group}/{base}", mode, root), loaded)
+    return merged(loaded, changes)
 
 
 def merged(old: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

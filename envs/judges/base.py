@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
 from envs.specs import Status
+
+if TYPE_CHECKING:
+    from envs.simulators.base import Simulator
 
 
 class JudgeError(RuntimeError):
@@ -46,6 +49,7 @@ class Judge(nn.Module):
     Attributes:
         needs_labels: whether it is taught by recorded success, and cannot do without.
         reads_features: whether `score` must be given the simulator's features of the frames.
+        asks_world: whether what the simulator says of a task's end decides (Simulator.says_done).
         reads_instruction: whether its scores depend on the words; one that is blind to them cannot tell tasks
             apart.
         discount: per frame, of the progress that `loss` is given: discount ** (frames until success).
@@ -58,6 +62,7 @@ class Judge(nn.Module):
     threshold: Tensor
     needs_labels = False
     reads_features = False
+    asks_world = False
     reads_instruction = True
     discount = 1.0
     calibrates = True
@@ -95,6 +100,11 @@ class Judge(nn.Module):
             share: fraction of successes among the labels, by which the classes are balanced.
         """
         raise NotImplementedError
+
+    def attach(self, simulator: Simulator) -> None:
+        """Take over from the simulator whose video it shall judge what it needs of it; here nothing. Asked
+        before it is calibrated, and again whenever the simulator has learned.
+        """
 
     def facts(self) -> dict[str, Any]:
         """Numbers and texts that results say of the judge, such as what it measures by and how often it

@@ -58,8 +58,12 @@ class GoalJudge(Judge):
         """The goals of episodes that began with `first` uint8 [B, V, 3, H, W], on its device."""
         raise NotImplementedError
 
-    def done(self, frames: Tensor, instruction: list[str], progress: Tensor) -> Tensor:
-        """Probabilities [B, T] that the task is done in frames; here it is progress itself."""
+    def done(
+        self, frames: Tensor, instruction: list[str], progress: Tensor, features: Tensor | None = None
+    ) -> Tensor:
+        """Probabilities [B, T] that the task is done in frames; here it is progress itself. Features as of
+        `score`.
+        """
         return progress
 
     def unknown(self, success: Tensor, status: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
@@ -80,7 +84,7 @@ class GoalJudge(Judge):
         goals = self.goals(first_here, instruction)
         begin = self._away(first_here[:, None], goals.frames).clamp(min=_NEAREST)
         progress = (1 - self._away(frames_here, goals.frames) / begin).clamp(0, 1)
-        success = self.done(frames_here, instruction, progress)
+        success = self.done(frames_here, instruction, progress, features)
         status = judgement_status(success + progress)
         success, status = self.unknown(success, status, goals.known)
         return Judgement(*(part.to(frames.device) for part in (success, progress, status)))

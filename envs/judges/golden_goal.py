@@ -115,7 +115,9 @@ class GoldenGoalJudge(GoalJudge):
             frames.to(first.device), torch.tensor([found[key][1] for key in keys], device=first.device)
         )
 
-    def done(self, frames: Tensor, instruction: list[str], progress: Tensor) -> Tensor:
+    def done(
+        self, frames: Tensor, instruction: list[str], progress: Tensor, features: Tensor | None = None
+    ) -> Tensor:
         """See GoalJudge.done: what the text world says of each frame by itself, so that it hangs on no cut of
         the video; progress, if it says nothing.
         """

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 
 from envs.rng import noise_generator
 from envs.simulators import memory
@@ -43,6 +43,7 @@ class Simulator(Repeated):
 
     Attributes:
         feature_shape: of the features that state experts read, without the batch.
+        says_done: whether it learns to say in which frames a task is done; `done_head` is then there.
         hidden: names of the layers that optimisers may take for hidden ones (training/optimisers.py);
             none for all.
         recent_memory: whether memory is the newest frames instead of some that are spread over the past.
@@ -51,6 +52,7 @@ class Simulator(Repeated):
     """
 
     feature_shape: tuple[int, ...]
+    says_done: bool = False
     hidden: tuple[str, ...] = ()
     recent_memory: bool = False
     per_frame_moves: bool = False
@@ -121,6 +123,18 @@ class Simulator(Repeated):
     def features(self, inputs: TensorDict) -> Tensor:
         """Only the features of `predict`, for training the state expert."""
         return self.predict(inputs)[1]
+
+    def done_head(self) -> nn.Module:
+        """A copy of what says whether the task is done: pooled features [N, D] of chunks to probabilities
+        [N, K], one a frame.
+
+        Raises:
+            ValueError: of an engine that does not say it.
+        """
+        raise ValueError(
+            f"{type(self).__name__} does not say whether a task is done; choose simulator=tokens, or"
+            " judge=golden_goal"
+        )
 
     def coded(self, frames: Tensor) -> Tensor | None:
         """Frames uint8 [B, T, V, 3, H, W] as its autoencoder keeps each of them: how sharp it can be where it

@@ -218,6 +218,7 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     model, world = build_judge(cfg, inputs.weights("warm")), build_simulator(cfg, inputs.weights("simulator"))
     if golden := inputs.weights("text_world"):
         load(model.text_world, golden).requires_grad_(False)
+    model.attach(world)
     stats: dict[str, Any] = {}
     bf16 = cfg["simulator"]["bf16"]
     if learns(model):

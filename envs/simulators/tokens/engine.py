@@ -23,6 +23,7 @@ from envs.simulators.row_linear import RowLinear
 from envs.simulators.tokenizers.detail import restore_detail
 from envs.simulators.tokenizers.lfq import LookupFreeTokenizer
 from envs.simulators.tokens.decoding import Draws
+from envs.simulators.tokens.done import ChunkDone
 from envs.simulators.tokens.transformer import Trunk
 from envs.simulators.tokens.video import Lesson, TokenTraining, TokenVideo
 from envs.specs import WorldSpec
@@ -55,8 +56,7 @@ class TokensSimulator(Simulator):
         codec, net, conditioning, decoding, training: see TokenVideo.
 
     Features also tell whether the task is done, by recorded success: a head that learns beside the tokens
-    reads the mean over each frame's places. Judges that read features have it; what it says itself decides
-    nothing.
+    reads the mean over each frame's places. Under judge=golden_goal_action it decides what a success is.
 
     Raises:
         ValueError: if sizes do not fit.
@@ -66,6 +66,7 @@ class TokensSimulator(Simulator):
     hidden = ("blocks",)
     recent_memory = True
     per_frame_moves = True
+    says_done = True
 
     def __init__(
         self,
@@ -114,6 +115,12 @@ class TokensSimulator(Simulator):
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is decoded to pixels."""
         return self.generate(inputs).features
+
+    def done_head(self) -> ChunkDone:
+        """See Simulator.done_head."""
+        head = ChunkDone(self.spec, self.feature_shape)
+        head.head.load_state_dict(self.video.done_head.state_dict())
+        return head
 
     def coded(self, frames: Tensor) -> Tensor:
         """See Simulator.coded."""

@@ -15,11 +15,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from envs.ranges import Count, NonNegative, Share
-from envs.simulators.row_linear import RowLinear
 from envs.simulators.tokenizers.lfq import LookupFreeTokenizer
 from envs.simulators.tokens.blocks import Memory
 from envs.simulators.tokens.conditioning import Conditioning
 from envs.simulators.tokens.decoding import Decoding, Draws
+from envs.simulators.tokens.done import done_head
 from envs.simulators.tokens.transformer import SpatioTemporalTransformer, Trunk, Vocabulary
 from envs.specs import WorldSpec
 from envs.targets import OptionsOf, build, options
@@ -107,9 +107,7 @@ class TokenVideo(nn.Module):
         self.cond_tokens = conditioner.tokens
         self.net = SpatioTemporalTransformer(self.vocabulary, self.trunk, window, conditioner)
         width = self.trunk.width
-        self.done_head = nn.Sequential(
-            nn.LayerNorm(width), RowLinear(width, width), nn.SiLU(), RowLinear(width, 1)
-        )
+        self.done_head = done_head(width)
 
     # -- tokens
     @torch.no_grad()

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from envs.embodiment import Embodiment
 from envs.judges import Judge, Judgement, MissingFeatures, RuleJudge
+from envs.judges.golden_goal_action import ActionGoldenGoalJudge
 from envs.simulators.features import pooled_size
 from envs.specs import Status, WorldSpec, text_to_bytes
 from envs.targets import build, target
@@ -84,6 +85,7 @@ SURROUNDINGS: dict[str, Callable[[], AbstractContextManager[dict[str, Any]]]] = 
     "goal_picture": goal,
     "goal_image": goal,
     "golden_goal": partial(nullcontext, {"text_world": TINY_TEXT_WORLD}),
+    "golden_goal_action": partial(nullcontext, {"text_world": TINY_TEXT_WORLD}),
     "vlm": server,
     "vlm_local": weights,
 }
@@ -94,7 +96,10 @@ IGNORES: dict[str, tuple[str, ...]] = {
     "proxy": ("first frame",),
     "embedding": ("first frame", "frames"),
 }
+# Weights that say where an imagined goal ends, and nothing of frames: golden_goal has them judge frames, too.
+ENDINGS = {"golden_goal_action": ("text_world.video.done_head", "text_world.video.net.norm_seen")}
 FEATURES = (6, 10)  # of a simulator whose features judges read: tokens and their width
+WIDTH = 4  # of one that says itself whether a task is done, for every frame and view of a chunk
 FULL = (
     "_full"  # of a published size, which is counted on the meta device (tests/pipeline/benches/test_size.py)
 )
@@ -129,8 +134,14 @@ def spec(request: pytest.FixtureRequest) -> WorldSpec:
 def judge(options: dict[str, Any], spec: WorldSpec) -> Judge:
     """The judge with random weights."""
     torch.manual_seed(0)
-    context = {"feature_shape": FEATURES} if target(options, "judge").reads_features else {}
+    kind = target(options, "judge")
+    context = {"feature_shape": shape_of(kind, spec)} if kind.reads_features else {}
     return build(options, "judge", spec=spec, **context).eval()  # type: ignore[no-any-return]
+
+
+def shape_of(kind: Judge | type[Judge], spec: WorldSpec) -> tuple[int, ...]:
+    """Of the features that a judge reads."""
+    return ((spec.chunk + spec.views) * WIDTH,) if kind.asks_world else FEATURES
 
 
 Clips = tuple[Tensor, Tensor, list[str], tuple[Tensor, ...]]
@@ -141,7 +152,7 @@ def clips(judge: Judge, spec: WorldSpec, batch: int, frames: int) -> Clips:
     g = torch.Generator().manual_seed(0)
     shape = (batch, frames, spec.views, 3, *spec.size)
     video = torch.randint(0, 256, shape, dtype=torch.uint8, generator=g)
-    features = torch.randn(batch, -(-frames // spec.chunk), pooled_size(FEATURES), generator=g)
+    features = torch.randn(batch, -(-frames // spec.chunk), pooled_size(shape_of(judge, spec)), generator=g)
     texts = [INSTRUCTIONS[k % len(INSTRUCTIONS)] for k in range(batch)]
     return video, video[:, 0], texts, (features,) if judge.reads_features else ()
 
@@ -180,7 +191,7 @@ def test_a_judgement_does_not_depend_on_the_rest_of_the_batch(judge: Judge, spec
     assert torch.allclose(alone.progress, together.progress[1:2], atol=1e-5)
 
 
-def test_every_weight_is_learned_or_at_least_used(judge: Judge, spec: WorldSpec) -> None:
+def test_every_weight_is_learned_or_at_least_used(name: str, judge: Judge, spec: WorldSpec) -> None:
     """What is trained gets a gradient from the loss; what is frozen changes the judgement when it changes."""
     frames, first, texts, seen = clips(judge, spec, 6, 1)
     first = first.flip(0)
@@ -196,6 +207,8 @@ def test_every_weight_is_learned_or_at_least_used(judge: Judge, spec: WorldSpec)
     before = judge.score(frames, first, texts, *seen)
     turn = [*EMBODIMENTS].index(spec.embodiment.robot)  # all robots have the same; they share the work
     for key, value in frozen[turn :: len(EMBODIMENTS)]:
+        if key.startswith(ENDINGS.get(name, ("-",))):
+            continue
         kept = value.detach().clone()
         value.copy_(kept + torch.randn(kept.shape, generator=torch.Generator().manual_seed(0)))
         judge.load_state_dict(judge.state_dict())  # as weights come, so that what hangs on them is made anew
@@ -211,6 +224,10 @@ def test_what_is_submitted_is_fetched(judge: Judge, spec: WorldSpec) -> None:
 
 def test_first_frame_instruction_and_every_view_matter(name: str, judge: Judge, spec: WorldSpec) -> None:
     frames, first, texts, seen = clips(judge, spec, 2, 3)
+    if isinstance(
+        judge, ActionGoldenGoalJudge
+    ):  # success asks neither words nor pictures, and noise nears no goal
+        frames[:, 1:] = (judge.goals(first, texts).frames // 2 + first // 2)[:, None]
     scores, ignored = judge.score(frames, first, texts, *seen), IGNORES.get(name, ())
     assert same(judge.score(frames, 255 - first, texts, *seen), scores) == ("first frame" in ignored)
     assert same(judge.score(frames, first, texts[::-1], *seen), scores) == (not judge.reads_instruction)
