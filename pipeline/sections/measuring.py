@@ -84,6 +84,7 @@ class PolicyValueSection:
     others: Mapping[Name, Choice] | None
     noise: Sequence[Positive]
     experts: Sequence[Share]
+    judged: Literal["chunks", "whole"]
     starts: Annotated[int, Ge(2)]
     repeats: Count
     stochastic: bool

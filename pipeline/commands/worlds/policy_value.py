@@ -65,6 +65,7 @@ def policy_value(cfg: Mapping[str, Any], root: Path) -> str:
         cost = spending.total
     result = {
         **subject.about(),
+        "judged": section["judged"],
         "judged_by": judge.facts(),
         "judge_cost": cost,
         "starts": {task: len(episodes) for task, episodes in starts.items()},

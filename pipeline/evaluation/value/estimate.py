@@ -21,6 +21,7 @@ from pipeline.evaluation.fidelity.masks import ALIKE
 from pipeline.evaluation.value.agreement import Cell
 from pipeline.evaluation.value.candidates import Candidate
 from pipeline.evaluation.value.trials import Imagination, Physics
+from pipeline.evaluation.value.whole import Onlooker
 from pipeline.graph.kept import Kept, Tensors
 
 Cfg = Mapping[str, Any]
@@ -94,12 +95,18 @@ class Comparison:
         """
         # repeats are to draw other noise, whatever the run's episodes share
         drawn = {**self.cfg, "simulator": {**self.cfg["simulator"], "shared_noise": False}}
+        simulator, decoder, judge = parts
+        whole = self.cfg["policy_value"]["judged"] == "whole"
+        if whole:
+            judge = Onlooker(judge, self.cfg["task"]["horizon"] // self.cfg["task"]["chunk"])
+            rewards = {**self.cfg["judge"]["rewards"], "progress": 0.0}
+            drawn["judge"] = {**self.cfg["judge"], "rewards": rewards}
         cells = []
         with self._bar("imagined values") as bar:
             for task, episodes in self.starts.items():
                 first = InitialStates.of(self.store, episodes)
-                env = build_world(drawn, *parts, first, min(_SIDE_BY_SIDE, len(episodes)))
-                mine = {**identity, **self._where(episodes)}
+                env = build_world(drawn, simulator, decoder, judge, first, min(_SIDE_BY_SIDE, len(episodes)))
+                mine = {**identity, **self._where(episodes), **({"judged": "whole"} if whole else {})}
                 imagination = Imagination(self.cfg, env, mine, kept, self.spread)
                 for candidate in self.candidates:
                     known = true.get((task, candidate.name))

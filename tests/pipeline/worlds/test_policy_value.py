@@ -96,6 +96,9 @@ def test_without_physics_values_are_estimated_alone(
     ]
     assert all("true" not in cell for cell in result["cells"])
     assert "Fewer held-out starts than policy_value.starts=32" in said
+    said = policy_value(load_config([*words, "policy_value.judged=whole"]), tmp_path / "run")
+    assert "\n0 parts were reused" in said  # other judgements, kept apart
+    assert json.loads((tmp_path / "run/policy-value.json").read_text())["judged"] == "whole"
     other = "policy_value.others={mine: {_target_: actors.policies.vla.ChunkPolicy, nope: 1}}"
     with pytest.raises(ConfigError, match=r"policy_value\.others\.mine\.nope is not an option"):
         load_config([*words, other])
