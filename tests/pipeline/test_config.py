@@ -83,6 +83,10 @@ def test_mistakes_name_the_key(words: list[str], match: str) -> None:
         load_config(words)
 
 
+# What a choice cannot be without.
+NEEDED = {"task=lerobot": ["task.data=[recordings]"], "judge=golden_goal_action": ["simulator=tokens"]}
+
+
 def test_options_of_a_choice_count_with_that_choice_alone() -> None:
     mine = ["+if_chosen.judge={proxy: {width: 4}, learned: {points: 7}}"]
     mine += ["+if_chosen.task={push: {suite: {hold: 0.2}}}"]
@@ -93,7 +97,8 @@ def test_options_of_a_choice_count_with_that_choice_alone() -> None:
     told = load_config([*mine, "judge=proxy", "judge.width=5", "task.suite={hold: 0.3}"])
     assert (told["judge"]["width"], told["task"]["suite"]["hold"]) == (5, 0.3)
     for name in choices("judge"):  # an experiment's options of its own judge are no other's
-        assert load_config(["experiment=soak", f"judge={name}"])["judge"]
+        beside = NEEDED.get(f"judge={name}", [])
+        assert load_config(["experiment=soak", f"judge={name}", *beside])["judge"]
 
 
 def test_a_distiller_sets_the_learning_rates_of_student_and_critic() -> None:
@@ -137,7 +142,7 @@ def test_hundreds_of_wrong_values_are_all_found(word: str) -> None:
     """
     group = word.partition("=")[0]
     section = SECTIONS.get(group, group)
-    cfg = load_config([word, "task.data=[recordings]"] if word == "task=lerobot" else [word])
+    cfg = load_config([word, *NEEDED.get(word, [])])
     tried, missed = 0, []
     # an experiment is the whole config
     known = {} if word == WHOLE or group != "experiment" else dict(leaves(load_config([WHOLE])))
