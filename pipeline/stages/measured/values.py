@@ -39,7 +39,9 @@ def true_values(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return {"cells": len(found)}
 
 
-@stage(reads=(*WORLD, "policy", *_VALUES, "policy_value.repeats"), place=Place.EVALUATOR)
+@stage(
+    reads=(*WORLD, "policy", *_VALUES, "policy_value.repeats", "policy_value.judged"), place=Place.EVALUATOR
+)
 @priced
 def estimated_values(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The same candidates from the same starts in the imagined world of the roles simulator, state and judge,
