@@ -39,6 +39,25 @@ class MissingFeatures(ValueError):
     """A judge that reads a simulator's features was shown video that has none."""
 
 
+def features_of_all(features: Tensor | None, frames: int, chunk: int, judge: str, otherwise: str) -> Tensor:
+    """Features [B, C, D], if they are those of so many frames in chunks of `chunk`.
+
+    Args:
+        judge, otherwise: who reads them, and who does not, for the message.
+
+    Raises:
+        MissingFeatures: if some are missing.
+    """
+    if features is None or features.shape[1] * chunk < frames:
+        raise MissingFeatures(
+            f"judge={judge} reads the simulator's features of every chunk, and of these {frames} frames it"
+            f" was given {'none' if features is None else f'{features.shape[1]} chunks'}; recordings have"
+            f" them where a simulator can be run on their actions. Choose another judge, such as"
+            f" judge={otherwise}, for video without"
+        )
+    return features
+
+
 class Judge(nn.Module):
     """Scores video against an instruction; subclasses implement `score`, and `loss` if they learn.
 

@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from envs.judges.base import Judgement, MissingFeatures
+from envs.judges.base import Judgement, features_of_all
 from envs.judges.fitted import FittedJudge
 from envs.language import TextEncoder
 from envs.ranges import Count, Discount, Share
@@ -68,13 +68,7 @@ class EmbeddingJudge(FittedJudge):
             MissingFeatures: without features of all frames.
         """
         count = frames.shape[1]
-        if features is None or features.shape[1] * self.chunk < count:
-            raise MissingFeatures(
-                f"judge=embedding reads the simulator's features of every chunk, and of these {count} frames"
-                f" it was given {'none' if features is None else f'{features.shape[1]} chunks'}; recordings"
-                " have them where a simulator can be run on their actions. Choose another judge, such as"
-                " judge=learned, for video without"
-            )
+        features = features_of_all(features, count, self.chunk, "embedding", "learned")
         text = text_to_bytes(instruction).to(self.threshold.device)
         each = features.shape[1]
         seen = features.flatten(0, 1).to(self.threshold.device)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from envs.judges.base import MissingFeatures
+from envs.judges.base import features_of_all
 from envs.judges.golden_goal import GoldenGoalJudge
 from envs.ranges import Count, Share
 from envs.simulators.base import Simulator
@@ -64,13 +64,7 @@ class ActionGoldenGoalJudge(GoldenGoalJudge):
             MissingFeatures: without features of all frames.
         """
         count = frames.shape[1]
-        if features is None or features.shape[1] * self.chunk < count:
-            raise MissingFeatures(
-                "judge=golden_goal_action reads the simulator's features of every chunk, and of these"
-                f" {count} frames it was given"
-                f" {'none' if features is None else f'{features.shape[1]} chunks'}; choose another judge,"
-                " such as judge=golden_goal, for video without"
-            )
+        features = features_of_all(features, count, self.chunk, "golden_goal_action", "golden_goal")
         each = features.shape[1]
         done = self.says(features.flatten(0, 1).to(progress.device)).unflatten(0, (-1, each))
         return done.flatten(1, 2)[:, :count]
