@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from envs.rng import noise_generator
 from envs.simulators import memory
-from envs.simulators.compiling import Repeated, begin_step
+from envs.simulators.compiling import Repeated
 from envs.specs import WorldSpec
 
 __all__ = ["WORLD_OPTIONS", "Simulator", "noise_generator", "to_bytes"]
@@ -217,8 +217,6 @@ class Simulator(Repeated):
             the new frames are unknown here and repeat the last; the state expert fills them in
             (`memory.write_states`).
         """
-        if self.compiled == "graphs":
-            begin_step()
         inputs = memory.build_inputs(state, self.recall(state, future), future)
         frames, features = self.predict(inputs)
         return frames, features.float(), memory.append(state, frames, future)

@@ -87,8 +87,6 @@ def _sampling(world: Simulator, clip: TensorDict) -> Callable[[], None]:
     @torch.no_grad()
     def chunk() -> None:
         world.eval()
-        if replays(world):
-            begin_step()
         world.predict(inputs)
 
     return chunk

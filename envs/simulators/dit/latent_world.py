@@ -15,6 +15,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from envs.simulators.base import Simulator, noise_generator, to_bytes
+from envs.simulators.compiling import begin_step
 from envs.simulators.dit.augment import augment_memory_frames, augment_memory_latents, chosen_clips
 from envs.simulators.dit.diffusion import Diffusion, Given
 from envs.simulators.dit.network import MultiViewDiT
@@ -25,7 +26,7 @@ from envs.simulators.stepwise import lost_jumps
 from envs.simulators.tokenizers.autoencoder import STRIDE, Codec
 from envs.specs import WorldSpec
 
-_BUSY = 1024  # width from which a block's launches take less time than its work
+_BUSY = 1024  # width; on an H200 blocks of 192 wait for their launches, and of 2048 do not
 MEMORY_NOISE = 1e-4 / (1 + 1e-4)  # the noise level at which memory stands, as released
 
 
@@ -255,6 +256,8 @@ class LatentWorld(Simulator):
 
     def _denoise(self, inputs: TensorDict, layers: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """Future latents [B, V, C, T', h, w] and the features of the last step."""
+        if self.compiled == "graphs" and not self.training:  # in training `fit` says when a step begins
+            begin_step()
         given = self.prepare(inputs)
         kept: list[Tensor] = []
 
