@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from actors.factory import build_simulator
 from actors.process import device_of, prepare_process
 from envs.episodes.clip_spec import ClipSpec
+from envs.episodes.clips import ClipStore
 from envs.precision import mixed_precision
 from envs.rng import constant_generator
 from envs.simulators.base import Simulator
@@ -42,17 +43,9 @@ def compiled(cfg: Mapping[str, Any]) -> dict[str, dict[str, float]]:
         for how in (None, "blocks", "graphs"):
             torch.compiler.reset()
             world = build_simulator({**cfg, "launch": {**cfg["launch"], "compile": how}})
-            spec = ClipSpec(world.memory_frames, world.spec.chunk, recent=world.recent_memory)
-
-            def clips(count: int, world: Simulator = world, spec: ClipSpec = spec) -> TensorDict:
-                drawn = store.sample(torch.arange(len(store)), count, spec, constant_generator(0))
-                return drawn.to(device)
-
-            rows: dict[str, Callable[[], Any]] = {
-                f"a training step of {batch}": _training(world, clips(batch))
-            }
+            rows = {f"a training step of {batch}": _training(world, _clips(world, store, batch))}
             for count in _SAMPLED:
-                rows[f"a chunk of {count}"] = _sampling(world, clips(count))
+                rows[f"a chunk of {count}"] = _sampling(world, _clips(world, store, count))
             for row, work in rows.items():
                 with mixed_precision(device, True):
                     work()  # the second run of a compiled part records its graph
@@ -63,6 +56,12 @@ def compiled(cfg: Mapping[str, Any]) -> dict[str, dict[str, float]]:
             + ", ".join(f"launch.compile={how} {by['plain'] / by[how]:.2f}x" for how in ("blocks", "graphs"))
         )
     return found
+
+
+def _clips(world: Simulator, store: ClipStore, count: int) -> TensorDict:
+    """Clips [count] of one chunk, on the world's device."""
+    spec = ClipSpec(world.memory_frames, world.spec.chunk, recent=world.recent_memory)
+    return store.sample(torch.arange(len(store)), count, spec, constant_generator(0)).to(world.device)
 
 
 def _training(world: Simulator, clip: TensorDict) -> Callable[[], None]:

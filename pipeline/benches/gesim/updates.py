@@ -11,7 +11,7 @@ from torch import Tensor
 
 from envs.precision import mixed_precision
 from envs.rng import constant_generator
-from envs.simulators.compiling import Compile, begin_step, compile_parts
+from envs.simulators.compiling import Compile, compile_parts
 from envs.simulators.stepwise import Stepwise
 from envs.specs import WorldSpec
 from learners.stages.distill.dmd2 import DMD2
@@ -77,8 +77,6 @@ def _measure(
         def update(step: int) -> None:
             for optimiser in optimisers:
                 optimiser.zero_grad(set_to_none=True)
-            if how == "graphs":
-                begin_step()
             with mixed_precision(device, True):
                 value: Tensor = method.loss(Turn(clip, step), constant_generator(step))[0]
             value.backward()
