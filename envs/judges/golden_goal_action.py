@@ -1,5 +1,5 @@
-"""RoboScape-R's reward to the letter: nearness to a golden goal, and the action world's own word that the
-task is done.
+"""RoboScape-R's success: nearness to a golden goal is as in golden_goal.py, but that the task is done is the
+action world's own word.
 """
 
 from __future__ import annotations
