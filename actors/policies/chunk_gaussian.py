@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution, constraints, register_kl
 
-from actors.policies.heads import Head
+from actors.policies.heads import Head, some_drawn
 from envs.ranges import Count, Positive
 from envs.specs import ActionMode
 
@@ -36,12 +36,14 @@ class ChunkGaussian(Distribution):
     constant.
 
     The density is that of the knots; a chunk determines them exactly (the basis has full column rank), so
-    likelihood ratios are those of the chunk.
+    likelihood ratios are those of the chunk. It is the density of chunks that are drawn; where the mode is
+    taken instead (heads.some_drawn) its gradient with respect to the mean is zero: nothing is learned.
 
     Args:
         loc: [..., n, A] mean knots in normalised units.
         scale: [..., n, A] standard deviations.
         basis: [K, n]; gain and offset: [A] in action units.
+        share: [...] of chunks that are drawn.
     """
 
     arg_constraints: ClassVar[dict[str, Any]] = {"loc": constraints.real, "scale": constraints.positive}
@@ -54,9 +56,10 @@ class ChunkGaussian(Distribution):
         basis: Tensor,
         gain: Tensor,
         offset: Tensor,
+        share: Tensor,
         validate_args: bool | None = None,
     ):
-        self.loc, self.scale = loc, scale
+        self.loc, self.scale, self.share = loc, scale, share
         # TensorDict hands shared tensors over with batch dimensions; every row is the same
         shared = basis.ndim - 2
         self.basis = basis[(0,) * shared]
@@ -85,7 +88,8 @@ class ChunkGaussian(Distribution):
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
         shape = (*sample_shape, *self.loc.shape)
-        return self._decode(self.loc + self.scale * torch.randn(shape, device=self.loc.device))
+        knots = self.loc + self.scale * torch.randn(shape, device=self.loc.device)
+        return some_drawn(self._decode(knots), self.mode, self.share)
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
         with torch.no_grad():
@@ -102,7 +106,7 @@ class ChunkGaussian(Distribution):
 
     def held(self) -> ChunkGaussian:
         """The same with a spread that does not learn."""
-        return ChunkGaussian(self.loc, self.scale.detach(), self.basis, self.gain, self.offset)
+        return ChunkGaussian(self.loc, self.scale.detach(), self.basis, self.gain, self.offset, self.share)
 
 
 @register_kl(ChunkGaussian, ChunkGaussian)
@@ -125,7 +129,7 @@ class ChunkGaussianHead(Head):
         mode: how the chunk's numbers are meant; relative ones begin where the robot is.
     """
 
-    names = ("loc", "scale", "basis", "gain", "offset")
+    names = ("loc", "scale", "basis", "gain", "offset", "share")
     distribution = ChunkGaussian
     basis: Tensor
     gain: Tensor
@@ -153,7 +157,7 @@ class ChunkGaussianHead(Head):
         self.register_buffer("gain", torch.ones(actions))
         self.register_buffer("offset", torch.zeros(actions))
 
-    def forward(self, hidden: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def forward(self, hidden: Tensor) -> tuple[Tensor, ...]:
         loc = self.mean(hidden.float()).unflatten(-1, (self.knots, self.actions))
         scale = self.log_std.clamp(-4.0, 0.5).exp().expand_as(loc)
         lead = hidden.shape[:-1]
@@ -163,6 +167,7 @@ class ChunkGaussianHead(Head):
             self.basis.expand(*lead, *self.basis.shape),
             self.gain.expand(*lead, -1),
             self.offset.expand(*lead, -1),
+            self.share.expand(lead),
         )
 
     def normalise(self, chunks: Tensor, varies: Tensor) -> None:
@@ -188,9 +193,9 @@ class ChunkGaussianHead(Head):
         return self._gap(self(one)[0], self(other)[0])
 
     @torch.no_grad()
-    def scale_exploration(self, factor: float) -> None:
-        """Multiply the spread."""
-        self.log_std.add_(math.log(factor))
+    def scale_spread(self, width: float) -> None:
+        """Multiply the standard deviations."""
+        self.log_std.add_(math.log(width))
 
     @property
     def exploration(self) -> float:

@@ -11,24 +11,29 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.distributions import Distribution, constraints, register_kl
 
-from actors.policies.heads import Head
+from actors.policies.heads import Head, some_drawn
 from envs.ranges import Count
 
 
 class ChunkTokens(Distribution):
-    """chunk[k, a] = low[a] + (bin + 1/2) / bins * (high[a] - low[a]) with bin ~ Categorical(logits[k, a]).
+    """chunk[k, a] = low[a] + (bin + 1/2) / bins * (high[a] - low[a]) with bin ~ Categorical(logits[k, a]) for
+    the share of chunks that are drawn; the others are the mode (heads.some_drawn).
 
-    Dimensions with low = high are constant and count neither in the density nor in the entropy.
+    Dimensions with low = high are constant and count neither in the density nor in the entropy, which is that
+    of drawn chunks, as is the KL divergence.
 
     Args:
         logits: [..., K, A, bins].
         low, high: [A] in action units.
+        share: [...] of chunks that are drawn.
     """
 
     arg_constraints: ClassVar[dict[str, Any]] = {"logits": constraints.real_vector}
 
-    def __init__(self, logits: Tensor, low: Tensor, high: Tensor, validate_args: bool | None = None):
-        self.log_share = logits.log_softmax(-1)
+    def __init__(
+        self, logits: Tensor, low: Tensor, high: Tensor, share: Tensor, validate_args: bool | None = None
+    ):
+        self.log_share, self.share = logits.log_softmax(-1), share
         # TensorDict hands shared tensors over with batch dimensions; every row is the same.
         self.low, self.high = low[(0,) * (low.ndim - 1)], high[(0,) * (high.ndim - 1)]
         self.active = self.high > self.low
@@ -56,22 +61,22 @@ class ChunkTokens(Distribution):
             drawn = torch.multinomial(
                 share.flatten(0, -2), max(1, torch.Size(sample_shape).numel()), replacement=True
             )
-            return self._decode(drawn.movedim(-1, 0).reshape(*sample_shape, *share.shape[:-1]))
+            drawn = drawn.movedim(-1, 0).reshape(*sample_shape, *share.shape[:-1])
+            return some_drawn(self._decode(drawn), self.mode, self.share)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        log_probs = (
-            self.log_share.expand(*value.shape, self.bins)
-            .gather(-1, bins_of(value, self.low, self.high, self.bins).unsqueeze(-1))
-            .squeeze(-1)
-        )
-        return (log_probs * self.active).sum((-2, -1))
+        bins = bins_of(value, self.low, self.high, self.bins)
+        shares = self.log_share.expand(*value.shape, self.bins).gather(-1, bins.unsqueeze(-1)).squeeze(-1)
+        drawn = self.share.log() + (shares * self.active).sum((-2, -1))
+        usual = ((bins == self.log_share.argmax(-1)) | ~self.active).all(-1).all(-1)
+        return torch.where(usual, torch.logaddexp(drawn, torch.log1p(-self.share)), drawn)
 
     def entropy(self) -> Tensor:
         return -((self.log_share.exp() * self.log_share).sum(-1) * self.active).sum((-2, -1))
 
     def held(self) -> ChunkTokens:
-        """Itself: how sure tokens are cannot be told from which they are."""
-        return self
+        """All of its chunks drawn; how sure tokens are cannot be told from which they are."""
+        return ChunkTokens(self.log_share, self.low, self.high, torch.ones_like(self.share))
 
 
 @register_kl(ChunkTokens, ChunkTokens)
@@ -96,7 +101,7 @@ class ChunkTokenHead(Head):
         bins: per number; they span -1..1 until `normalise` finds another range.
     """
 
-    names = ("logits", "low", "high")
+    names = ("logits", "low", "high", "share")
     distribution = ChunkTokens
     low: Tensor
     high: Tensor
@@ -110,10 +115,10 @@ class ChunkTokenHead(Head):
         self.register_buffer("low", torch.full((actions,), -1.0))
         self.register_buffer("high", torch.full((actions,), 1.0))
 
-    def forward(self, hidden: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, hidden: Tensor) -> tuple[Tensor, ...]:
         logits = self.logits(hidden.float()).unflatten(-1, (self.chunk, self.actions, self.bins))
         lead = hidden.shape[:-1]
-        return logits, self.low.expand(*lead, -1), self.high.expand(*lead, -1)
+        return logits, self.low.expand(*lead, -1), self.high.expand(*lead, -1), self.share.expand(lead)
 
     def normalise(self, chunks: Tensor, varies: Tensor) -> None:
         """See Head.normalise; the bins span the demonstrations and a tenth more on either side."""
@@ -141,7 +146,7 @@ class ChunkTokenHead(Head):
         return 0.5 * (_kl(p, q) + _kl(q, p)).mean() / (p.active.sum().clamp(min=1) * self.chunk)
 
     @torch.no_grad()
-    def scale_exploration(self, factor: float) -> None:
+    def scale_spread(self, width: float) -> None:
         """Multiply the temperature at which tokens are drawn, by dividing the logits."""
-        self.logits.weight.div_(factor)
-        self.logits.bias.div_(factor)
+        self.logits.weight.div_(width)
+        self.logits.bias.div_(width)

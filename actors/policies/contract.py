@@ -17,8 +17,8 @@ Whatever else a policy has is used if it is there:
   frames;
 - `gaze(observed)`, those features and what key-points look for (vla.py), `instruction_keypoints` and
   `views`: the last `instruction_keypoints` key-points are taught where hands go;
-- `scale_exploration(factor)`: with it, how widely chunks are drawn around the mode is found in physics
-  (section explore); without it the policy explores as it is;
+- `scale_exploration(width, share)`: with it, how widely chunks are drawn around the mode, and how many are
+  drawn at all, is found in physics (section explore); without it the policy explores as it is;
 - `exploration`: how widely they are drawn, over how widely the config says (see rl_rate);
 - `imitation_loss(observed, chunks [B, K, A])`: a better one than the negative log-likelihood.
 """

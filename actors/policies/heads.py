@@ -25,12 +25,18 @@ class Head(nn.Module, abc.ABC):
         distribution: its class, with log_prob, entropy, mode, a registered KL divergence, and `held`.
         chunk: actions per chunk, K.
         actions: numbers of an action, A.
+        share: of chunks that are drawn at random, float32 []; the others are the mode (see some_drawn).
     """
 
     names: ClassVar[tuple[str, ...]]
     distribution: ClassVar[type[Any]]
     chunk: int
     actions: int
+    share: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("share", torch.ones(()))
 
     @abc.abstractmethod
     def normalise(self, chunks: Tensor, varies: Tensor) -> None:
@@ -49,8 +55,13 @@ class Head(nn.Module, abc.ABC):
         """Scalar distance of what is said of two hidden vectors [N, width]."""
 
     @abc.abstractmethod
-    def scale_exploration(self, factor: float) -> None:
+    def scale_spread(self, width: float) -> None:
         """Multiply how widely chunks are drawn around the mode, which stays."""
+
+    def scale_exploration(self, width: float, share: float) -> None:
+        """Multiply how widely chunks are drawn around the mode, and draw that share of them."""
+        self.scale_spread(width)
+        self.share.fill_(share)
 
     @property
     def exploration(self) -> float:
@@ -58,6 +69,17 @@ class Head(nn.Module, abc.ABC):
         the distribution as far however widely it is drawn.
         """
         return 1.0
+
+
+def some_drawn(drawn: Tensor, mode: Tensor, share: Tensor) -> Tensor:
+    """Chunks [..., K, A], each drawn with probability `share` [...] and the mode otherwise.
+
+    A chunk is known by what comes of it, and what comes of it should not be the mishaps of those that follow:
+    with few of them drawn an episode survives wide ones, which tell more. TRPO's vine estimate (Schulman et
+    al. 2015) departs from a policy's own course in one action at a time for the same reason.
+    """
+    chosen = torch.rand(drawn.shape[:-2], device=drawn.device) < share
+    return torch.where(chosen[..., None, None], drawn, mode)
 
 
 def varying(chunks: Tensor, robot: Embodiment) -> Tensor:

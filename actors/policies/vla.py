@@ -266,9 +266,9 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         for part in parts if query is None else [*parts, query.proprioception]:
             part.normalise(*(states, commands)[: len(part.keys)])
 
-    def scale_exploration(self, factor: float) -> None:
-        """Multiply how widely chunks are drawn around the mode, which stays."""
-        self.head.scale_exploration(factor)
+    def scale_exploration(self, width: float, share: float) -> None:
+        """Multiply how widely chunks are drawn around the mode, which stays, and draw that share of them."""
+        self.head.scale_exploration(width, share)
 
     @property
     def exploration(self) -> float:

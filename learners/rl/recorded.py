@@ -27,11 +27,12 @@ _SAMPLES = 8  # of a policy, that tell what is usual; not every distribution kno
 class RecordedDecisions:
     """Decisions that a policy took in physics with their advantages, as transitions of an iteration.
 
-    Likelihood ratios are to the policy that the iteration begins with, so that they are bounded as those of
-    fresh rollouts are; it is a few iterations away from the one that took the decisions.
+    Likelihood ratios are to the policy that RL begins with, over all of its iterations: clipping then lets
+    each decision move the policy so far and no further. Ratios to the policy of each iteration let the same
+    bad decision push it away again and again, the harder the less likely it has become.
 
     Args:
-        policy: in training.
+        policy: in training, as RL begins with it.
         rollout: of dataset_rollout, [N, T], with advantage, value_target and state_value [N, T, 1].
         mode: how the numbers of the policy's chunks are meant.
 
@@ -39,9 +40,7 @@ class RecordedDecisions:
         ConfigError: if the policy is scored on action tokens, which no recording holds.
 
     Chunks are those that were carried out. Some the robot's limits have cut short of what the policy said; it
-    would hardly ever say those, and they are left out. So are those, iteration by iteration, that the policy
-    would hardly say any more: how likely a chunk is at ten spreads from the mean changes so fast that ratios
-    overflow within an iteration.
+    would hardly ever say those, and they are left out.
     """
 
     def __init__(self, policy: TensorDictModuleBase, store: ClipStore, rollout: TensorDict, mode: ActionMode):
@@ -51,20 +50,23 @@ class RecordedDecisions:
         pick = (rollout["valid"] & rollout["whole"]).flatten()
         self.known = rollout.exclude("next", "valid", "whole").flatten(0, 1)[pick].cpu()
         self.known[CHUNK] = chunks_ahead(store, self.known["row"], mode)
-        usual = [self._likely(self._seen(some))[1] for some in self.known.split(_AT_ONCE)]
+        if not len(self.known):
+            return
+        likely, usual = zip(*(self._likely(some) for some in self.known.split(_AT_ONCE)), strict=True)
+        self.known[LOG_PROB] = torch.cat(likely)
         self.known = self.known[torch.cat(usual)]
 
     def __len__(self) -> int:
         return len(self.known)
 
     @torch.no_grad()
-    def _likely(self, seen: TensorDict) -> tuple[torch.Tensor, torch.Tensor]:
-        """How likely the policy finds the chunks of decisions [N], with what it reads: float32 [N]; and
-        whether it might well say them, bool [N].
+    def _likely(self, some: TensorDict) -> tuple[torch.Tensor, torch.Tensor]:
+        """How likely the policy finds the chunks of decisions [N]: float32 [N]; and whether it might well say
+        them, bool [N].
         """
         device = device_of(self.policy)
-        said = distribution(self.policy, inputs_for(seen, self.policy))
-        likely = said.log_prob(seen[CHUNK].to(device))
+        said = distribution(self.policy, inputs_for(self._seen(some), self.policy))
+        likely = said.log_prob(some[CHUNK].to(device))
         # What is usual is told by the same draws each time, so that a resumed run tells the same.
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             seed_process(0)
@@ -77,13 +79,9 @@ class RecordedDecisions:
         return seen.update(some)
 
     def sample(self, count: int, like: TensorDict, generator: torch.Generator) -> TensorDict:
-        """Random ones, `count` at most, that the policy might still say; with the keys and on the device of
-        the transitions `like`.
-        """
+        """Random ones, `count` at most, with the keys and on the device of the transitions `like`."""
         seen = self._seen(self.known[torch.randperm(len(self.known), generator=generator)[:count]])
-        likely, usual = zip(*(self._likely(some) for some in seen.split(_AT_ONCE)), strict=True)
-        seen[LOG_PROB] = torch.cat(likely)
-        return seen[torch.cat(usual)].select(*like.keys(True, True)).to(device_of(self.policy))
+        return seen.select(*like.keys(True, True)).to(device_of(self.policy))
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ class ImitationSection:
 class ExploreSection:
     """Section explore."""
 
-    levels: Sequence[Positive]
+    levels: Sequence[tuple[Positive, Annotated[float, Gt(0), Le(1)]]]
     episodes: Count
     keep: Share
 

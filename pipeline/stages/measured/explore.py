@@ -1,14 +1,15 @@
-"""Stage that finds in physics how widely the first policy may try things.
+"""Stage that finds in physics how widely, and in how many decisions, the first policy may try things.
 
 RL learns from how differently episodes go, so exploration should be wide; but what a task forgives differs: a
 push still works under noise with which nothing can be grasped. Where most of what the policy can do is lost,
-rewards are too rare to learn from, and simulator and judge see little but failures.
+rewards are too rare to learn from, and simulator and judge see little but failures. Episodes survive wide
+departures where only some decisions are drawn at random, and the policy's mode takes the others.
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,31 +33,33 @@ from pipeline.stages.collect import SPLITS, run_recorded
 from pipeline.stages.given import PHYSICS, Cfg
 
 Rates = dict[str, dict[str, Any]]  # a rate entry (statistics.py) by task
+Level = tuple[float, float]  # how widely decisions are drawn, and the share of them that is
 
 
 @stage(reads=(*PHYSICS, "explore"))
 def explore(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """The policy, drawing its actions as widely as it can while it keeps the share explore.keep of what its
-    mode succeeds in: of explore.levels the first that does so, from the widest on, or the narrowest.
+    """The policy, exploring by the first of explore.levels that keeps the share explore.keep of what its mode
+    succeeds in, or by the last.
 
     All are tried from the same explore.episodes starts. What is recorded is learned from as other episodes of
     the policy are.
 
     Returns:
-        level, which was chosen (the widest if the mode never succeeds, for then nothing can be told); mode
-        and levels, the successes of those that were tried, with the same by task under tasks; alarm, if no
-        level keeps enough.
+        level, which was chosen, with its name, width and share (the first if the mode never succeeds, for
+        then nothing can be told); mode and levels, the successes of those that were tried, with the same by
+        task under tasks; alarm, if no level keeps enough.
     """
     section = cfg["explore"]
     prepare_process(cfg["seed"], cfg["threads"])
     seeds = episode_seeds(cfg["seed"], Purpose.DEPLOY, section["episodes"])
+    choices = [(float(width), float(share)) for width, share in section["levels"]]
     data = folder / "dataset"
     shutil.rmtree(data, ignore_errors=True)
     with WriteBehind(LeRobotWriter(data, world_spec(cfg).embodiment)) as behind:
-        found = find_level(section["levels"], section["keep"], partial(_tried, cfg, inputs, seeds, behind))
+        found = find_level(choices, section["keep"], partial(_tried, cfg, inputs, seeds, behind))
     level, mode, tried = found
-    levels = {f"{factor:g}": _summed(rates) for factor, rates in tried.items()}
-    seen = ", ".join(f"x{name} {entry['successes']}" for name, entry in levels.items())
+    levels = {level_name(one): _summed(rates) for one, rates in tried.items()}
+    seen = ", ".join(f"{name} {entry['successes']}" for name, entry in levels.items())
     total = _summed(mode)
     tqdm.write(f"explore: of {total['episodes']} episodes each succeed: mode {total['successes']}, {seen}")
     episodes = sum(entry["episodes"] for entry in (total, *levels.values()))
@@ -64,7 +67,7 @@ def explore(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     write_splits(data, {name: episodes if name == TRAIN else 0 for name in SPLITS})
     save_weights(_scaled(cfg, inputs, level), folder)
     return {
-        "level": level,
+        "level": {"name": level_name(level), "width": level[0], "share": level[1]},
         "mode": total,
         "levels": levels,
         **_alarm(mode, tried, section["keep"]),
@@ -74,24 +77,29 @@ def explore(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 
 def find_level(
-    levels: Iterable[float], keep: float, trial: Callable[[float | None], Rates]
-) -> tuple[float, Rates, dict[float, Rates]]:
-    """The widest level that keeps the share `keep` of the mode's successes; see `explore` and `kept`.
+    levels: Sequence[Level], keep: float, trial: Callable[[Level | None], Rates]
+) -> tuple[Level, Rates, dict[Level, Rates]]:
+    """The first level that keeps the share `keep` of the mode's successes; see `explore` and `kept`.
 
     Args:
-        levels: factors of how widely the policy explores.
+        levels: in the order in which they are tried, the boldest first.
         trial: success of the policy at a level, or of its mode for None, by task.
 
     Returns:
         The level, the mode's success, and that of each level that was tried.
     """
-    widest_first = sorted(levels, reverse=True)
-    level, mode, tried = widest_first[0], trial(None), dict[float, Rates]()
-    for level in widest_first if _summed(mode)["successes"] else ():
+    level, mode, tried = levels[0], trial(None), dict[Level, Rates]()
+    for level in levels if _summed(mode)["successes"] else ():
         tried[level] = trial(level)
         if kept(tried[level], mode) >= keep:
             break
     return level, mode, tried
+
+
+def level_name(level: Level) -> str:
+    """A level as tables name it, such as x0.5 on 50%."""
+    width, share = level
+    return f"x{width:g} on {100 * share:g}%"
 
 
 def kept(rates: Rates, mode: Rates) -> float:
@@ -102,9 +110,9 @@ def kept(rates: Rates, mode: Rates) -> float:
     return sum(shares) / len(shares)
 
 
-def _tried(cfg: Cfg, inputs: Inputs, seeds: list[int], behind: WriteBehind, level: float | None) -> Rates:
-    """Record episodes of the policy that explores so widely, or of its mode if `level` is None."""
-    policy = _scaled(cfg, inputs, 1.0 if level is None else level)
+def _tried(cfg: Cfg, inputs: Inputs, seeds: list[int], behind: WriteBehind, level: Level | None) -> Rates:
+    """Record episodes of the policy that explores so, or of its mode if `level` is None."""
+    policy = _scaled(cfg, inputs, (1.0, 1.0) if level is None else level)
     robot, won, played = world_spec(cfg).embodiment, list[bool](), list[int]()
     for tracks in run_recorded(cfg, policy, seeds, stochastic=level is not None):
         behind.write([Episode.from_track(track, "policy-0", robot) for track in tracks])
@@ -125,24 +133,24 @@ def _summed(rates: Rates) -> dict[str, Any]:
     return {**whole, **({"tasks": rates} if len(rates) > 1 else {})}
 
 
-def _scaled(cfg: Cfg, inputs: Inputs, level: float) -> Any:
+def _scaled(cfg: Cfg, inputs: Inputs, level: Level) -> Any:
     """The policy with its exploration scaled."""
     policy = build_policy(cfg, inputs.weights("policy"))
-    policy.scale_exploration(level)
+    policy.scale_exploration(*level)
     return policy
 
 
-def _alarm(mode: Rates, tried: Mapping[float, Rates], keep: float) -> dict[str, str]:
+def _alarm(mode: Rates, tried: Mapping[Level, Rates], keep: float) -> dict[str, str]:
     """What the user must know if no level keeps enough."""
     if not tried:
         return {
             "alarm": f"by its mode the policy succeeds in none of {_summed(mode)['episodes']} episodes, so"
             " how widely it may explore is not known; give imitation more demonstrations or steps (imitation)"
         }
-    narrowest = min(tried)
-    if kept(tried[narrowest], mode) >= keep:
+    *_, last = tried
+    if kept(tried[last], mode) >= keep:
         return {}
     return {
-        "alarm": f"even x{narrowest:g} keeps less than {keep:g} of the mode's successes; add narrower ones to"
-        " explore.levels"
+        "alarm": f"even {level_name(last)} keeps less than {keep:g} of the mode's successes; add more"
+        " cautious ones to explore.levels"
     }

@@ -24,9 +24,8 @@ class WrongHead(ChunkGaussianHead):
 
 def tokens(*batch: int, bins: int = 8) -> ChunkTokens:
     """A distribution over chunks [4, 3] whose middle dimension is constant."""
-    return ChunkTokens(
-        torch.randn(*batch, 4, 3, bins), torch.tensor([-1.0, 0.5, 0.0]), torch.tensor([1.0, 0.5, 2.0])
-    )
+    low, high = torch.tensor([-1.0, 0.5, 0.0]), torch.tensor([1.0, 0.5, 2.0])
+    return ChunkTokens(torch.randn(*batch, 4, 3, bins), low, high, torch.ones(batch))
 
 
 def test_tokens_are_a_density_over_bins() -> None:
@@ -61,6 +60,7 @@ def test_gaussian_chunks_are_smooth_from_rest_and_their_density_consistent() -> 
         knot_basis(4, 2, from_rest=True),
         gain,
         torch.tensor([0.0, 7.0, 0.0]),
+        torch.ones(5),
     )
     chunk = dist.sample()
     assert chunk.shape == (5, 4, 3) and bool((chunk[..., 1] == 7.0).all())

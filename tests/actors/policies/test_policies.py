@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from actors.policies.chunk_tokens import ChunkTokens
 from actors.policies.contract import (
     action_key,
     disagreement,
@@ -95,19 +96,53 @@ def test_explores_more_narrowly_around_the_same_mode(name: str) -> None:
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         before = policy(inputs_for(seen, policy))[CHUNK]
         wide = distribution(policy, seen).entropy()
-        policy.scale_exploration(0.25)
+        policy.scale_exploration(0.25, 1.0)
         assert torch.allclose(policy(inputs_for(seen, policy))[CHUNK], before)
         narrow = distribution(policy, seen).entropy()
-        policy.scale_exploration(4.0)
+        policy.scale_exploration(4.0, 1.0)
         again = distribution(policy, seen).entropy()
     assert bool((narrow < wide).all()) and torch.allclose(again, wide, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", [name for name in POLICIES if name.startswith("chunk_")])
+def test_some_decisions_are_drawn_and_the_others_are_the_mode(name: str) -> None:
+    spec = world_spec(ARM_DELTAS)
+    policy = policy_of(name, spec)
+    seen = observations(spec, 1)
+    mode = likeliest(policy, seen)
+    many = TensorDict.cat([seen] * 400)
+    policy.scale_exploration(1.0, 0.25)
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        said = policy(inputs_for(many, policy))
+    drawn = ((said[CHUNK] - mode).abs() > 1e-5).flatten(1).any(1)
+    assert 60 < int(drawn.sum()) < 140  # 100 expected, 8.7 standard deviation
+    assert torch.allclose(distribution(policy, many).log_prob(said[CHUNK]), said[LOG_PROB], atol=1e-4)
+
+
+def test_tokens_say_how_likely_the_mode_is_when_it_stands_for_what_is_not_drawn() -> None:
+    logits = torch.tensor([[[[0.0, 2.0, 0.0]], [[1.0, 0.0, 0.0]]]])  # one chunk of two numbers
+    low, high = torch.zeros(1), torch.full((1,), 3.0)
+    dist = ChunkTokens(logits, low, high, torch.tensor([0.25]))
+    every = torch.tensor([[[a], [b]] for a in (0.5, 1.5, 2.5) for b in (0.5, 1.5, 2.5)])
+    shares = torch.stack([dist.log_prob(one[None]).exp() for one in every])
+    assert float(shares.sum()) == pytest.approx(1.0)
+    drawn = dist.held().log_prob(dist.mode).exp()
+    assert float(dist.log_prob(dist.mode).exp()) == pytest.approx(float(0.25 * drawn + 0.75))
+
+
+def test_nothing_is_learned_of_a_mean_that_stands_for_a_drawn_chunk() -> None:
+    policy = policy_of("chunk_gaussian", world_spec(ARM_DELTAS))
+    seen = observations(world_spec(ARM_DELTAS), 4)
+    dist = distribution(policy, seen)
+    gradient = torch.autograd.grad(dist.log_prob(dist.mode.detach()).sum(), dist.loc)[0]
+    assert float(gradient.abs().max()) < 1e-4
 
 
 @pytest.mark.parametrize(("name", "share"), [("chunk_gaussian", 0.25), ("chunk_tokens", 1.0)])
 def test_a_mean_steps_as_far_as_it_was_explored(name: str, share: float) -> None:
     policy = policy_of(name, world_spec(ARM_DELTAS))
     assert rl_rate(policy, 3e-4) == pytest.approx(3e-4)
-    policy.scale_exploration(0.25)
+    policy.scale_exploration(0.25, 0.5)
     assert rl_rate(policy, 3e-4) == pytest.approx(share * 3e-4)
     assert rl_rate(torch.nn.Identity(), 3e-4) == 3e-4  # of anybody's policy, which says nothing of it
 

@@ -181,9 +181,13 @@ def test_the_page_shows_how_widely_the_policy_explores_by_task(inputs: Inputs) -
     level = {**entry(31), "tasks": {"open": entry(13), "close": entry(18)}}
     page = build_report({}, inputs, {**result(), "verdict": "gain"})
     assert "Exploration" not in page
-    found = {"level": 0.35, "mode": {**level, **entry(44)}, "levels": {"1": entry(3), "0.35": level}}
+    found = {
+        "level": {"name": "x0.35 on 50%", "width": 0.35, "share": 0.5},
+        "mode": {**level, **entry(44)},
+        "levels": {"x1 on 100%": entry(3), "x0.35 on 50%": level},
+    }
     page = build_report({}, inputs, {**result(exploration=found), "verdict": "gain"})
-    assert "<b>×0.35</b>" in page and "44/100" in page and "3/100" in page and "31/100" in page
+    assert "<b>x0.35 on 50%</b>" in page and "44/100" in page and "3/100" in page and "31/100" in page
     assert page.count("18/100") == 2  # of the mode and of the level
 
 

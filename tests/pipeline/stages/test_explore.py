@@ -13,29 +13,34 @@ from actors.factory import open_clips
 from pipeline.config import load_config
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.loop import build_loop
-from pipeline.stages.measured.explore import find_level, kept
+from pipeline.stages.measured.explore import Level, find_level, kept
 from pipeline.study.methods import add_rl_in_physics
 
-WORDS = ["experiment=soak", "track=disabled", "explore.levels=[0.5,1.0]", "explore.episodes=3"]
+WORDS = ["experiment=soak", "track=disabled", "explore.levels=[[1.0,1.0],[0.5,0.5]]", "explore.episodes=3"]
+LEVELS: list[Level] = [(1.0, 1.0), (1.0, 0.5), (0.5, 0.5)]
 
 
 @pytest.mark.parametrize(
-    ("successes", "level", "tried"),
+    ("successes", "tried"),  # of 100 each, by level; None is the mode
     [
-        ({None: 40, 1.0: 30}, 1.0, [1.0]),  # of 100 each, by level; None is the mode
-        ({None: 40, 1.0: 8, 0.5: 20, 0.25: 24}, 0.25, [1.0, 0.5, 0.25]),
-        ({None: 40, 1.0: 2, 0.5: 4, 0.25: 8}, 0.25, [1.0, 0.5, 0.25]),  # none is narrow enough
-        ({None: 0}, 1.0, []),  # nothing can be told
+        ({None: 40, (1.0, 1.0): 30}, 1),
+        ({None: 40, (1.0, 1.0): 8, (1.0, 0.5): 20, (0.5, 0.5): 24}, 3),
+        ({None: 40, (1.0, 1.0): 2, (1.0, 0.5): 4, (0.5, 0.5): 8}, 3),  # none keeps enough
     ],
 )
-def test_the_widest_level_that_keeps_enough_of_the_modes_successes(
-    successes: dict[float | None, int], level: float, tried: list[float]
+def test_the_first_level_that_keeps_enough_of_the_modes_successes(
+    successes: dict[Level | None, int], tried: int
 ) -> None:
-    def trial(factor: float | None) -> dict[str, Any]:
-        return {"": rate_entry(torch.arange(100) < successes[factor])}
+    def trial(level: Level | None) -> dict[str, Any]:
+        return {"": rate_entry(torch.arange(100) < successes[level])}
 
-    found, mode, seen = find_level([0.25, 1.0, 0.5], 0.6, trial)
-    assert found == level and list(seen) == tried and mode[""]["successes"] == successes[None]
+    found, mode, seen = find_level(LEVELS, 0.6, trial)
+    assert found == LEVELS[tried - 1] and list(seen) == LEVELS[:tried] and mode[""]["successes"] == 40
+
+
+def test_of_a_mode_that_never_succeeds_nothing_can_be_told() -> None:
+    found, _, seen = find_level(LEVELS, 0.6, lambda level: {"": rate_entry(torch.zeros(100) > 0)})
+    assert found == LEVELS[0] and not seen
 
 
 def test_easy_tasks_do_not_make_up_for_hard_ones() -> None:
@@ -56,12 +61,12 @@ def test_trials_are_recorded_and_the_policy_goes_on_with_what_was_found(tmp_path
     store = open_clips(cfg, [graph.folder("explore") / "dataset"])
     assert len(store) == made["episodes"] == 3 * (1 + len(made["levels"]))
     assert len(store.select(["policy-0"])) == len(store.split("train")) == len(store)
-    assert ("alarm" in made) is (made["mode"]["successes"] == 0 or made["level"] == 0.5)
+    assert ("alarm" in made) is (made["mode"]["successes"] == 0 or made["level"]["width"] == 0.5)
     before, after = (
         load_file(graph.folder(name) / "weights.safetensors") for name in ("imitation", "explore")
     )
     moved = {key for key, value in before.items() if not torch.equal(value, after[key])}
-    assert moved <= {key for key in before if key.endswith("log_std")}
+    assert moved <= {key for key in before if key.endswith(("log_std", "share"))}
     assert graph.nodes["deploy-1"].inputs["policy"] == "explore"
     assert graph.nodes[add_rl_in_physics(graph, cfg, "steps")].inputs["policy"] == "explore"
     assert "explore" in graph.nodes["simulator-1"].inputs["data"]

@@ -1,0 +1,1 @@
+"""Stages of reinforcement learning, and what truth tells them: which tasks to imagine, how a policy does."""
