@@ -18,9 +18,8 @@ from pipeline.acting import acting
 from pipeline.graph.graph import Graph
 from pipeline.graph.workers import learners_of
 from pipeline.outside import CHECKPOINT, KINEMATICS, STATE_CHECKPOINT, files_at, fingerprint, judge_files
-from pipeline.stages import collect, imitation, keep, pace, prove, show, world
+from pipeline.stages import collect, imitation, keep, pace, prove, rl, show, world
 from pipeline.stages.measured import explore
-from pipeline.stages.reinforcement import rl
 
 Cfg = Mapping[str, Any]
 T = TypeVar("T")
@@ -125,7 +124,7 @@ def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
         data = [*data, deployed]
         made = add_world(graph, cfg, data, made, number)
         inputs = {"data": data, **made.roles()}
-        gap = graph.add(f"gap-{number}", prove.gap, {**inputs, "policy": policy}, number=number)
+        graph.add(f"gap-{number}", prove.gap, {**inputs, "policy": policy}, number=number)
         policy, known = _keep(graph, policy, deployed, best, known, number)
         best = policy
         if number <= cfg["rounds"]["clone"]:
@@ -136,7 +135,7 @@ def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
                 number=number,
             )
         if with_rl:
-            policy = _learn(graph, cfg, {**inputs, "starts": starts, "gap": gap}, policy, number)
+            policy = _learn(graph, cfg, data, made, policy, number, starts)
     last = last_round(cfg) + 1
     policy, _ = _keep(graph, policy, _deploy(graph, cfg, policy, last), best, known, last)
     before = graph.add("evaluate-before", prove.evaluate_physics, {"policy": first})
@@ -186,8 +185,7 @@ def _data_loop(graph: Graph, cfg: Cfg) -> None:
     first = add_imitation(graph, cfg, data)
     made = add_world(graph, cfg, data, World(), 1)
     starts = _extra_starts(graph, cfg)
-    inputs = {"data": data, "starts": starts, **made.roles()}
-    policy = _learn(graph, cfg, inputs, first, 1, deployed=0)
+    policy = _learn(graph, cfg, data, made, first, 1, starts, deployed=0)
     _conclude(graph, data, made, first, policy, {})
 
 
@@ -231,16 +229,18 @@ def add_world(graph: Graph, cfg: Cfg, data: list[str], before: World, number: in
 def _learn(
     graph: Graph,
     cfg: Cfg,
-    inputs: Mapping[str, Sequence[str]],
+    data: list[str],
+    made: World,
     policy: str,
     number: int,
+    starts: list[str],
     deployed: int | None = None,
 ) -> str:
     """RL in the imagined world; `deployed` is the round whose successes anchor it, this one by default."""
     return graph.add(
         f"rl-{number}",
         rl.rl,
-        {**inputs, "policy": policy},
+        {"data": data, "starts": starts, **made.roles(), "policy": policy},
         number=number,
         deployed=number if deployed is None else deployed,
         iterations=of_round(cfg["rounds"]["iterations"], number),

@@ -32,8 +32,6 @@ class RLConfig:
             every chunk it builds on its own; from inside, short episodes meet every stage of the task.
         chunks: of an imagined episode, None for as many as the task has. What the judge's progress, and a
             critic if there is one, expect of the rest stands in for it.
-        doubt: tasks whose imagined success has been seen to lie further than this above the true one, beyond
-            what chance does, are not imagined; 1 imagines all.
         schedule: "sync" learns from rollouts of the newest policy only; "async" lets hosts run on meanwhile.
         max_policy_lag: versions a rollout may be behind, if async.
         queue: jobs submitted and not yet learned from at most, if async.
@@ -71,7 +69,6 @@ class RLConfig:
     threads: Count
     starts: Literal["inside", "key", "first"]
     chunks: Count | None
-    doubt: Share
     schedule: Literal["sync", "async"]
     max_policy_lag: Natural
     queue: Count

@@ -37,6 +37,7 @@ from pipeline.stages.judge_cost import priced
 
 EPISODES = "episodes.json"  # of the stage measure
 _SIDE_BY_SIDE = 64  # imagined episodes
+_TOO_KIND = 0.2  # so far apart lie the confidence intervals of imagined and true success
 
 
 @stage(reads=(*WORLD, "policy", "measure"), place=Place.EVALUATOR)
@@ -71,7 +72,24 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         scores = judge_frames(judge, made.frames, store, held, made.features)
         write_film(folder / "media/held-out.mp4", paired_frames(store, held, made, 0), store.fps, rest=REST)
         result["replayed"] = judge_table(judge, scores, made.valid, store, held)
-    return {**result, "judged_by": judge.facts()}
+    return {**result, "judged_by": judge.facts(), "alarms": too_kind(result)}
+
+
+def too_kind(result: Mapping[str, Any]) -> list[str]:
+    """What to know of those tasks of a gap in which imagined success lies far above the true one, beyond what
+    chance does: there RL learns from true decisions alone, if from any.
+    """
+    out = []
+    for task, entry in (result["tasks"] or {"": result}).items():
+        imagined, true = entry["imagined"], entry["true"]
+        if imagined["low"] - true["high"] > _TOO_KIND:
+            seen, so = (f"{one['successes']} of {one['episodes']}" for one in (imagined, true))
+            out.append(
+                f"{task or 'the task'} succeeds in {seen} imagined and {so} true episodes from the same starts,"
+                " so imagination teaches little of it; deploy more episodes (rounds.deploy), or train simulator"
+                " and judge for longer (simulator_fit, judge_fit)"
+            )
+    return out
 
 
 @stage(reads=(*PHYSICS, "evaluate"), place=Place.EVALUATOR)

@@ -14,8 +14,7 @@ from envs.targets import ConfigError
 from pipeline.evaluation.charts import Curve, line_chart
 from pipeline.evaluation.result import result_of
 from pipeline.evaluation.statistics import rate, rate_entry, rate_line
-from pipeline.stages import prove
-from pipeline.stages.reinforcement import rl
+from pipeline.stages import prove, rl
 from pipeline.study.columns import Cell, Cfg, Column, Measured, outcomes_of
 from pipeline.study.methods import Made
 

@@ -30,8 +30,7 @@ from pipeline.loop import (
     imagined_iterations,
     last_round,
 )
-from pipeline.stages import collect, prove
-from pipeline.stages.reinforcement import rl
+from pipeline.stages import collect, prove, rl
 from pipeline.stages.variant import fewer_episodes
 
 Cfg = Mapping[str, Any]

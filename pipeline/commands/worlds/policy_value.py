@@ -25,10 +25,9 @@ from pipeline.evaluation.value.page import build_page, table_text
 from pipeline.graph.code_version import code_of
 from pipeline.graph.kept import Kept
 from pipeline.loop import has_physics
-from pipeline.stages import imitation
+from pipeline.stages import imitation, rl
 from pipeline.stages.given import mode_of
 from pipeline.stages.judge_cost import COST, Spending
-from pipeline.stages.reinforcement import rl
 
 _ACTING = (imitation.imitation, imitation.clone, rl.rl)  # stages that leave a policy
 _MODULE = "pipeline.evaluation.value.trials"

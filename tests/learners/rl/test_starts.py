@@ -16,7 +16,7 @@ from envs.specs import EPISODE
 from learners.rl.loop import train_rl
 from learners.rl.starts import Starts
 from pipeline.config import load_config
-from pipeline.stages.reinforcement.rl import starts_of
+from pipeline.stages.rl import starts_of
 from tests.learners.rl.test_algorithms import algorithm_of, policy_of, settings
 
 GROUP = 4
@@ -59,8 +59,8 @@ def test_the_config_says_whether_noise_is_shared() -> None:
     for words, count in (([], 0), (["simulator.shared_noise=false"], 7)):
         cfg = load_config(words)
         share = cfg["extra_starts"]["share"]
-        assert starts_of(cfg, range(7), [], 7) == Starts(range(7), count)
-        assert starts_of(cfg, [0, 2], range(4, 7), 7) == Starts(shared_out([0, 2], range(4, 7), share), count)
+        assert starts_of(cfg, 7, range(7), 0) == Starts(range(7), count)
+        assert starts_of(cfg, 4, [0, 2], 3) == Starts(shared_out([0, 2], range(4, 7), share), count)
 
 
 def test_a_group_that_was_torn_apart_is_found() -> None:

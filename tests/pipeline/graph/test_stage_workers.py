@@ -18,8 +18,7 @@ from pipeline.config import load_config
 from pipeline.graph.stage import Inputs
 from pipeline.graph.workers import run_stage
 from pipeline.loop import build_loop
-from pipeline.stages import prove
-from pipeline.stages.reinforcement import rl
+from pipeline.stages import prove, rl
 
 WORDS = [
     "experiment=smoke",

@@ -20,7 +20,7 @@ from pipeline.graph.stage import Inputs
 from pipeline.loop import build_loop
 from pipeline.stages import world
 from pipeline.stages.given import DATASETS
-from pipeline.stages.reinforcement.rl import what_the_judge_needs
+from pipeline.stages.rl import what_the_judge_needs
 from tests.embodiments import ARM_DELTAS
 from tests.envs.simulators.test_text_world import section
 

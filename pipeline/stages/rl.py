@@ -45,8 +45,7 @@ from pipeline.stages.given import (
     successful_episodes,
 )
 from pipeline.stages.judge_cost import priced
-from pipeline.stages.reinforcement.doubt import Doubt, chosen_among
-from pipeline.stages.reinforcement.trials import true_success
+from pipeline.stages.trials import true_success
 
 LEARNING = ("policy", "algorithm", "rl", "imitation", "microbatches")
 
@@ -78,9 +77,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     algorithm = build_algorithm(cfg, policy)
     inside = None if settings.starts == "first" else newest_episodes(store, learning_episodes(store))
     data, more = (datasets(inputs.folders(role)) for role in ("data", "starts"))
-    beside = open_clips(cfg, more) if more else None
-    extra = range(len(store), len(store) + (len(beside) if beside else 0))
-    doubt = Doubt.of(inputs, settings.doubt)
+    extra = range(len(store), len(store) + (len(open_clips(cfg, more)) if more else 0))
     knew, decisions = _warm_up(cfg, policy, algorithm, store, settings.seed, number)
     recipe = Recipe(
         config=cfg.plain(),
@@ -99,7 +96,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     )
     fleet = build_fleet(recipe) if leads() else None
     try:
-        starts = _starts(cfg, store, inside, beside, doubt)
+        starts = starts_of(cfg, *_begun(store, inside, settings.starts == "key"), len(extra))
         true = TrueExperience(anchor, decisions)
         watch = true_success(cfg, settings, inputs.weights("policy"))
         stats = train_rl(fleet, policy, algorithm, settings, folder, starts, true=true, watch=watch)
@@ -110,38 +107,25 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
             fleet.close()
     save_weights(policy, folder)
     last = {f"last_{key}": value for key, value in stats.pop("last").items()}
-    return {"lr": lr, **knew, **stats, **last, "alarms": [*doubt.alarms(), *stats["alarms"]]}
+    return {"lr": lr, **knew, **stats, **last}
 
 
-def _starts(
-    cfg: Cfg, store: ClipStore, inside: Tensor | None, beside: ClipStore | None, doubt: Doubt
-) -> Starts:
-    """Where imagined episodes begin: `inside` recorded ones, at all decisions or at key frames, or at the
-    first frames of all; and at those of episodes `beside`.
-    """
+def _begun(store: ClipStore, inside: Tensor | None, key: bool) -> tuple[int, Sequence[int]]:
+    """How many starts recorded episodes offer, and the numbers of those that are taken."""
     if inside is None:
-        episode = torch.arange(len(store))
-        chosen = list(range(len(store)))
-    else:
-        episode, frame = decision_points(store, inside)
-        key = cfg["rl"]["starts"] == "key"
-        chosen = (
-            key_points(store, episode, frame).nonzero().flatten().tolist() if key else list(range(len(frame)))
-        )
-    chosen = chosen_among(chosen, doubt.trusted(cfg, store, episode)) or chosen
-    if beside is None:
-        return starts_of(cfg, chosen, [], len(episode))
-    first, count = len(episode), len(episode) + len(beside)
-    trusted = doubt.trusted(cfg, beside, torch.arange(len(beside)))
-    return starts_of(cfg, chosen, chosen_among(range(first, count), trusted, first), count)
+        return len(store), range(len(store))
+    episode, frame = decision_points(store, inside)
+    chosen = key_points(store, episode, frame).nonzero().flatten().tolist() if key else range(len(frame))
+    return len(frame), chosen
 
 
-def starts_of(cfg: Cfg, chosen: Sequence[int], extra: Sequence[int], count: int) -> Starts:
-    """Imagined episodes begin at the `chosen` ones of `count` starts and, as often as extra_starts.share
-    says, at the `extra` ones.
+def starts_of(cfg: Cfg, begun: int, chosen: Sequence[int], extra: int) -> Starts:
+    """Where imagined episodes begin: at the `chosen` ones of `begun` starts, and at the `extra` ones that
+    stand after all of these.
     """
-    pool = shared_out(chosen, extra, cfg["extra_starts"]["share"]) if extra else chosen
-    return Starts(pool, 0 if cfg["simulator"]["shared_noise"] else count)
+    share, shared = cfg["extra_starts"]["share"], cfg["simulator"]["shared_noise"]
+    pool = shared_out(chosen, range(begun, begun + extra), share) if extra else chosen
+    return Starts(pool, 0 if shared else begun + extra)
 
 
 def what_the_judge_needs(cfg: Cfg, fleet: Fleet | None) -> str:

@@ -1,0 +1,31 @@
+"""Tasks whose imagined success is far above the true one are told."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from pipeline.evaluation.statistics import rate_entry
+from pipeline.stages.prove import too_kind
+
+
+def entry(imagined: int, true: int, episodes: int = 40) -> dict[str, Any]:
+    """What a gap says of a task's starts."""
+    every = torch.arange(episodes)
+    return {"imagined": rate_entry(every < imagined), "true": rate_entry(every < true)}
+
+
+def test_a_task_that_succeeds_in_imagination_alone_is_an_alarm() -> None:
+    tasks = {"push": entry(40, 1), "door": entry(7, 6), "drawer": entry(40, 31)}
+    (alarm,) = too_kind({"tasks": tasks})
+    assert "push succeeds in 40 of 40 imagined and 1 of 40 true" in alarm and "rounds.deploy" in alarm
+    assert not too_kind({"tasks": {name: tasks[name] for name in ("door", "drawer")}})
+
+
+def test_without_several_tasks_all_starts_are_one() -> None:
+    (alarm,) = too_kind({"tasks": {}, **entry(150, 60, 200)})
+    assert alarm.startswith("the task succeeds in 150 of 200")
+    assert not too_kind({"tasks": {}, **entry(124, 86, 200)})  # kind, and usual
+    assert not too_kind({"tasks": {}, **entry(5, 60, 200)})  # too strict teaches little, but nothing false
+    assert not too_kind({"tasks": {}, **entry(4, 0, 5)})  # too few to tell
