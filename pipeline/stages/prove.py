@@ -85,9 +85,9 @@ def too_kind(result: Mapping[str, Any]) -> list[str]:
         if imagined["low"] - true["high"] > _TOO_KIND:
             seen, so = (f"{one['successes']} of {one['episodes']}" for one in (imagined, true))
             out.append(
-                f"{task or 'the task'} succeeds in {seen} imagined and {so} true episodes from the same starts,"
-                " so imagination teaches little of it; deploy more episodes (rounds.deploy), or train simulator"
-                " and judge for longer (simulator_fit, judge_fit)"
+                f"{task or 'the task'} succeeds in {seen} imagined and {so} true episodes from the same"
+                " starts, so imagination teaches little of it; deploy more episodes (rounds.deploy), or train"
+                " simulator and judge for longer (simulator_fit, judge_fit)"
             )
     return out
 
