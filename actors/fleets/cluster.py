@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import os
 import platform
-import signal
 import socket
-import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +14,7 @@ import tensordict
 import torch
 
 from actors.fleets.reaper import reap_after_me
+from actors.fleets.sigterm import our_sigterm
 from envs.targets import ConfigError
 
 ROLES = ("learner", "actors", "judge", "evaluator")
@@ -155,7 +153,7 @@ def connect(launch: Mapping[str, Any]) -> list[Mapping[str, float]]:
     if not ray.is_initialized():
         _knock(str(launch["address"]))
         try:
-            with _our_sigterm():
+            with our_sigterm():
                 _start(launch)
         except Exception as error:
             raise ConfigError(_advice(str(launch["address"]), error)) from error
@@ -182,43 +180,6 @@ def _start(launch: Mapping[str, Any]) -> None:
         log_to_driver=False,
         configure_logging=False,
     )
-
-
-@contextmanager
-def _our_sigterm() -> Iterator[None]:
-    """Within, Ray starts; it takes SIGTERM for itself, and would end a driver with status 15 where shells and
-    schedulers expect 143, or, where its C++ turns that end into an error, with 1. Whatever became of it, a
-    SIGTERM that came ends the process with 143.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before, (listen, wake) = signal.getsignal(signal.SIGTERM), os.pipe()
-    for end in (listen, wake):
-        os.set_blocking(end, False)
-    # It gets every signal, whoever handles it.
-    listening = signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
-
-    def terminated() -> bool:
-        try:
-            return signal.SIGTERM in os.read(listen, 4096)
-        except BlockingIOError:  # none came
-            return False
-
-    try:
-        yield
-    except (SystemExit, Exception) as error:
-        if terminated():
-            raise SystemExit(128 + signal.SIGTERM) from error
-        raise
-    else:
-        if terminated():
-            raise SystemExit(128 + signal.SIGTERM)
-    finally:
-        signal.set_wakeup_fd(listening)
-        signal.signal(signal.SIGTERM, before)
-        os.close(listen)
-        os.close(wake)
 
 
 def _knock(address: str) -> None:

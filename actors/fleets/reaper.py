@@ -19,6 +19,7 @@ from pathlib import Path
 
 MARK = "WORLDLOOP_RAY_OF"  # environment variable by which they are known
 _EVERY = 1.0  # seconds between looks
+_AGENTS = (b"ray::DashboardAgent", b"ray::RuntimeEnvAgent")
 
 
 def reap_after_me() -> None:
@@ -29,7 +30,7 @@ def reap_after_me() -> None:
         os.environ[MARK] = uuid.uuid4().hex
         # The pipe stays open as long as we live; nobody else holds its other end.
         _REAPERS[os.getpid()] = subprocess.Popen(
-            [sys.executable, "-S", __file__], stdin=subprocess.PIPE, start_new_session=True
+            [sys.executable, "-S", __file__, str(os.getsid(0))], stdin=subprocess.PIPE, start_new_session=True
         )
 
 
@@ -54,6 +55,22 @@ def marked(mark: str) -> set[int]:
     return found
 
 
+def orphans(session: int) -> set[int]:
+    """Ids of Ray's agents in a session whose raylet has ended, and with it the parent that would tell whose
+    they are: one that was born just before may never have been seen beside it.
+    """
+    found = set()
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            parent, _, its = (entry / "stat").read_text().rsplit(")", 1)[1].split()[1:4]
+            agent = (entry / "cmdline").read_bytes().startswith(_AGENTS)
+        except OSError:
+            continue  # it ended while we looked
+        if agent and int(its) == session and not _is_ray(int(parent)):
+            found.add(int(entry.name))
+    return found
+
+
 def _is_ray(pid: int) -> bool:
     try:
         command = Path(f"/proc/{pid}/cmdline").read_bytes()
@@ -70,7 +87,7 @@ def main() -> None:
         known |= marked(mark)
     known |= marked(mark)
     time.sleep(2)
-    for pid in known | marked(mark):
+    for pid in known | marked(mark) | orphans(int(sys.argv[1])):
         if _is_ray(pid):  # not another process that got its number
             try:
                 os.kill(pid, signal.SIGKILL)

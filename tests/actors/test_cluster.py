@@ -20,9 +20,11 @@ import ray
 from ray.cluster_utils import Cluster
 
 from actors.factory import build_policy
-from actors.fleets.cluster import _advice, _our_sigterm, check_versions, connect, versions
+from actors.fleets.cluster import _advice, check_versions, connect, versions
 from actors.fleets.launch import build_fleet, check_launch
 from actors.fleets.ray_fleet import RayFleet
+from actors.fleets.reaper import orphans
+from actors.fleets.sigterm import our_sigterm
 from actors.rollouts.host import Job, trained_weights
 from actors.rollouts.recipe import Recipe
 from envs.targets import ConfigError
@@ -110,7 +112,7 @@ def test_an_ended_driver_leaves_no_ray_and_the_status_that_shells_expect(
 @pytest.mark.parametrize("turned", [RuntimeError, SystemExit, None])
 def test_a_sigterm_counts_whatever_a_starting_ray_makes_of_it(turned: type[BaseException] | None) -> None:
     before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(SystemExit) as ended, _our_sigterm():
+    with pytest.raises(SystemExit) as ended, our_sigterm():
         signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(number))  # as ray.init does
         try:
             signal.raise_signal(signal.SIGTERM)
@@ -118,8 +120,34 @@ def test_a_sigterm_counts_whatever_a_starting_ray_makes_of_it(turned: type[BaseE
             if turned is not None:
                 raise turned(15) from error
     assert ended.value.code == 143 and signal.getsignal(signal.SIGTERM) is before
-    with pytest.raises(ValueError, match="its own"), _our_sigterm():
+    with pytest.raises(ValueError, match="its own"), our_sigterm():
         raise ValueError("its own")
+
+
+def test_an_agent_without_its_raylet_is_found_in_its_session() -> None:
+    agent = subprocess.Popen(["bash", "-c", "exec -a ray::DashboardAgent sleep 60"], start_new_session=True)
+    try:
+        deadline = time.monotonic() + 20
+        while not (found := orphans(agent.pid)) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert found == {agent.pid} and agent.pid not in orphans(os.getsid(0))
+    finally:
+        agent.kill()
+        agent.wait()
+
+
+class Dropped:
+    """Gets a SIGTERM where Python drops what is raised, as in the handlers of a fork."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_a_sigterm_that_python_drops_counts_and_is_not_reported(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended, our_sigterm():
+        signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(number))
+        Dropped()
+    assert ended.value.code == 143 and "Traceback" not in capsys.readouterr().err
 
 
 def test_a_wrong_token_is_named() -> None:

@@ -74,14 +74,15 @@ def test_what_a_dead_owner_held_is_taken_over(
 
 def test_two_commands_in_one_run_leave_one_good_run(tmp_path: Path) -> None:
     words = ["stage", "collect", "experiment=smoke", f"runs={tmp_path}", "track=disabled"]
-    words.append("collect.episodes.train=120")
     first = _worldloop(words)
     lock = tmp_path / "smoke/.owner.json"
     deadline = time.monotonic() + 60
     while not lock.exists() and time.monotonic() < deadline and first.poll() is None:
         time.sleep(0.02)
+    first.send_signal(signal.SIGSTOP)  # however fast it is, it is there while the other comes
     second = _worldloop(words)
     said = second.communicate()[1]
+    first.send_signal(signal.SIGCONT)
     assert first.wait() == 0 and second.returncode == 1, said
     assert "belongs to `worldloop stage collect`, process" in said and "Traceback" not in said
     (folder,) = (tmp_path / "smoke/stages").glob("collect-*")
