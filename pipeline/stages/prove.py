@@ -77,7 +77,7 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 def too_kind(result: Mapping[str, Any]) -> list[str]:
     """What to know of those tasks of a gap in which imagined success lies far above the true one, beyond what
-    chance does: there RL learns from true decisions alone, if from any.
+    chance does: that an imagined episode succeeds says little there.
     """
     out = []
     for task, entry in (result["tasks"] or {"": result}).items():
@@ -86,7 +86,7 @@ def too_kind(result: Mapping[str, Any]) -> list[str]:
             seen, so = (f"{one['successes']} of {one['episodes']}" for one in (imagined, true))
             out.append(
                 f"{task or 'the task'} succeeds in {seen} imagined and {so} true episodes from the same"
-                " starts, so imagination teaches little of it; deploy more episodes (rounds.deploy), or train"
+                " starts, so that it succeeds in imagination says little; deploy more episodes (rounds.deploy), or train"
                 " simulator and judge for longer (simulator_fit, judge_fit)"
             )
     return out
