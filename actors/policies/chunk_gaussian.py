@@ -36,8 +36,8 @@ class ChunkGaussian(Distribution):
     constant.
 
     The density is that of the knots; a chunk determines them exactly (the basis has full column rank), so
-    likelihood ratios are those of the chunk. It is the density of chunks that are drawn; where the mode is
-    taken instead (heads.some_drawn) its gradient with respect to the mean is zero: nothing is learned.
+    likelihood ratios are those of the chunk. It is the density of chunks that are drawn; where the mode was
+    taken instead (heads.some_drawn) its gradient with respect to the mean is zero as long as the mean stays.
 
     Args:
         loc: [..., n, A] mean knots in normalised units.

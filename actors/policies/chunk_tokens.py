@@ -33,7 +33,7 @@ class ChunkTokens(Distribution):
     def __init__(
         self, logits: Tensor, low: Tensor, high: Tensor, share: Tensor, validate_args: bool | None = None
     ):
-        self.log_share, self.share = logits.log_softmax(-1), share
+        self.log_probs, self.share = logits.log_softmax(-1), share
         # TensorDict hands shared tensors over with batch dimensions; every row is the same.
         self.low, self.high = low[(0,) * (low.ndim - 1)], high[(0,) * (high.ndim - 1)]
         self.active = self.high > self.low
@@ -45,44 +45,44 @@ class ChunkTokens(Distribution):
 
     @property
     def mode(self) -> Tensor:
-        return self._decode(self.log_share.argmax(-1))
+        return self._decode(self.log_probs.argmax(-1))
 
     @property
     def mean(self) -> Tensor:
-        middles = torch.arange(self.bins, device=self.log_share.device)
-        return self._decode((self.log_share.exp() * middles).sum(-1))
+        middles = torch.arange(self.bins, device=self.log_probs.device)
+        return self._decode((self.log_probs.exp() * middles).sum(-1))
 
     deterministic_sample = mode
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
         with torch.no_grad():
             # NaN shows in the log-probability; drawing from it would raise for all rows
-            share = self.log_share.exp().nan_to_num(1.0)
+            probs = self.log_probs.exp().nan_to_num(1.0)
             drawn = torch.multinomial(
-                share.flatten(0, -2), max(1, torch.Size(sample_shape).numel()), replacement=True
+                probs.flatten(0, -2), max(1, torch.Size(sample_shape).numel()), replacement=True
             )
-            drawn = drawn.movedim(-1, 0).reshape(*sample_shape, *share.shape[:-1])
+            drawn = drawn.movedim(-1, 0).reshape(*sample_shape, *probs.shape[:-1])
             return some_drawn(self._decode(drawn), self.mode, self.share)
 
     def log_prob(self, value: Tensor) -> Tensor:
         bins = bins_of(value, self.low, self.high, self.bins)
-        shares = self.log_share.expand(*value.shape, self.bins).gather(-1, bins.unsqueeze(-1)).squeeze(-1)
-        drawn = self.share.log() + (shares * self.active).sum((-2, -1))
-        usual = ((bins == self.log_share.argmax(-1)) | ~self.active).all(-1).all(-1)
-        return torch.where(usual, torch.logaddexp(drawn, torch.log1p(-self.share)), drawn)
+        said = self.log_probs.expand(*value.shape, self.bins).gather(-1, bins.unsqueeze(-1)).squeeze(-1)
+        drawn = self.share.log() + (said * self.active).sum((-2, -1))
+        at_mode = ((bins == self.log_probs.argmax(-1)) | ~self.active).all(-1).all(-1)
+        return torch.where(at_mode, torch.logaddexp(drawn, torch.log1p(-self.share)), drawn)
 
     def entropy(self) -> Tensor:
-        return -((self.log_share.exp() * self.log_share).sum(-1) * self.active).sum((-2, -1))
+        return -((self.log_probs.exp() * self.log_probs).sum(-1) * self.active).sum((-2, -1))
 
     def held(self) -> ChunkTokens:
         """All of its chunks drawn; how sure tokens are cannot be told from which they are."""
-        return ChunkTokens(self.log_share, self.low, self.high, torch.ones_like(self.share))
+        return ChunkTokens(self.log_probs, self.low, self.high, torch.ones_like(self.share))
 
 
 @register_kl(ChunkTokens, ChunkTokens)
 def _kl(p: ChunkTokens, q: ChunkTokens) -> Tensor:
     """KL(p || q) in nats, [...], over the dimensions that vary."""
-    return ((p.log_share.exp() * (p.log_share - q.log_share)).sum(-1) * p.active).sum((-2, -1))
+    return ((p.log_probs.exp() * (p.log_probs - q.log_probs)).sum(-1) * p.active).sum((-2, -1))
 
 
 def bins_of(chunk: Tensor, low: Tensor, high: Tensor, bins: int) -> Tensor:

@@ -74,9 +74,8 @@ class Head(nn.Module, abc.ABC):
 def some_drawn(drawn: Tensor, mode: Tensor, share: Tensor) -> Tensor:
     """Chunks [..., K, A], each drawn with probability `share` [...] and the mode otherwise.
 
-    A chunk is known by what comes of it, and what comes of it should not be the mishaps of those that follow:
-    with few of them drawn an episode survives wide ones, which tell more. TRPO's vine estimate (Schulman et
-    al. 2015) departs from a policy's own course in one action at a time for the same reason.
+    What comes of a drawn chunk is also what comes of those drawn after it; with fewer of them an episode
+    survives wider ones. (TRPO's vine estimate, Schulman et al. 2015, tries single actions from states, too.)
     """
     chosen = torch.rand(drawn.shape[:-2], device=drawn.device) < share
     return torch.where(chosen[..., None, None], drawn, mode)

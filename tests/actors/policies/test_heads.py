@@ -35,7 +35,7 @@ def test_tokens_are_a_density_over_bins() -> None:
     assert chunk.shape == (5, 4, 3) and bool((chunk[..., 1] == 0.5).all())
     assert bool((chunk[..., 0].abs() < 1).all()) and bool(((chunk[..., 2] > 0) & (chunk[..., 2] < 2)).all())
     bins = torch.stack(((chunk[..., 0] + 1) / 2 * 8, chunk[..., 2] / 2 * 8), -1).floor().long()
-    expected = dist.log_share[:, :, [0, 2]].gather(-1, bins.unsqueeze(-1)).sum((-3, -2, -1))
+    expected = dist.log_probs[:, :, [0, 2]].gather(-1, bins.unsqueeze(-1)).sum((-3, -2, -1))
     assert torch.allclose(dist.log_prob(chunk), expected, atol=1e-5)
     assert bool((dist.log_prob(dist.mode) >= dist.log_prob(chunk)).all())
 
