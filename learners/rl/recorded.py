@@ -28,8 +28,8 @@ class RecordedDecisions:
     """Decisions that a policy took in physics with their advantages, as transitions of an iteration.
 
     Likelihood ratios are to the policy that RL begins with, over all of its iterations: clipping then lets
-    each decision move the policy so far and no further. Ratios to the policy of each iteration let the same
-    bad decision push it away again and again, the harder the less likely it has become.
+    each decision move the policy so far and no further. Ratios to the policy of each iteration would let
+    the same bad decision push it away again and again.
 
     Args:
         policy: in training, as RL begins with it.
