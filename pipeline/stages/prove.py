@@ -86,8 +86,8 @@ def too_kind(result: Mapping[str, Any]) -> list[str]:
             seen, so = (f"{one['successes']} of {one['episodes']}" for one in (imagined, true))
             out.append(
                 f"{task or 'the task'} succeeds in {seen} imagined and {so} true episodes from the same"
-                " starts, so that it succeeds in imagination says little; deploy more episodes (rounds.deploy),"
-                " or train simulator and judge for longer (simulator_fit, judge_fit)"
+                " starts, so that it succeeds in imagination says little; deploy more episodes"
+                " (rounds.deploy), or train simulator and judge for longer (simulator_fit, judge_fit)"
             )
     return out
 
