@@ -221,7 +221,7 @@ def _allowed(error: Mapping[str, Any]) -> str:
     if error["type"] == "missing":
         last = error["loc"][-1]
         return "be longer" if isinstance(last, int) else f"have {last}"
-    message = str(error["msg"]).replace("an instance of Sequence", "a list")
+    message = re.sub("an instance of Sequence|a valid tuple", "a list", str(error["msg"]))
     wanted = re.sub(r"^\w+ should ", "", message)
     return wanted if wanted != message else f"be something else: {message}"
 

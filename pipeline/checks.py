@@ -29,6 +29,7 @@ from learners.stages.simulator import SimulatorFitConfig
 from learners.training.fit import FitConfig
 from pipeline.acting import acting
 from pipeline.sections import learning, measuring, running
+from pipeline.stages.given import imagined_chunks
 
 Cfg = Mapping[str, Any]
 
@@ -269,11 +270,11 @@ def _learning(cfg: Cfg) -> Iterator[str]:
         )
     if rl["schedule"] == "async" and rl["queue"] < rl["shards"]:
         yield f"rl.queue={rl['queue']} must hold at least the rl.shards={rl['shards']} jobs of one iteration"
-    short = rl["chunks"] is not None and rl["chunks"] * task["chunk"] < task["horizon"]
+    short = imagined_chunks(cfg) * task["chunk"] < task["horizon"]
     if short and not getattr(kind, "bootstraps", True) and not cfg["judge"]["rewards"]["progress"]:
         yield (
-            f"rl.chunks={rl['chunks']} cuts episodes short, and neither a critic (algorithm={name}) nor"
-            " judge.rewards.progress=0 says what the rest is worth; set rl.chunks=null"
+            f"rl.horizon={rl['horizon']} cuts episodes short, and neither a critic (algorithm={name}) nor"
+            " judge.rewards.progress=0 says what the rest is worth; set rl.horizon=null"
         )
 
 

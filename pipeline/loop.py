@@ -19,6 +19,7 @@ from pipeline.graph.graph import Graph
 from pipeline.graph.workers import learners_of
 from pipeline.outside import CHECKPOINT, KINEMATICS, STATE_CHECKPOINT, files_at, fingerprint, judge_files
 from pipeline.stages import collect, imitation, keep, pace, prove, rl, show, world
+from pipeline.stages.given import imagined_chunks
 from pipeline.stages.measured import explore
 
 Cfg = Mapping[str, Any]
@@ -109,8 +110,7 @@ def imagined_iterations(cfg: Cfg) -> int:
     """Iterations of RL whose episodes, if they were whole, would take as many steps as all rounds imagine."""
     iterations = sum(of_round(cfg["rounds"]["iterations"], n) for n in range(1, last_round(cfg) + 1))
     whole = cfg["task"]["horizon"] // cfg["task"]["chunk"]
-    share = min(1.0, (cfg["rl"]["chunks"] or whole) / whole)  # of a whole episode, has an imagined one
-    return max(1, round(iterations * share))
+    return max(1, round(iterations * imagined_chunks(cfg) / whole))
 
 
 def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:

@@ -30,8 +30,8 @@ class RLConfig:
         starts: imagined episodes begin "inside" the newest recorded ones, at any of their chunks, at those
             of "key" frames (episodes/key_frames.py), or at the "first" frames of all. A world errs more with
             every chunk it builds on its own; from inside, short episodes meet every stage of the task.
-        chunks: of an imagined episode, None for as many as the task has. What the judge's progress, and a
-            critic if there is one, expect of the rest stands in for it.
+        horizon: actions of an imagined episode, rounded up to whole chunks; None for the task's own. What the
+            judge's progress, and a critic if there is one, expect of the rest stands in for it.
         schedule: "sync" learns from rollouts of the newest policy only; "async" lets hosts run on meanwhile.
         max_policy_lag: versions a rollout may be behind, if async.
         queue: jobs submitted and not yet learned from at most, if async.
@@ -68,7 +68,7 @@ class RLConfig:
     shards: Count
     threads: Count
     starts: Literal["inside", "key", "first"]
-    chunks: Count | None
+    horizon: Count | None
     schedule: Literal["sync", "async"]
     max_policy_lag: Natural
     queue: Count

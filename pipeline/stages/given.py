@@ -60,6 +60,12 @@ def mode_of(cfg: Cfg) -> ActionMode:
     return ActionMode(cfg["task"]["mode"])
 
 
+def imagined_chunks(cfg: Cfg) -> int:
+    """Chunks of an episode that RL imagines: enough for rl.horizon actions, at most the task's."""
+    asked, chunk, whole = cfg["rl"]["horizon"], int(cfg["task"]["chunk"]), int(cfg["task"]["horizon"])
+    return whole // chunk if asked is None else min(whole // chunk, -(-int(asked) // chunk))
+
+
 def datasets(folders: Iterable[Path]) -> list[Path]:
     """The data sets that stages left in their folders, or point to."""
     out: list[str] = []

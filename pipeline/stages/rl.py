@@ -37,6 +37,7 @@ from pipeline.stages.given import (
     WORLD,
     Cfg,
     datasets,
+    imagined_chunks,
     learning_episodes,
     mode_of,
     newest_episodes,
@@ -89,7 +90,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         data=tuple(str(path) for path in (*data, *more)),
         inside=() if inside is None else tuple(inside.tolist()),
         first=() if inside is None else tuple(extra),
-        horizon=_horizon(cfg, settings.chunks, algorithm),
+        horizon=_horizon(cfg, algorithm),
         freeze_perception=settings.freeze_perception,
         bootstrap=algorithm.bootstraps,
         later=settings.rewards_later,
@@ -136,18 +137,17 @@ def what_the_judge_needs(cfg: Cfg, fleet: Fleet | None) -> str:
     return f". {kind.__name__}: {kind.remedy(cfg['judge'])}"
 
 
-def _horizon(cfg: Cfg, chunks: int | None, algorithm: Algorithm) -> int:
-    """Control steps of an imagined episode.
+def _horizon(cfg: Cfg, algorithm: Algorithm) -> int:
+    """Actions of an imagined episode.
 
     Raises:
-        ConfigError: if rl.chunks cuts off what nothing else values.
+        ConfigError: if rl.horizon cuts off what nothing else values.
     """
-    whole = int(cfg["task"]["horizon"])
-    short = whole if chunks is None else min(whole, chunks * int(cfg["task"]["chunk"]))
-    if short < whole and not algorithm.bootstraps and not rewards_of(cfg).progress:
+    short, asked = imagined_chunks(cfg) * int(cfg["task"]["chunk"]), cfg["rl"]["horizon"]
+    if short < int(cfg["task"]["horizon"]) and not algorithm.bootstraps and not rewards_of(cfg).progress:
         raise ConfigError(
-            f"rl.chunks={chunks} cuts episodes short, and neither a critic (algorithm={algorithm.name}) nor"
-            " judge.rewards.progress=0 says what the rest is worth; set rl.chunks=null"
+            f"rl.horizon={asked} cuts episodes short, and neither a critic (algorithm={algorithm.name}) nor"
+            " judge.rewards.progress=0 says what the rest is worth; set rl.horizon=null"
         )
     return short
 

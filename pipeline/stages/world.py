@@ -39,6 +39,7 @@ from pipeline.stages.given import (
     WORLD,
     Cfg,
     fit_options,
+    imagined_chunks,
     learning_episodes,
     learns,
     newest_episodes,
@@ -202,7 +203,7 @@ def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return {**stats, "ending_threshold": float(model.threshold), "ending_calibrated": calibrated}
 
 
-@stage(reads=(*WORLD, "judge_fit.{phase}", "rl.starts", "rl.chunks", "microbatches"), place=Place.LEARNERS)
+@stage(reads=(*WORLD, "judge_fit.{phase}", "rl.starts", "rl.horizon", "microbatches"), place=Place.LEARNERS)
 @priced
 def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The judge on recorded and on generated frames; its threshold on recorded video that no judge learns
@@ -262,9 +263,9 @@ def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor)
     and does not go far; of the others whole episodes, by which the world is measured.
     """
     rl, bf16 = cfg["rl"], cfg["simulator"]["bf16"]
-    if rl["starts"] == "first" or rl["chunks"] is None:
+    if rl["starts"] == "first" or rl["horizon"] is None:
         return generated_frames(world, store, episodes, bf16)
-    near = generated_frames(world, store, episodes[::2], bf16, rl["chunks"])
+    near = generated_frames(world, store, episodes[::2], bf16, imagined_chunks(cfg))
     return torch.cat([near, generated_frames(world, store, episodes[1::2], bf16)])
 
 

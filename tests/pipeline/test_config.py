@@ -45,7 +45,7 @@ from pipeline.loop import build_loop
         (["algorithm=grpo", "rl.envs=40"], r"algorithm\.group"),
         (
             ["algorithm=grpo", "judge.rewards.progress=0"],
-            r"rl\.chunks=2 cuts episodes short.*rl\.chunks=null",
+            r"rl\.horizon=8 cuts episodes short.*rl\.horizon=null",
         ),
         (["rl.rewards_later=true"], r"rl\.rewards_later=true, but algorithm=ppo"),
         (["rl.schedule=async", "rl.queue=2"], r"rl\.queue=2 must hold at least the rl\.shards=4"),
@@ -128,7 +128,7 @@ WRONG: dict[type, list[Any]] = {
 }
 # other packages' options; where null has a meaning
 FREE = ("simulator.scratch", "policy.policy", "judge.chat.body")
-NULLABLE = ("rl.chunks", "task.suite", "finetune.weights", "judge.chat.key")
+NULLABLE = ("rl.horizon", "task.suite", "finetune.weights", "judge.chat.key")
 
 
 WHOLE = "experiment=quickstart"

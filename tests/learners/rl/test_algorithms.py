@@ -46,7 +46,7 @@ RL = {
         "anchor_batch": 8,
         "rewards_later": False,
     },
-    **{"starts": "first", "chunks": None, "freeze_perception": False, "checkpoint_every": 5, "seed": 0},
+    **{"starts": "first", "horizon": None, "freeze_perception": False, "checkpoint_every": 5, "seed": 0},
     **{"evaluate_every": 0, "evaluate_episodes": 1},
 }
 POLICIES = [name for name in offered("policy") if name != "openpi"]  # that one needs a server
