@@ -20,7 +20,7 @@ from pipeline.config import load_config
 from pipeline.evaluation.by_task import evenly, tasks_of_seeds
 from pipeline.graph.stage import Inputs
 from pipeline.stages.collect import collect, scripted_jobs, split_counts
-from pipeline.stages.given import demonstrations
+from pipeline.stages.given import demonstrations, imagined_chunks
 from tests.embodiments import ARM_DELTAS
 from tests.moving_square import moving_square
 
@@ -142,3 +142,13 @@ def test_recordings_that_stand_task_by_task_are_shared_out_evenly(tmp_path: Path
         assert demonstrations(*told(order)).tolist() == list(range(7))
     physics = {**cfg, "task": {**cfg["task"], "suite": {"_target_": "any"}}}
     assert demonstrations(physics, store).tolist() == list(range(7))
+
+
+@pytest.mark.parametrize(
+    ("horizon", "chunk", "chunks"), [(8, 4, 2), (8, 2, 4), (8, 25, 1), (9, 4, 3), (60, 4, 5), (None, 4, 5)]
+)
+def test_imagined_episodes_are_as_long_whatever_a_chunk_has(
+    horizon: int | None, chunk: int, chunks: int
+) -> None:
+    cfg = {"rl": {"horizon": horizon}, "task": {"chunk": chunk, "horizon": 20 if chunk < 20 else 100}}
+    assert imagined_chunks(cfg) == chunks
