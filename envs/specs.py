@@ -154,18 +154,18 @@ def check_chunk(chunk: Tensor, embodiment: Embodiment) -> None:
         )
 
 
-def memory_indices(length: Tensor, count: int) -> Tensor:
-    """Which of the first `length` [...] frames are remembered, [..., count]: evenly spread, both ends too."""
-    share = torch.linspace(0, 1, count, dtype=torch.float64, device=length.device)
-    return ((length.unsqueeze(-1) - 1) * share).round().long()
-
-
-def recent_indices(length: Tensor, count: int) -> Tensor:
-    """The last `count` of the first `length` [...] frames, [..., count]; the first repeats where there are
-    fewer.
+def memory_indices(length: Tensor, count: int, newest: int = 1) -> Tensor:
+    """Which of the first `length` [...] frames are remembered, [..., count]: the `newest` ones, 1 to count,
+    and others that are evenly spread over those before, the first included. Where there are too few, some
+    repeat.
     """
-    back = torch.arange(count - 1, -1, -1, device=length.device)
-    return (length.unsqueeze(-1) - 1 - back).clamp(min=0)
+    # of the newest ones the oldest is the end of what is evenly spread
+    share = torch.linspace(0, 1, count - newest + 1, dtype=torch.float64, device=length.device)
+    spread = share if newest < count else torch.ones_like(share)
+    last = length.unsqueeze(-1) - 1
+    back = torch.arange(newest - 2, -1, -1, device=length.device)
+    before = ((last - newest + 1).clamp(min=0) * spread).round().long()
+    return torch.cat([before, (last - back).clamp(min=0)], -1)
 
 
 def text_to_bytes(texts: Sequence[str]) -> Tensor:

@@ -20,6 +20,7 @@ from pipeline.graph.workers import learners_of
 from pipeline.outside import CHECKPOINT, KINEMATICS, STATE_CHECKPOINT, files_at, fingerprint, judge_files
 from pipeline.stages import collect, imitation, keep, pace, prove, rl, show, world
 from pipeline.stages.given import imagined_chunks
+from pipeline.stages.judging import stage as judging
 from pipeline.stages.measured import explore
 
 Cfg = Mapping[str, Any]
@@ -220,9 +221,9 @@ def add_world(graph: Graph, cfg: Cfg, data: list[str], before: World, number: in
     golden = ""
     if "text_world" in cfg["judge"]:
         roles = {"data": data, "warm": before.text_world}
-        golden = graph.add(f"text_world-{number}", world.text_world, roles, phase=phase)
+        golden = graph.add(f"text_world-{number}", judging.text_world, roles, phase=phase)
     roles = {**inputs, "warm": before.judge, "text_world": golden}
-    judge = graph.add(f"judge-{number}", world.judge, roles, phase=phase, **judge_files(cfg))
+    judge = graph.add(f"judge-{number}", judging.judge, roles, phase=phase, **judge_files(cfg))
     return World(teacher, simulator, state, judge, golden, speeds)
 
 

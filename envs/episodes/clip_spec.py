@@ -10,12 +10,13 @@ class ClipSpec:
     """Shape of a training clip.
 
     Args:
-        memory: sparse memory frames, evenly spread over the past and always with the first, M.
+        memory: memory frames, M.
         chunk: frames a chunk adds, K.
         chunks: consecutive chunks per clip, L.
         stride: frames between two frames of the clip.
         history: consecutive commands and states up to now, H; 0 is as many as `memory`.
-        recent: whether memory is the newest frames instead, the first repeated where there are fewer.
+        newest: of the memory frames, those that are the newest; the others are evenly spread over the past
+            (memory_indices).
     """
 
     memory: int = 4
@@ -23,4 +24,4 @@ class ClipSpec:
     chunks: int = 1
     stride: int = 1
     history: int = 0
-    recent: bool = False
+    newest: int = 1

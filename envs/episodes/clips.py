@@ -12,7 +12,7 @@ from torch import Tensor
 from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.episode import EpisodeError
 from envs.episodes.store import EpisodeStore
-from envs.specs import memory_indices, recent_indices
+from envs.specs import memory_indices
 
 
 class ClipStore(EpisodeStore):
@@ -37,8 +37,8 @@ class ClipStore(EpisodeStore):
         rows = base[:, None] + torch.minimum(ahead, last[:, None])
         # frames before each chunk, in strides
         past = begin[:, None] // spec.stride + spec.chunk * torch.arange(spec.chunks)
-        chosen = recent_indices if spec.recent else memory_indices
-        index = chosen(past + 1, spec.memory)  # [B, L, M], in strides from `begin % stride`
+        # [B, L, M], in strides from `begin % stride`
+        index = memory_indices(past + 1, spec.memory, spec.newest)
         at = (begin % spec.stride)[:, None, None] + index * spec.stride
         memory = base[:, None, None] + torch.minimum(at, last[:, None, None])
         recent = begin[:, None] - spec.stride * torch.arange((spec.history or spec.memory) - 1, -1, -1)

@@ -15,6 +15,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from envs.episodes.clip_spec import ClipSpec
 from envs.rng import noise_generator
 from envs.simulators import memory
 from envs.simulators.compiling import Repeated
@@ -39,14 +40,15 @@ class Simulator(Repeated):
 
     Args:
         spec: what it shows of which robot.
-        memory_frames: memory frames, M; of sparse ones the first frame is always one.
+        memory_frames: memory frames, M.
+        newest_frames: of them, those that are the newest; the others are evenly spread over the past, the
+            first frame included.
 
     Attributes:
         feature_shape: of the features that state experts read, without the batch.
         says_done: whether it learns to say in which frames a task is done; `done_head` is then there.
         hidden: names of the layers that optimisers may take for hidden ones (training/optimisers.py);
             none for all.
-        recent_memory: whether memory is the newest frames instead of some that are spread over the past.
         per_frame_moves: whether absolute commands are told as moves since the frame before, instead of since
             the chunk began.
     """
@@ -54,12 +56,11 @@ class Simulator(Repeated):
     feature_shape: tuple[int, ...]
     says_done: bool = False
     hidden: tuple[str, ...] = ()
-    recent_memory: bool = False
     per_frame_moves: bool = False
 
-    def __init__(self, spec: WorldSpec, memory_frames: int):
+    def __init__(self, spec: WorldSpec, memory_frames: int, newest_frames: int = 1):
         super().__init__()
-        self.spec, self.memory_frames = spec, memory_frames
+        self.spec, self.memory_frames, self.newest_frames = spec, memory_frames, newest_frames
 
     @property
     def device(self) -> torch.device:
@@ -160,10 +161,12 @@ class Simulator(Repeated):
         """
 
     def recall(self, state: TensorDict, future: TensorDict) -> TensorDict:
-        """Memory for the next chunk, [B, M, ...]: evenly spread over the past, with the first frame, or the
-        newest ones.
-        """
-        return memory.recall(state, self.memory_frames, self.recent_memory)
+        """Memory for the next chunk, [B, M, ...]."""
+        return memory.recall(state, self.memory_frames, self.newest_frames)
+
+    def clip_spec(self, chunks: int = 1, stride: int = 1, history: int = 0) -> ClipSpec:
+        """Training clips of so many chunks, in which it remembers what sessions do; see ClipSpec."""
+        return ClipSpec(self.memory_frames, self.spec.chunk, chunks, stride, history, self.newest_frames)
 
     def release(self, state: TensorDict, mask: Tensor) -> None:
         """The sessions of `mask` [B] end; what is held for them elsewhere can go. Here nothing is."""

@@ -12,7 +12,6 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
 from envs.precision import mixed_precision
 from envs.simulators import memory
@@ -73,8 +72,7 @@ def features_of_chunks(
         bf16: whether the simulator computes in bfloat16 where the device does.
         still: of a chunk that would change nothing, instead of the one that was recorded.
     """
-    memory_frames, chunk = simulator.memory_frames, simulator.spec.chunk
-    device, spec = simulator.device, ClipSpec(memory_frames, chunk, recent=simulator.recent_memory)
+    device, spec = simulator.device, simulator.clip_spec()
     simulator.eval()
     parts = []
     for some in torch.arange(len(episode)).split(_AT_ONCE):

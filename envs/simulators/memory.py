@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.specs import memory_indices, recent_indices
+from envs.specs import memory_indices
 
 # What a first frame or a chunk brings, by its name there, and the history's name for it.
 _FIRST = {"frames": "frames", "command": "commands", "state": "states", "pose_map": "pose_map", "c2w": "c2w"}
@@ -42,14 +42,11 @@ def new_sessions(
     return state
 
 
-def recall(state: TensorDict, count: int, newest: bool = False) -> TensorDict:
-    """`count` remembered frames and what belongs to them, [B, M, ...]: evenly spread, the first included, or
-    the newest ones.
-    """
+def recall(state: TensorDict, count: int, newest: int = 1) -> TensorDict:
+    """`count` remembered frames and what belongs to them, [B, M, ...]: see memory_indices."""
     history = state["history"]
     known = history.select(*(name for name in _MEMORY if name in history.keys()))
-    chosen = recent_indices if newest else memory_indices
-    return _pick(known, chosen(state["length"], count))
+    return _pick(known, memory_indices(state["length"], count, newest))
 
 
 def build_inputs(state: TensorDict, remembered: TensorDict, future: TensorDict) -> TensorDict:

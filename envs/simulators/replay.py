@@ -10,6 +10,7 @@ from torch import Tensor
 
 from envs.episodes.clips import ClipStore
 from envs.precision import mixed_precision
+from envs.simulators import memory
 from envs.simulators.base import Simulator
 from envs.simulators.features import pooled
 from envs.simulators.state_experts.base import StateDecoder
@@ -21,7 +22,7 @@ class Replay(NamedTuple):
     """Generated episodes beside the rows of the true ones.
 
     frames uint8 [N, T, V, 3, H, W] generated, rows int64 [N, T] of the true frames, valid bool [N, T], states
-    float32 [N, T, S] decoded, features float32 [N, C, D] of the generated chunks, pooled.
+    float32 [N, T, S] decoded or recorded, features float32 [N, C, D] of the generated chunks, pooled.
     """
 
     frames: Tensor
@@ -47,7 +48,8 @@ def replay(
 
     Args:
         alone: chunks after which it goes on from true frames again; None for never.
-        decoder: decodes the robot's states along the way; without one `states` repeats the first.
+        decoder: decodes the robot's states along the way, as in imagination; without one they are the
+            recorded ones, so that the simulator alone is to blame for what differs.
         stride: recorded frames from one generated frame to the next; T is then so many times smaller.
         draw: number of the sample; each draws noise of its own.
         most: chunks to generate at most; None for whole episodes.
@@ -77,7 +79,8 @@ def replay(
             with mixed_precision(device, bf16):
                 frames, features, state = simulator.step(state, shown.to(device))
             if decoder is None:
-                states = first["state"][:, None].expand(-1, chunk, -1)
+                states = store.arrays["states"][rows].to(device)
+                memory.write_states(state, states)
             else:
                 states = decoder.follow(state, chunk, features)
             shown = pooled(features)[:, None].cpu()

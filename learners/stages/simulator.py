@@ -13,7 +13,6 @@ from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
-from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
 from envs.episodes.episode import EpisodeError
 from envs.ranges import Count, Natural, Share
@@ -131,12 +130,11 @@ class ClipBatches:
         self, episodes: Tensor, count: int, chunks: int, first: int, generator: torch.Generator
     ) -> Iterator[TensorDict]:
         """`count` clips of some episodes, of one stride after the other, beginning with the `first`-th."""
-        memory, chunk = self.simulator.memory_frames, self.simulator.spec.chunk
         most = len(self.config.strides)
         for number, stride in enumerate(self.config.strides):
             share = len(range((number - first) % most, count, most))
-            spec = ClipSpec(memory, chunk, chunks, stride, recent=self.simulator.recent_memory)
             if share:
+                spec = self.simulator.clip_spec(chunks, stride)
                 yield self.store.sample(episodes, share, spec, generator)
 
 

@@ -11,7 +11,6 @@ from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
-from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
 from envs.precision import mixed_precision
 from envs.rng import step_generator
@@ -96,11 +95,7 @@ class _Features:
     ):
         self.decoder, self.simulator, self.store, self.episodes = decoder, simulator, store, episodes
         self.bf16 = bf16
-        self.spec = ClipSpec(
-            *(simulator.memory_frames, simulator.spec.chunk),
-            history=decoder.memory_frames,
-            recent=simulator.recent_memory,
-        )
+        self.spec = simulator.clip_spec(history=decoder.memory_frames)
 
     def of(self, clip: TensorDict, generator: torch.Generator) -> TensorDict:
         """shown [B, ...] (see StateDecoder.look), history and future of a clip [B] on the device."""

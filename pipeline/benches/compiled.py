@@ -12,7 +12,6 @@ from tensordict import TensorDict
 
 from actors.factory import build_simulator
 from actors.process import device_of, prepare_process
-from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
 from envs.precision import mixed_precision
 from envs.rng import constant_generator
@@ -60,8 +59,8 @@ def compiled(cfg: Mapping[str, Any]) -> dict[str, dict[str, float]]:
 
 def _clips(world: Simulator, store: ClipStore, count: int) -> TensorDict:
     """Clips [count] of one chunk, on the world's device."""
-    spec = ClipSpec(world.memory_frames, world.spec.chunk, recent=world.recent_memory)
-    return store.sample(torch.arange(len(store)), count, spec, constant_generator(0)).to(world.device)
+    every = torch.arange(len(store))
+    return store.sample(every, count, world.clip_spec(), constant_generator(0)).to(world.device)
 
 
 def _training(world: Simulator, clip: TensorDict) -> Callable[[], None]:

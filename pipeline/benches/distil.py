@@ -31,6 +31,7 @@ from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.loop import has_physics
 from pipeline.stages import collect, world
 from pipeline.stages.given import WORLD, Cfg, open_store
+from pipeline.stages.judging import stage as judging
 
 # Of 15 evaluations 4 are 3.75 times fewer: of these students 3 is the most that can be 4 times as fast.
 TEACHER, STUDENT = (15, 8, 4, 2, 1), (4, 3, 2, 1)
@@ -126,7 +127,7 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
     rows = {}
     judge_class: Any = target(cfg["judge"], "judge")
     golden = (
-        graph.add("text_world", world.text_world, {"data": data}, phase="first")
+        graph.add("text_world", judging.text_world, {"data": data}, phase="first")
         if "text_world" in cfg["judge"]
         else ""
     )
@@ -138,7 +139,7 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
         if f"judge-{name}" in own.nodes:
             return f"judge-{name}"
         roles = {"data": data, "simulator": simulator, "text_world": golden}
-        return own.add(f"judge-{name}", world.judge, roles, phase="first")
+        return own.add(f"judge-{name}", judging.judge, roles, phase="first")
 
     def measured(title: str, name: str, simulator: str, section: Mapping[str, Any], evaluations: int) -> None:
         own, roles = graph.under({**cfg, "simulator": section}), {"data": data, "simulator": simulator}

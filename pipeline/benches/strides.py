@@ -29,7 +29,8 @@ from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.loop import has_physics
 from pipeline.stages import collect, world
 from pipeline.stages.given import WORLD, Cfg, open_store
-from pipeline.stages.judge_cost import priced
+from pipeline.stages.judging import stage as judging
+from pipeline.stages.judging.cost import priced
 
 _EPISODES = 48  # held-out ones that are measured
 _HEADINGS = (
@@ -71,12 +72,12 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[int, st
     simulator = graph.add("simulator", world.simulator, roles, phase="first")
     numbers = sorted(cfg["simulator_fit"]["first"]["strides"])
     golden = (
-        graph.add("text_world", world.text_world, {"data": data}, phase="first")
+        graph.add("text_world", judging.text_world, {"data": data}, phase="first")
         if "text_world" in cfg["judge"]
         else ""
     )
     roles = {"data": data, "simulator": simulator, "text_world": golden}
-    judge = graph.add("judge", world.judge, roles, phase="first")
+    judge = graph.add("judge", judging.judge, roles, phase="first")
     roles, common = {"data": data, "simulator": simulator, "judge": judge}, common_stride(numbers)
     return graph, {n: graph.add(f"stride-{n}", measure, roles, stride=n, common=common) for n in numbers}
 

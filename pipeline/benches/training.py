@@ -17,7 +17,6 @@ from actors.factory import build_pool, build_simulator, build_state_decoder, ope
 from actors.process import prepare_process
 from actors.world_config import world_spec
 from envs.episodes import Episode, LeRobotWriter
-from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
 from envs.rng import step_generator
 from envs.simulators.base import Simulator
@@ -45,7 +44,7 @@ def _clips(lora: int = 0) -> SimulatorFitConfig:
 def clip_loss(simulator: Simulator, store: ClipStore, count: int = 16) -> float:
     """The simulator's loss on single chunks, on the same clips and noise at every call."""
     simulator.eval()
-    spec = ClipSpec(simulator.memory_frames, simulator.spec.chunk, recent=simulator.recent_memory)
+    spec = simulator.clip_spec()
     values = []
     for number in range(_BATCHES):
         generator = step_generator(0, number)

@@ -32,7 +32,7 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         (see the measure stage); tasks (the same rates by task, {} if there is one); scenes (the same rates of
         each task in each scene that occurs, [] if there is one); exploration (see the explore stage;
         None without it); rounds (gaps); episodes used and held out; seconds per stage; training (see
-        `_training`); what the judge has cost (stages/judge_cost.py), {} if it is free; alarms.
+        `_training`); what the judge has cost (stages/judging/cost.py), {} if it is free; alarms.
     """
     finished = manifests(inputs)
     imagined, measured = (result_of(inputs.folder(role)) for role in ("imagined", "measured"))

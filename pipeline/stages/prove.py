@@ -33,7 +33,7 @@ from pipeline.evaluation.media import REST, paired_frames
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import PHYSICS, WORLD, Cfg, load_world, open_store
-from pipeline.stages.judge_cost import priced
+from pipeline.stages.judging.cost import priced
 
 EPISODES = "episodes.json"  # of the stage measure
 _SIDE_BY_SIDE = 64  # imagined episodes
@@ -68,7 +68,9 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     held = store.split("held_out")
     held = held[torch.isin(held, store.select(["policy-*"]))]
     if len(held):
-        made = replay(world.base_env.simulator, store, held, bf16=cfg["simulator"]["bf16"])
+        simulator = world.base_env.simulator
+        decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
+        made = replay(simulator, store, held, decoder, bf16=cfg["simulator"]["bf16"])
         scores = judge_frames(judge, made.frames, store, held, made.features)
         write_film(folder / "media/held-out.mp4", paired_frames(store, held, made, 0), store.fps, rest=REST)
         result["replayed"] = judge_table(judge, scores, made.valid, store, held)

@@ -45,7 +45,7 @@ from pipeline.stages.given import (
     rl_options,
     successful_episodes,
 )
-from pipeline.stages.judge_cost import priced
+from pipeline.stages.judging.cost import priced
 from pipeline.stages.trials import true_success
 
 LEARNING = ("policy", "algorithm", "rl", "imitation", "microbatches")

@@ -34,7 +34,7 @@ from pipeline.evaluation.result import build_result
 from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.collect import run_recorded
 from pipeline.stages.given import EVERYTHING, WORLD, Cfg, open_store
-from pipeline.stages.judge_cost import priced
+from pipeline.stages.judging.cost import priced
 from pipeline.stages.prove import EPISODES
 
 WORST = "worst"  # the label of episodes chosen for their disagreement

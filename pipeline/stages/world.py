@@ -6,46 +6,31 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
-from actors.factory import build_judge, build_simulator, build_state_decoder, build_text_world
+from actors.factory import build_simulator, build_state_decoder
 from actors.process import prepare_process
-from actors.weights import load
 from envs.episodes.clips import ClipStore
-from envs.judges.base import Judge
-from envs.rng import order_generator
-from envs.simulators.base import Simulator
-from envs.simulators.features import features_of_episodes
 from envs.targets import ConfigError, options
 from learners.stages.distill.stage import train_student
 from learners.stages.film import Film
-from learners.stages.generated import generated_frames, recorded_features
-from learners.stages.judge import calibrate, judge_recordings, train_judge
 from learners.stages.simulator import ClipBatches, SimulatorFitConfig, train_simulator
 from learners.stages.state import train_state
-from learners.stages.text_world import calibrate_ending, train_text_world
 from learners.stages.tokenizer import train_tokenizer
 from learners.training.parallel import leads
 from pipeline.acting import acting
-from pipeline.evaluation.judging import episode_success, labelled
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import (
-    ROBOT,
     SIMULATOR,
-    WORLD,
     Cfg,
     fit_options,
-    imagined_chunks,
     learning_episodes,
     learns,
     newest_episodes,
     open_store,
 )
-from pipeline.stages.judge_cost import priced
 from pipeline.stages.pace import in_time
 
 
@@ -179,122 +164,3 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     stats = train_state(decoder, model, store, episodes, fit, folder, **how) if learns(decoder) else {}
     save_weights(decoder, folder)
     return {**stats, "steps": fit.steps}
-
-
-@stage(reads=(*ROBOT, "threads", "judge.text_world", "text_world_fit", "microbatches"), place=Place.LEARNERS)
-def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """The text world of a judge that asks for one, with its tokenizer, going on from the role `warm` if there
-    is one; the threshold that ends its trajectories on recorded video that neither it nor judges learn from.
-
-    Settings: phase, first or refresh.
-    """
-    phase, section = inputs.settings["phase"], cfg["text_world_fit"]
-    store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"], cfg["threads"])
-    model = build_text_world(cfg, inputs.weights("warm"))
-    fit = fit_options(cfg, section[phase], f"text_world_fit.{phase}")
-    tokenizer = fit_options(cfg, section["tokenizer"], "text_world_fit.tokenizer")
-    stats = train_text_world(
-        *(model, store, store.split("train"), section["stride"], fit, folder),
-        tokenizer=tokenizer if phase == "first" else None,
-    )
-    calibrated = calibrate_ending(model, store, store.split("calibration"), section["stride"])
-    save_weights(model, folder)
-    return {**stats, "ending_threshold": float(model.threshold), "ending_calibrated": calibrated}
-
-
-@stage(reads=(*WORLD, "judge_fit.{phase}", "rl.starts", "rl.horizon", "microbatches"), place=Place.LEARNERS)
-@priced
-def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """The judge on recorded and on generated frames; its threshold on recorded video that no judge learns
-    from. A judge without weights is only calibrated. One with a text world takes over what the role
-    `text_world` has learned, and leaves it as it is.
-
-    Settings: phase, first or refresh.
-    """
-    phase = inputs.settings["phase"]
-    section = cfg["judge_fit"][phase]
-    store = open_store(cfg, inputs)
-    prepare_process(cfg["seed"], cfg["threads"])
-    model, world = build_judge(cfg, inputs.weights("warm")), build_simulator(cfg, inputs.weights("simulator"))
-    if golden := inputs.weights("text_world"):
-        load(model.text_world, golden).requires_grad_(False)
-    model.attach(world)
-    stats: dict[str, Any] = {}
-    bf16 = cfg["simulator"]["bf16"]
-    if learns(model):
-        train = labelled(store, store.split("train"))
-        if not len(train):
-            raise ConfigError(
-                f"judge={cfg['judge']['_target_']} learns from success, which no training episode of the data"
-                " says; record next.success, or choose a judge that needs none (judge=...)"
-            )
-        shuffled = torch.randperm(len(train), generator=order_generator(cfg["seed"]))
-        pick = train[shuffled[: section["imagined"]]]
-        generated = _as_imagined(cfg, world, store, pick)
-        recorded = recorded_features(world, store, train, bf16) if model.reads_features else None
-        fit = fit_options(cfg, section["fit"], f"judge_fit.{phase}.fit")
-        stats = dict(train_judge(model, store, train, fit, folder, generated, recorded))
-        stats["generated_frames"] = len(generated)
-    _calibrate(cfg, model, store, world, bf16)
-    save_weights(model, folder)
-    return {**stats, "threshold": float(model.threshold), **model.facts(), **_doubts(cfg, model, store)}
-
-
-def _doubts(cfg: Cfg, model: Judge, store: ClipStore) -> dict[str, str]:
-    """{"alarm"}: the judge is blind to the words, and there are several; or most goals that it imagined for
-    calibration never end, whatever stands in for them. {} otherwise.
-    """
-    facts, said = model.facts(), set(store.instructions)
-    goals, unfinished = facts.get("goals", 0), facts.get("goals_unfinished", 0)
-    doubts = []
-    if not model.reads_instruction and len(said) > 1:
-        doubts.append(
-            f"{type(model).__name__} reads no instruction, and recordings hold {len(said)} different ones: it"
-            " cannot tell what was asked for; where words decide, choose judge=learned"
-        )
-    if 2 * unfinished > goals:
-        doubts.append(f"{unfinished} of {goals} imagined goals never end; {type(model).remedy(cfg['judge'])}")
-    return {"alarm": "; ".join(doubts)} if doubts else {}
-
-
-def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor) -> TensorDict:
-    """Generated frames of episodes: of half of them as RL will see them, if it begins inside recorded ones
-    and does not go far; of the others whole episodes, by which the world is measured.
-    """
-    rl, bf16 = cfg["rl"], cfg["simulator"]["bf16"]
-    if rl["starts"] == "first" or rl["horizon"] is None:
-        return generated_frames(world, store, episodes, bf16)
-    near = generated_frames(world, store, episodes[::2], bf16, imagined_chunks(cfg))
-    return torch.cat([near, generated_frames(world, store, episodes[1::2], bf16)])
-
-
-def _calibrate(cfg: Cfg, model: Judge, store: ClipStore, world: Simulator, bf16: bool) -> None:
-    """Set the judge's threshold on the calibration split, where its scores tell success; a judge that says
-    (judge.votes.calibrate=false) that its answers need none is not asked.
-
-    Raises:
-        ConfigError: if it gives no judgement on any episode there.
-    """
-    if not model.calibrates:
-        return
-    unseen = labelled(store, store.split("calibration"))
-    if not len(unseen):
-        return
-    features = features_of_episodes(world, store, unseen, bf16) if model.reads_features else None
-    score = judge_recordings(model, store, unseen, features)
-    succeeded = episode_success(store, unseen)
-    blank = int((~torch.isfinite(score).all(1)).sum())
-    if blank:
-        why = (
-            f"judge={cfg['judge']['_target_']} gives no judgement on {blank} of {len(unseen)} recorded"
-            f" calibration episodes; {type(model).remedy(cfg['judge'])}"
-        )
-        if blank == len(unseen):  # nor would it on generated ones, which RL would drop one after the other
-            raise ConfigError(why)
-        tqdm.write(why)
-    if not calibrate(model, score, succeeded):
-        tqdm.write(
-            f"judge: {int(succeeded.sum())} of {len(succeeded)} calibration episodes succeeded, and its"
-            f" scores do not tell which; threshold left at {float(model.threshold):.3f}"
-        )

@@ -13,7 +13,7 @@ from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
 from envs.initial_states import DecisionPoints, InitialStates, decision_points, shared_out
 from envs.simulators import memory
-from envs.specs import CHUNK, IMAGE, STATE, ActionMode, Rewards
+from envs.specs import CHUNK, IMAGE, STATE, ActionMode, Rewards, memory_indices
 from envs.transforms import world_transforms
 from envs.world import WorldEnv
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES
@@ -70,16 +70,16 @@ def test_extra_starts_get_about_their_share(inside: int, extra: int) -> None:
         assert sum(number >= inside for number in pool) / len(pool) == pytest.approx(share, abs=0.12)
 
 
-@pytest.mark.parametrize("newest", [False, True], ids=["spread", "newest"])
+@pytest.mark.parametrize("newest", [1, 2, 3])
 @ROBOTS
-def test_sessions_remember_what_clips_show(tiny_store: Stores, robot: Embodiment, newest: bool) -> None:
+def test_sessions_remember_what_clips_show(tiny_store: Stores, robot: Embodiment, newest: int) -> None:
     store = tiny_store(robot)
     starts = DecisionPoints(store, torch.arange(len(store)))
     which = torch.tensor([0, len(starts) - 1, len(starts) // 2])
     past, length = starts.past(which)
     state = memory.new_sessions(past, length, which, starts.longest)
     remembered = memory.recall(state, 3, newest)
-    spec = ClipSpec(3, store.spec.chunk, recent=newest)
+    spec = ClipSpec(3, store.spec.chunk, newest=newest)
     clip = store.clips(starts.episode[which], starts.frame[which], spec)
     for name in remembered.keys():
         assert torch.equal(remembered[name], clip["memory", name][:, 0]), name
@@ -120,3 +120,10 @@ def test_first_frames_are_moments_without_a_past(store: ClipStore) -> None:
     past, length = starts.past(torch.tensor([2, 0]))
     assert length.tolist() == [1, 1] and past.shape == (2, 1) and starts.longest == 1
     assert torch.equal(past["frames"][:, 0], store.frames(store.start[[2, 0]]))
+
+
+def test_some_of_memory_is_the_newest_and_the_rest_is_spread_over_the_past() -> None:
+    lengths = torch.tensor([1, 2, 10])
+    assert memory_indices(lengths, 4).tolist() == [[0] * 4, [0, 0, 1, 1], [0, 3, 6, 9]]
+    assert memory_indices(lengths, 3, 2).tolist() == [[0] * 3, [0, 0, 1], [0, 8, 9]]
+    assert memory_indices(lengths, 4, 2).tolist() == [[0] * 4, [0, 0, 0, 1], [0, 4, 8, 9]]

@@ -58,7 +58,6 @@ class ForcingSimulator(Blockwise):
         ConfigError: naming an option that is unknown, missing or out of range.
     """
 
-    recent_memory = True
     per_frame_moves = True
     hidden = ("attn", "ff")
 
@@ -84,7 +83,7 @@ class ForcingSimulator(Blockwise):
                 f"simulator.horizon={horizon} must be at most task.chunk={spec.chunk}: a block is generated"
                 " under its actions, and a chunk has no more of them; lower it, or raise task.chunk"
             )
-        super().__init__(spec, window - spec.chunk)
+        super().__init__(spec, window - spec.chunk, window - spec.chunk)
         trunk = options(Trunk, net, "simulator.net")
         if any(side % (STRIDE * trunk.patch) for side in spec.size):
             raise ValueError(
@@ -110,7 +109,7 @@ class ForcingSimulator(Blockwise):
 
     def recall(self, state: TensorDict, future: TensorDict) -> TensorDict:
         """See Simulator.recall; the newest `context` frames."""
-        return memory.recall(state, self.context, newest=True)
+        return memory.recall(state, self.context, self.context)
 
     # -- generating
     def repeated(self) -> Iterator[tuple[nn.Module, bool]]:

@@ -64,7 +64,6 @@ class TokensSimulator(Simulator):
     """
 
     hidden = ("blocks",)
-    recent_memory = True
     per_frame_moves = True
     says_done = True
 
@@ -83,7 +82,7 @@ class TokensSimulator(Simulator):
                 f"{_KEY}.window={window} must be more than task.chunk={spec.chunk}: a chunk's frames and at"
                 " least one before them"
             )
-        super().__init__(spec, window - spec.chunk)
+        super().__init__(spec, window - spec.chunk, window - spec.chunk)
         self.video = TokenVideo(spec, window, codec, net, conditioning, decoding, training, _KEY)
         width, stride = self.video.trunk.width, self.codec.stride
         self.action_vector = ActionVector(spec.embodiment)

@@ -39,13 +39,13 @@ class UNetSimulator(Simulator):
 
     Args:
         spec: what it shows; sizes must be multiples of 8 * fold.
-        memory_frames: sparse memory frames, the first and the last among them.
+        memory_frames: memory frames, M.
+        newest_frames: of them, those that are the newest (see Simulator); two or more tell speeds.
         fold: pixels of the main view, each way, that lie in one place of the finest level, 2 or 4. Four cost
             little more than two of a picture half as large, and see twice as finely.
         width: channels of the finest level, a multiple of 8; twice as many of the middle one, at half its
             resolution, and again of the deep one, at a quarter.
-        fine_blocks, mid_blocks: residual blocks on the way down, and on the way up, of these levels.
-        deep_blocks: residual blocks of the deep one.
+        blocks: residual blocks of these levels, of the first two on the way down, and on the way up.
         motion: extra loss weight of pixels that change, or look unusual for their place.
         side_weight: loss weight of every view but the main one.
     """
@@ -58,15 +58,19 @@ class UNetSimulator(Simulator):
         self,
         spec: WorldSpec,
         memory_frames: Count,
+        newest_frames: Count,
         fold: Count,
         width: Count,
-        fine_blocks: Natural,
-        mid_blocks: Natural,
-        deep_blocks: Natural,
+        blocks: tuple[Natural, Natural, Natural],
         motion: NonNegative,
         side_weight: NonNegative,
     ):
-        super().__init__(spec, memory_frames)
+        super().__init__(spec, memory_frames, newest_frames)
+        if newest_frames > memory_frames:
+            raise ValueError(
+                f"simulator.newest_frames={newest_frames} is more than"
+                f" simulator.memory_frames={memory_frames}"
+            )
         if fold not in (2, 4):
             raise ValueError(f"simulator.fold={fold} must be 2 or 4")
         if any(side % (8 * fold) for side in spec.size):
@@ -93,11 +97,11 @@ class UNetSimulator(Simulator):
         self.down = nn.ModuleList((nn.Conv2d(width, half, 2, stride=2), nn.Conv2d(half, wide, 2, stride=2)))
         self.up = nn.ModuleList((nn.Conv2d(half, width * 4, 1), nn.Conv2d(wide, half * 4, 1)))
         self.fuse = nn.ModuleList((nn.Conv2d(2 * width, width, 1), nn.Conv2d(2 * half, half, 1)))
-        self.fine_in = nn.ModuleList(FilmBlock(width, _COND) for _ in range(fine_blocks))
-        self.mid_in = nn.ModuleList(FilmBlock(half, _COND) for _ in range(mid_blocks))
-        self.deep = nn.ModuleList(FilmBlock(wide, _COND) for _ in range(deep_blocks))
-        self.mid_out = nn.ModuleList(FilmBlock(half, _COND) for _ in range(mid_blocks))
-        self.fine_out = nn.ModuleList(FilmBlock(width, _COND) for _ in range(fine_blocks))
+        self.fine_in = nn.ModuleList(FilmBlock(width, _COND) for _ in range(blocks[0]))
+        self.mid_in = nn.ModuleList(FilmBlock(half, _COND) for _ in range(blocks[1]))
+        self.deep = nn.ModuleList(FilmBlock(wide, _COND) for _ in range(blocks[2]))
+        self.mid_out = nn.ModuleList(FilmBlock(half, _COND) for _ in range(blocks[1]))
+        self.fine_out = nn.ModuleList(FilmBlock(width, _COND) for _ in range(blocks[0]))
         self.maps = memory_frames + 1 + DRAWN  # logits of the sources, and drawn colour
         self.heads = nn.ModuleList(
             output_head(width if s == 1 else wide, spec.chunk, self.maps, memory_frames, edge)

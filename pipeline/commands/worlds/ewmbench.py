@@ -33,7 +33,7 @@ from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.grippers.ruler import GripperRuler, gripper_ruler, known_ends, looked_through
 from pipeline.evaluation.judging import cost_text
 from pipeline.graph.code_version import code_of
-from pipeline.stages.judge_cost import COST, Spending
+from pipeline.stages.judging.cost import COST, Spending
 
 _MODULE = "pipeline.evaluation.ewmbench.samples"
 _SHORTEST = 4  # frames of an episode: the first is given, and accelerations need three

@@ -27,7 +27,7 @@ from pipeline.graph.kept import Kept
 from pipeline.loop import has_physics
 from pipeline.stages import imitation, rl
 from pipeline.stages.given import mode_of
-from pipeline.stages.judge_cost import COST, Spending
+from pipeline.stages.judging.cost import COST, Spending
 
 _ACTING = (imitation.imitation, imitation.clone, rl.rl)  # stages that leave a policy
 _MODULE = "pipeline.evaluation.value.trials"

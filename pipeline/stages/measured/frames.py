@@ -13,7 +13,7 @@ from pipeline.evaluation.measurement import evenly
 from pipeline.evaluation.rewards.shown import shown_table
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import ROBOT, Cfg, open_store
-from pipeline.stages.judge_cost import priced
+from pipeline.stages.judging.cost import priced
 
 
 @stage(reads=(*ROBOT, "threads", "judge"), place=Place.EVALUATOR)

@@ -18,7 +18,7 @@ from pipeline.evaluation.value.estimate import Comparison, starts_of
 from pipeline.graph.kept import Kept, Tensors
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import PHYSICS, WORLD, Cfg, datasets, mode_of, open_store
-from pipeline.stages.judge_cost import priced
+from pipeline.stages.judging.cost import priced
 
 TRUE = "true.pt"  # outcomes by task and candidate
 CELLS = "cells.json"

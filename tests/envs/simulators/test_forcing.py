@@ -14,7 +14,7 @@ from torch import Tensor
 from envs.simulators.forcing.engine import ForcingSimulator
 from envs.simulators.forcing.prediction import Clean, Prediction, V
 from envs.simulators.forcing.schedule import DDIM, Sigmoid, unit_parts
-from envs.specs import recent_indices
+from envs.specs import memory_indices
 from envs.targets import ConfigError
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
 from tests.envs.simulators.clips import clip, first_of, future_of
@@ -154,7 +154,7 @@ def test_frames_are_those_of_the_same_seed_commands_and_steps() -> None:
 
 
 def test_before_there_are_enough_frames_the_first_repeats() -> None:
-    assert recent_indices(torch.tensor([1, 3, 9]), 4).tolist() == [[0] * 4, [0, 0, 1, 2], [5, 6, 7, 8]]
+    assert memory_indices(torch.tensor([1, 3, 9]), 4, 4).tolist() == [[0] * 4, [0, 0, 1, 2], [5, 6, 7, 8]]
     world = make()
     clips = clip(world.spec, 2, 4)
     state = world.reset(first_of(world.spec, clips), torch.tensor([1, 2]))

@@ -8,9 +8,10 @@ import torch
 
 from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
+from envs.simulators import memory
 from envs.simulators.replay import future_of, replay
 from learners.stages.generated import generated_frames
-from tests.embodiments import ARM_JOINTS, BIMANUAL_POSES
+from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_POSES
 from tests.learners.models import simulator_of
 
 Stores = Callable[[Embodiment], ClipStore]
@@ -59,3 +60,23 @@ def test_frames_may_go_on_from_true_ones_again(tiny_store: Stores) -> None:
     state = simulator.resume(past, torch.full_like(some, 1 + chunk), some)
     frames = simulator.step(state, future_of(simulator, store, short.rows[:, chunk : 2 * chunk]))[0]
     assert torch.equal(frames, short.frames[:, chunk : 2 * chunk])
+
+
+def test_the_robot_is_where_it_was_recorded_unless_its_states_are_decoded(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)  # of changes nothing but the state says where the robot is
+    simulator, some, chunk = simulator_of("unet_small", store.spec), torch.tensor([3, 1]), store.spec.chunk
+    for parameter in simulator.parameters():
+        torch.nn.init.normal_(parameter, std=0.05, generator=torch.Generator().manual_seed(0))
+    made = replay(simulator, store, some, bf16=False)
+    assert torch.equal(made.states, store.arrays["states"][made.rows])
+    chunks = [slice(n * chunk, (n + 1) * chunk) for n in range(2)]
+
+    def second(states: torch.Tensor) -> torch.Tensor:
+        """The second chunk of a session that was told these states in the first."""
+        state = simulator.reset(store.first(some), some)
+        _, _, state = simulator.step(state, future_of(simulator, store, made.rows[:, chunks[0]]))
+        memory.write_states(state, states)
+        return simulator.step(state, future_of(simulator, store, made.rows[:, chunks[1]]))[0]
+
+    assert torch.equal(made.frames[:, chunks[1]], second(made.states[:, chunks[0]]))
+    assert not torch.equal(made.frames[:, chunks[1]], second(made.states[:, chunks[0]] + 1))

@@ -22,8 +22,8 @@ from pipeline.commands.worlds.judge import Selection, judge_study
 from pipeline.config import load_config
 from pipeline.graph.stage import Inputs
 from pipeline.loop import build_loop
-from pipeline.stages import world
 from pipeline.stages.given import DATASETS
+from pipeline.stages.judging import stage as judging
 from tests.embodiments import ARM_DELTAS
 from tests.envs.judges.chat_server import MODEL, ChatServer, seeing, serving
 
@@ -52,8 +52,8 @@ def run_stage(cfg: dict[str, Any], folder: Path) -> dict[str, Any]:
     folder.mkdir(exist_ok=True)
     (folder / DATASETS).write_text(json.dumps(list(cfg["task"]["data"])))
     settings = {"phase": "first"}
-    view = world.judge.view("judge-1", cfg, settings)
-    return dict(world.judge.run(view, folder, Inputs({"data": folder}, settings)))
+    view = judging.judge.view("judge-1", cfg, settings)
+    return dict(judging.judge.run(view, folder, Inputs({"data": folder}, settings)))
 
 
 def test_its_stage_asks_nobody_unless_the_threshold_is_to_be_set(

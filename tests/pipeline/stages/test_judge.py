@@ -1,4 +1,4 @@
-"""What the judge's stage tells of a judge that cannot know what it is asked."""
+"""What the judge's stage tells of a judge that cannot know what it is asked, or has not learned it."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from envs.episodes.formats.lerobot_writer import LeRobotWriter
+from envs.episodes.splits import write_splits
 from pipeline.config import load_config
 from pipeline.graph.stage import Inputs
-from pipeline.stages import world
 from pipeline.stages.given import DATASETS
+from pipeline.stages.judging import stage as judging
 from tests.embodiments import ARM_DELTAS
-from tests.moving_square import SIZE, episodes_of
+from tests.moving_square import SIZE, episodes_of, moving_square
 
 
 @pytest.mark.parametrize(("judge", "blind"), [("proxy", True), ("learned", False)])
@@ -28,7 +30,30 @@ def test_a_judge_that_is_blind_to_several_instructions_is_an_alarm(
     words = (f"judge={judge}", "task=lerobot", f"task.data=[{data}]", "task.size=[32,32]")
     cfg = load_config(["experiment=smoke", *words, "task.chunk=4", "task.horizon=8", "launch.device=cpu"])
     (tmp_path / DATASETS).write_text(json.dumps([str(data)]))
-    view = world.judge.view("judge-1", cfg, settings)
-    made = world.judge.run(view, tmp_path, Inputs({"data": tmp_path}, settings))
+    view = judging.judge.view("judge-1", cfg, settings)
+    made = judging.judge.run(view, tmp_path, Inputs({"data": tmp_path}, settings))
     said = "ProxyJudge reads no instruction, and recordings hold 2 different ones"
     assert (said in made.get("alarm", "")) == blind
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_judge_that_cannot_tell_success_on_recorded_video_is_an_alarm(told: bool, tmp_path: Path) -> None:
+    """Once success is what its pictures show, and once it is what a coin says."""
+    data, settings = tmp_path / "data", {"phase": "first"}
+    some = [
+        moving_square(ARM_DELTAS, seed, "expert" if told and seed % 4 < 2 else "random") for seed in range(24)
+    ]
+    coin = [np.full(len(episode), seed % 4 < 2) for seed, episode in enumerate(some)]
+    if not told:
+        some = [replace(episode, success=said) for episode, said in zip(some, coin, strict=True)]
+    LeRobotWriter(data, ARM_DELTAS.at(SIZE)).write(some)
+    write_splits(data, {"train": 8, "calibration": 16})
+    words = ("judge=learned", "task=lerobot", f"task.data=[{data}]", "task.size=[32,32]", "launch.device=cpu")
+    fit = ("judge_fit.first.imagined=0", "judge_fit.first.fit.steps=120")
+    cfg = load_config(["experiment=smoke", *words, *fit, "task.chunk=4", "task.horizon=8"])
+    (tmp_path / DATASETS).write_text(json.dumps([str(data)]))
+    view = judging.judge.view("judge-1", cfg, settings)
+    made = judging.judge.run(view, tmp_path, Inputs({"data": tmp_path}, settings))
+    assert made["calibration_successes"] == made["calibration_failures"] == 8
+    assert (made["auc"] >= 0.8) == told, made["auc"]
+    assert ("hardly tells success from failure" in made.get("alarm", "")) == (not told)

@@ -18,8 +18,8 @@ from envs.targets import ConfigError
 from pipeline.config import load_config
 from pipeline.graph.stage import Inputs
 from pipeline.loop import build_loop
-from pipeline.stages import world
 from pipeline.stages.given import DATASETS
+from pipeline.stages.judging import stage as judging
 from pipeline.stages.rl import what_the_judge_needs
 from tests.embodiments import ARM_DELTAS
 from tests.envs.simulators.test_text_world import section
@@ -51,13 +51,13 @@ def test_a_text_world_that_never_says_done_is_told_with_what_to_change(
     cfg["judge"]["text_world"] = section(ending={"threshold": 1.0})  # nothing is more certain than that
     (tmp_path / DATASETS).write_text(json.dumps([str(tiny_data(ARM_DELTAS))]))
     settings = {"phase": "first"}
-    view = world.judge.view("judge-1", cfg, settings)
+    view = judging.judge.view("judge-1", cfg, settings)
     said = r"no judgement on (\d+) of \1 .*ending\.threshold=1\.0, .*fallback=drop: .*=last_frame or progress"
     with pytest.raises(ConfigError, match=said):
-        world.judge.run(view, tmp_path, Inputs({"data": tmp_path}, settings))
+        judging.judge.run(view, tmp_path, Inputs({"data": tmp_path}, settings))
     cfg["judge"]["fallback"] = "last_frame"  # with which no judgement is missing
-    made = world.judge.run(
-        world.judge.view("judge-1", cfg, settings), tmp_path, Inputs({"data": tmp_path}, settings)
+    made = judging.judge.run(
+        judging.judge.view("judge-1", cfg, settings), tmp_path, Inputs({"data": tmp_path}, settings)
     )
     assert made["goals"] == made["goals_unfinished"] and "imagined goals never end" in made["alarm"]
     assert "train it longer (text_world_fit)" in made["alarm"]
@@ -83,8 +83,8 @@ def test_it_trains_and_goes_on_from_what_it_left(
     for phase in ("first", "refresh"):
         folder = tmp_path / phase
         folder.mkdir()
-        view = world.text_world.view(phase, cfg, {"phase": phase})
-        stats[phase] = world.text_world.run(view, folder, Inputs(found, {"phase": phase}))
+        view = judging.text_world.view(phase, cfg, {"phase": phase})
+        stats[phase] = judging.text_world.run(view, folder, Inputs(found, {"phase": phase}))
         learned[phase] = build_text_world(cfg, folder / "weights.safetensors").state_dict()
         found["warm"] = folder
     assert stats["first"]["successes"] == stats["refresh"]["successes"] > 0

@@ -54,6 +54,7 @@ def test_a_picture_twice_as_large_folded_twice_as_far_meets_the_same_blocks() ->
     ("options", "size", "said"),
     [
         ({"fold": 3}, (48, 48), r"simulator\.fold=3 must be 2 or 4"),
+        ({"newest_frames": 4}, (32, 32), r"newest_frames=4 is more than simulator\.memory_frames=3"),
         ({"fold": 4}, (48, 64), r"task\.size=\[48, 64\] must be multiples of 32"),
         ({"fold": 2}, (40, 32), r"task\.size=\[40, 32\] must be multiples of 16"),
     ],

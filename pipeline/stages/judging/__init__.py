@@ -1,0 +1,1 @@
+"""The stages that make a judge, and what judges cost the stages that ask them."""
