@@ -78,18 +78,18 @@ class WorldEnv(ChunkedEnv):
         self.simulator, self.starts, self.shared_noise, self.bf16 = simulator, starts, shared_noise, bf16
         self.session: TensorDict | None = None
         pictures = (batch, spec.chunk, spec.views, 3, *spec.size)
-        features = Unbounded((batch, *simulator.feature_shape))
+        features = Unbounded((batch, *simulator.feature_shape), device=device)
         self.observation_spec["world"] = Composite(
-            frames=Bounded(0, 255, pictures, dtype=torch.uint8),
+            frames=Bounded(0, 255, pictures, dtype=torch.uint8, device=device),
             features=features,
             shape=(batch,),
             device=device,
         )
-        action: dict[str, Any] = {COMMANDS: Unbounded((batch, spec.chunk, spec.action_dim))}
+        action: dict[str, Any] = {COMMANDS: Unbounded((batch, spec.chunk, spec.action_dim), device=device)}
         if spec.pose_map:
-            action[POSE_MAP] = Bounded(0, 255, pictures, dtype=torch.uint8)
+            action[POSE_MAP] = Bounded(0, 255, pictures, dtype=torch.uint8, device=device)
         if spec.embodiment.calibrated:
-            action[CHUNK_C2W] = Unbounded((batch, spec.chunk, spec.views, 4, 4))
+            action[CHUNK_C2W] = Unbounded((batch, spec.chunk, spec.views, 4, 4), device=device)
         self.action_spec = Composite(action, shape=(batch,), device=device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:

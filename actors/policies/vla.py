@@ -259,8 +259,11 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         """Take units from demonstrations; numbers that hardly vary become constants (heads.varying).
 
         Args:
-            chunks: [N, K, A] as the policy will emit them; states: [N, S]; commands: [N, A] in force.
+            chunks: [N, K, A] as the policy will emit them; states: [N, S]; commands: [N, A] in force; on any
+                device.
         """
+        device = next(self.head.parameters()).device
+        chunks, states, commands = (values.to(device) for values in (chunks, states, commands))
         self.head.normalise(chunks, varying(chunks, self.spec.embodiment))
         parts, query = [self.fusion.proprioception], self.perception.query
         for part in parts if query is None else [*parts, query.proprioception]:

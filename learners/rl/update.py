@@ -95,7 +95,7 @@ def _loss(
         row["recorded_clip_fraction"] = recorded_figures.get("clip_fraction", 0.0)
     if true is not None and true.anchor is not None and config.anchor:
         drawn = true.anchor.sample(config.anchor_batch // config.microbatches, generator)
-        pull = true.anchor.loss(drawn, generator)
+        pull = true.anchor.loss(drawn.to(device_of(algorithm.modules())), generator)
         loss = loss + config.anchor * pull
         row["anchor"] = float(pull.detach())
     return loss, {**row, "loss": float(loss.detach())}
