@@ -21,7 +21,7 @@ from envs.episodes.key_frames import key_points
 from envs.initial_states import decision_points, shared_out
 from envs.rng import Purpose, episode_seeds
 from envs.specs import CHUNK
-from envs.targets import ConfigError, target
+from envs.targets import target
 from learners.rl.algorithm import Algorithm
 from learners.rl.dataset_rollout import dataset_rollout
 from learners.rl.loop import train_rl
@@ -90,7 +90,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         data=tuple(str(path) for path in (*data, *more)),
         inside=() if inside is None else tuple(inside.tolist()),
         first=() if inside is None else tuple(extra),
-        horizon=_horizon(cfg, algorithm),
+        horizon=imagined_chunks(cfg) * int(cfg["task"]["chunk"]),
         freeze_perception=settings.freeze_perception,
         bootstrap=algorithm.bootstraps,
         later=settings.rewards_later,
@@ -135,21 +135,6 @@ def what_the_judge_needs(cfg: Cfg, fleet: Fleet | None) -> str:
         return ""
     kind: Any = target(cfg["judge"], "judge")
     return f". {kind.__name__}: {kind.remedy(cfg['judge'])}"
-
-
-def _horizon(cfg: Cfg, algorithm: Algorithm) -> int:
-    """Actions of an imagined episode.
-
-    Raises:
-        ConfigError: if rl.horizon cuts off what nothing else values.
-    """
-    short, asked = imagined_chunks(cfg) * int(cfg["task"]["chunk"]), cfg["rl"]["horizon"]
-    if short < int(cfg["task"]["horizon"]) and not algorithm.bootstraps and not rewards_of(cfg).progress:
-        raise ConfigError(
-            f"rl.horizon={asked} cuts episodes short, and neither a critic (algorithm={algorithm.name}) nor"
-            " judge.rewards.progress=0 says what the rest is worth; set rl.horizon=null"
-        )
-    return short
 
 
 def _warm_up(
