@@ -121,10 +121,16 @@ def _why(result: Mapping[str, Any], points: float, imagined: float) -> str:
             " chance; give RL more iterations (rounds.iterations) or evaluate on more episodes"
         )
     if imagined > 5:
+        now, true = (100 * rate(result[key]) for key in ("imagined_after", "physics_after"))
+        rose = (
+            f"imagined success rose by {imagined:.0f} points to {now:.0f}%, and true success did not follow"
+        )
+        if now > true:
+            return f"{rose}: the policy exploits the simulator; deploy more episodes per round"
         return (
-            f"imagined success rose by {imagined:.0f} points and true success did not follow: the policy"
-            f" exploits the simulator (gap in the last round {100 * gap:+.0f} points); deploy more episodes"
-            " per round"
+            f"{rose}, which is higher: the imagined world is too bleak, and RL may have learned what it alone"
+            " asks for; see by the judge's table whether simulator or judge misses successes, and train it"
+            " longer"
         )
     if gap > _BLIND:
         true, predicted = (100 * rate(result["rounds"][-1][key]) for key in ("true", "imagined"))

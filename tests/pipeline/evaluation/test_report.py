@@ -96,6 +96,9 @@ def test_the_verdict_can_say_no_and_why() -> None:
     small = {"paired": {"gained": 1, "lost": 1, "p": 0.9}}
     fooled = verdict(result(physics_after=entry(41), imagined_after=entry(90), **small))
     assert fooled.startswith("no gain") and "exploits" in fooled
+    low = {"imagined_before": entry(2), "imagined_after": entry(20)}
+    bleak = verdict(result(physics_after=entry(41), **low, **small))
+    assert "too bleak" in bleak and "exploits" not in bleak
     near = verdict(result(physics_after=entry(45), imagined_after=entry(47), **small))
     assert "chance" in near and "exploits" not in near
     flat = verdict(result(physics_after=entry(39), imagined_after=entry(40), **small))
