@@ -1,14 +1,17 @@
-"""The loop where networks and imagined worlds lie on another device than physics and recordings do."""
+"""The loop, and serving, where networks lie on another device than physics and recordings do."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from actors.serving.sessions import SessionHost
 from pipeline.config import load_config
 from pipeline.loop import build_loop
+from tests.actors.serving import Running, Stranger, serve_config, tiny_expert, tiny_world
 from tests.second_device import DEVICE, second_device
 
 
@@ -23,6 +26,20 @@ def test_what_a_gpu_would_refuse_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
         layer(there * 2).sum().backward()
         assert layer.weight.grad is not None and layer.weight.grad.tolist() == [[2.0, 2.0]]
         assert there[torch.tensor([1])].cpu().tolist() == [1.0]
+
+
+def test_serving(monkeypatch: pytest.MonkeyPatch) -> None:
+    with second_device(monkeypatch):
+        world = tiny_world()
+        expert = tiny_expert(world).to(DEVICE)
+        server = Running(SessionHost(world.to(DEVICE), expert, serve_config()))
+        try:
+            client = Stranger(server.url)
+            client.prepare(frames=12)
+            frames, state = client.step(np.full((4, 14), 0.2, np.float32))
+            assert frames.shape == (4, 3, 3, 32, 32) and state is not None and np.isfinite(state).all()
+        finally:
+            server.stop()
 
 
 @pytest.mark.slow
