@@ -79,40 +79,40 @@ class ChunkedEnv(EnvBase):
         return self._steps
 
     def _set_specs(self) -> None:
-        spec, shape, device = self.spec, tuple(self.batch_size), self.device
+        spec, shape = self.spec, tuple(self.batch_size)
         views = spec.views
         seen = {
             "observation": Composite(
-                image=Bounded(0, 255, (*shape, views, 3, *spec.size), dtype=torch.uint8, device=device),
-                state=Unbounded((*shape, spec.state_dim), device=device),
-                command=Unbounded((*shape, spec.action_dim), device=device),
-                instruction_utf8=Bounded(0, 255, (*shape, TEXT_BYTES), dtype=torch.uint8, device=device),
+                image=Bounded(0, 255, (*shape, views, 3, *spec.size), dtype=torch.uint8),
+                state=Unbounded((*shape, spec.state_dim)),
+                command=Unbounded((*shape, spec.action_dim)),
+                instruction_utf8=Bounded(0, 255, (*shape, TEXT_BYTES), dtype=torch.uint8),
                 shape=shape,
             ),
-            "success": Binary(1, (*shape, 1), dtype=torch.bool, device=device),
-            "progress": Bounded(0.0, 1.0, (*shape, 1), device=device),
-            "episode_seed": Unbounded((*shape, 1), dtype=torch.int64, device=device),
+            "success": Binary(1, (*shape, 1), dtype=torch.bool),
+            "progress": Bounded(0.0, 1.0, (*shape, 1)),
+            "episode_seed": Unbounded((*shape, 1), dtype=torch.int64),
         }
         if spec.embodiment.calibrated:
             seen["camera"] = Composite(
-                intrinsic=Unbounded((*shape, views, 3, 3), device=device),
-                c2w=Unbounded((*shape, views, 4, 4), device=device),
+                intrinsic=Unbounded((*shape, views, 3, 3)),
+                c2w=Unbounded((*shape, views, 4, 4)),
                 shape=shape,
             )
-        self.observation_spec = Composite(seen, shape=shape, device=device)
+        self.observation_spec = Composite(seen, shape=shape).to(self.device)
         self._observation_keys = list(self.observation_spec.keys(True, True))
         # A spec must be bounded to be sampled from: offsets of a metre or a radian and deltas of one are more
         # than arms do at once, joints turn by half a circle.
         absolute = self.mode is ActionMode.ABSOLUTE and not spec.embodiment.delta
         bound = math.pi if absolute else 1.0
-        chunk = Bounded(-bound, bound, (*shape, spec.chunk, spec.action_dim), device=device)
-        self.action_spec = Composite(
-            vla_action=Composite(chunk=chunk, shape=shape), shape=shape, device=device
+        chunk = Bounded(-bound, bound, (*shape, spec.chunk, spec.action_dim))
+        self.action_spec = Composite(vla_action=Composite(chunk=chunk, shape=shape), shape=shape).to(
+            self.device
         )
-        self.reward_spec = Unbounded((*shape, 1), device=device)
-        flag = Categorical(2, (*shape, 1), dtype=torch.bool, device=device)
+        self.reward_spec = Unbounded((*shape, 1), device=self.device)
+        flag = Categorical(2, (*shape, 1), dtype=torch.bool, device=self.device)
         self.done_spec = Composite(
-            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape, device=device
+            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape, device=self.device
         )
 
     def schedule(self, seeds: Iterable[int]) -> None:

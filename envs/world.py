@@ -78,19 +78,18 @@ class WorldEnv(ChunkedEnv):
         self.simulator, self.starts, self.shared_noise, self.bf16 = simulator, starts, shared_noise, bf16
         self.session: TensorDict | None = None
         pictures = (batch, spec.chunk, spec.views, 3, *spec.size)
-        features = Unbounded((batch, *simulator.feature_shape), device=device)
+        features = Unbounded((batch, *simulator.feature_shape))
         self.observation_spec["world"] = Composite(
-            frames=Bounded(0, 255, pictures, dtype=torch.uint8, device=device),
+            frames=Bounded(0, 255, pictures, dtype=torch.uint8),
             features=features,
             shape=(batch,),
-            device=device,
-        )
-        action: dict[str, Any] = {COMMANDS: Unbounded((batch, spec.chunk, spec.action_dim), device=device)}
+        ).to(device)
+        action: dict[str, Any] = {COMMANDS: Unbounded((batch, spec.chunk, spec.action_dim))}
         if spec.pose_map:
-            action[POSE_MAP] = Bounded(0, 255, pictures, dtype=torch.uint8, device=device)
+            action[POSE_MAP] = Bounded(0, 255, pictures, dtype=torch.uint8)
         if spec.embodiment.calibrated:
-            action[CHUNK_C2W] = Unbounded((batch, spec.chunk, spec.views, 4, 4), device=device)
-        self.action_spec = Composite(action, shape=(batch,), device=device)
+            action[CHUNK_C2W] = Unbounded((batch, spec.chunk, spec.views, 4, 4))
+        self.action_spec = Composite(action, shape=(batch,)).to(device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         mask = self._reset_mask(tensordict)

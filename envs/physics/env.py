@@ -73,7 +73,7 @@ class PhysicsEnv(ChunkedEnv):
 
     def _set_specs(self) -> None:
         super()._set_specs()
-        self.observation_spec[LOST] = Binary(1, (*self.batch_size, 1), dtype=torch.bool, device=self.device)
+        self.observation_spec[LOST] = Binary(1, (*self.batch_size, 1), dtype=torch.bool)
         self._observation_keys.append(LOST)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
