@@ -87,7 +87,7 @@ class SecondDevice(TorchFunctionMode):
                 first.inner[tree_map(_inner, args[1])] = _inner(args[2])
                 return None
         if name == "where" and len(args) == 3:
-            return func(first, *(_beside(first, *pair) for pair in (args[1:], args[:0:-1])))
+            return func(first, _beside(first, args[1], args[2]), _beside(first, args[2], args[1]))
         if name in _WHOLE and any(isinstance(t, Elsewhere) for t in _tensors((args, given))):
             return _Whole.apply(partial(_call, func, args, given), *_tensors((args, given)))
         if _is_elsewhere(given.get("device")):

@@ -153,7 +153,8 @@ def _calibrate(cfg: Cfg, model: Judge, store: ClipStore, world: Simulator, bf16:
     features = features_of_episodes(world, store, unseen, bf16) if model.reads_features else None
     score = judge_recordings(model, store, unseen, features)
     succeeded = episode_success(store, unseen)
-    blank = int((~torch.isfinite(score).all(1)).sum())
+    judged = torch.isfinite(score).all(1)
+    blank = int((~judged).sum())
     if blank:
         why = (
             f"judge={cfg['judge']['_target_']} gives no judgement on {blank} of {len(unseen)} recorded"
@@ -167,7 +168,6 @@ def _calibrate(cfg: Cfg, model: Judge, store: ClipStore, world: Simulator, bf16:
             f"judge: {int(succeeded.sum())} of {len(succeeded)} calibration episodes succeeded, and its"
             f" scores do not tell which; threshold left at {float(model.threshold):.3f}"
         )
-    judged = torch.isfinite(score).all(1)
     won, sure = succeeded[judged], model.confidence(score[judged].double())
     if won.all() or not won.any():
         return {}
