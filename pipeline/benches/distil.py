@@ -207,7 +207,7 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         **{f"rollout_{name}": value for name, value in _pictures(store, whole).items()},
         "rollout_detail": _detail(store, whole),
         "state": rollout_error(store, held, whole)["state"]["median"],
-        **{f"speed_{n}": speed(simulator, store, n, cfg["measure"]["speed_chunks"]) for n in (1, 32)},
+        **{f"speed_{n}": speed(simulator, store, n, cfg["measure"]["speed_chunks"], bf16) for n in (1, 32)},
     }
 
 

@@ -110,6 +110,9 @@ def carry_out(
 ) -> tuple[Tensor, Tensor]:
     """Progress [D, W] as the judge sees it and outcome [W] of the decision points `which` [W], followed by
     chunks [D, W, K, A]; an outcome is NaN where physics crashed.
+
+    A success that the judge has seen stays one, as in imagination; physics shows a chunk's last frame, which
+    stands for the others.
     """
     store, count, depth = points.store, len(which), len(chunks)
     which = torch.cat((which, which[-1:].expand(physics.batch_size[0] - count)))  # fills the batch
@@ -119,7 +122,8 @@ def carry_out(
     texts = [store.instructions[number] for number in episode.tolist()]
     seen = torch.full((depth, len(which)), torch.nan)
     over = torch.zeros(len(which), dtype=torch.bool)
-    won, lost = over.clone(), over.clone()
+    won, lost, told = over.clone(), over.clone(), over.clone()
+    run = torch.zeros(len(which), dtype=torch.int64)
     physics.schedule(seeds)
     now = physics.reset()
     for begin in range(0, physics.horizon, physics.chunk):
@@ -131,10 +135,12 @@ def carry_out(
             chunk[mine] = chunks[number, mine].to(chunk.device)
         acted[CHUNK] = chunk
         after = physics.step(acted)
-        progress = judge.score(after["next", IMAGE].unsqueeze(1), first, texts).progress[:, 0].cpu()
+        judgement = judge.score(after["next", IMAGE].unsqueeze(1), first, texts)
+        done, run = judge.streak(judgement.success.cpu().expand(-1, physics.chunk), run)
+        told |= done.any(1)
+        progress = torch.where(told, 1.0, judgement.progress[:, 0].cpu())
         won |= ~over & after["next", SUCCESS].squeeze(-1)
         lost |= after["next", LOST].squeeze(-1)
-        progress = torch.where(won, 1.0, progress)
         for number in range(depth):
             at = since == number
             seen[number, at] = progress[at]

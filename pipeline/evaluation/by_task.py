@@ -56,6 +56,15 @@ def evenly(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor, count: in
     return episodes[first.sort().values]
 
 
+def held_out_first(cfg: Mapping[str, Any], store: ClipStore, count: int) -> Tensor:
+    """`count` of a store's episodes int64 [N], shared out over tasks: those that are held out, and others
+    only where these are too few.
+    """
+    held, every = store.split("held_out"), torch.arange(len(store))
+    chosen = evenly(cfg, store, held, count)
+    return torch.cat((chosen, evenly(cfg, store, every[~torch.isin(every, held)], count - len(chosen))))
+
+
 def by_task(tasks: Sequence[str], summarise: Callable[..., T], *values: Tensor) -> dict[str, T]:
     """What `summarise` says of each task's part of `values`, tensors [N] beside tasks [N]; {} if all are of
     one task, of which the whole says everything.

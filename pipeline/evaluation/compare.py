@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from envs.targets import ConfigError
-from pipeline.evaluation.statistics import rate, rate_line
+from pipeline.evaluation.statistics import points_line, rate, rate_line
 
 Result = Mapping[str, Any]
 
@@ -90,7 +90,7 @@ _ROWS: tuple[tuple[str, Callable[[Result], str]], ...] = (
     ),
     (
         "gap imagined - true, by round",
-        lambda r: ", ".join(f"{100 * entry['gap']:+.1f}" for entry in r["rounds"]),
+        lambda r: ", ".join(points_line(entry["gap"]) for entry in r["rounds"]),
     ),
     ("recorded episodes learned from", lambda r: str(r["episodes_used"])),
     (

@@ -64,11 +64,11 @@ def rollout_error(store: ClipStore, episodes: Tensor, made: Replay) -> dict[str,
     }
 
 
-def speed(simulator: Simulator, store: ClipStore, batch: int, chunks: int) -> float:
+def speed(simulator: Simulator, store: ClipStore, batch: int, chunks: int, bf16: bool) -> float:
     """Generated frames per second (all views together count as one) at a batch size, SIDE_BY_SIDE at most."""
     episodes = store.length.argsort(descending=True)[torch.arange(batch) % len(store)]
-    replay(simulator, store, episodes[:1])
+    replay(simulator, store, episodes[:1], bf16=bf16)
     began, frames = time.perf_counter(), 0
     for _ in range(max(1, chunks // 10)):
-        frames += replay(simulator, store, episodes).frames.shape[:2].numel()
+        frames += replay(simulator, store, episodes, bf16=bf16).frames.shape[:2].numel()
     return frames / (time.perf_counter() - began)

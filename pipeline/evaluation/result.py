@@ -37,10 +37,12 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
     finished = manifests(inputs)
     imagined, measured = (result_of(inputs.folder(role)) for role in ("imagined", "measured"))
     learned = [entry for name, entry in finished.items() if name.startswith("rl-")]
+    # The last deployment tells which policy to keep, and nothing learns from it.
+    last = f"deploy-{cfg['rounds']['count'] + 1}"
     gathered = [
         entry["result"]
         for name, entry in finished.items()
-        if name.split("-")[0] in ("collect", "explore", "deploy", "recordings")
+        if name.split("-")[0] in ("collect", "explore", "deploy", "recordings") and name != last
     ]
     result: dict[str, Any] = {
         "name": cfg["name"],
@@ -114,7 +116,7 @@ def verdict(result: Mapping[str, Any]) -> str:
 
 def _why(result: Mapping[str, Any], points: float, imagined: float) -> str:
     """What the figures say of why true success did not rise by enough."""
-    gap = result["rounds"][-1]["gap"] if result["rounds"] else float("nan")
+    gap = result["rounds"][-1]["gap"] if result["rounds"] else None
     if min(points, imagined) > 0 and imagined - points < 5:
         return (
             f"true success rose as imagined success did ({imagined:+.0f} points), but too little to tell from"
@@ -132,7 +134,7 @@ def _why(result: Mapping[str, Any], points: float, imagined: float) -> str:
             " asks for; see by the judge's table whether simulator or judge misses successes, and train it"
             " longer"
         )
-    if gap > _BLIND:
+    if gap is not None and gap > _BLIND:
         true, predicted = (100 * rate(result["rounds"][-1][key]) for key in ("true", "imagined"))
         return (
             f"the imagined world is no guide: in the last round it says {predicted:.0f}% of a policy that"

@@ -37,6 +37,11 @@ def rate_line(entry: Mapping[str, Any]) -> str:
     )
 
 
+def points_line(difference: float | None) -> str:
+    """A difference of rates in points; None where nobody knows it."""
+    return "unknown" if difference is None else f"{100 * difference:+.1f}"
+
+
 def mcnemar(before: Tensor, after: Tensor) -> dict[str, Any]:
     """Exact two-sided McNemar test of paired outcomes bool [N] -> {"gained", "lost", "p"}."""
     gained, lost = int((after & ~before).sum()), int((before & ~after).sum())

@@ -22,7 +22,7 @@ from pipeline.evaluation import measurement
 from pipeline.evaluation.by_task import (
     by_scene,
     by_task,
-    evenly,
+    held_out_first,
     scenes_of_episodes,
     tasks_of_episodes,
     tasks_of_seeds,
@@ -141,28 +141,28 @@ def _true_success(cfg: Cfg, folder: Path, inputs: Inputs, changes: Mapping[str, 
 @priced
 def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Deterministic success in the last imagined world, of the policies in the roles before and after, from
-    the starts of held-out episodes first, shared out over tasks; leaves a video of an episode of each.
+    the starts of held-out episodes first, shared out over tasks, of which those count where both could be
+    judged; leaves a video of an episode of each.
     """
     prepare_process(cfg["seed"], cfg["threads"])
     store = open_store(cfg, inputs)
-    held = store.split("held_out")
-    others, wanted = torch.arange(len(store)), cfg["evaluate"]["imagined"]
-    chosen = evenly(cfg, store, held, wanted)
-    more = evenly(cfg, store, others[~torch.isin(others, held)], wanted - len(chosen))
-    starts = torch.cat((chosen, more))
+    starts = held_out_first(cfg, store, cfg["evaluate"]["imagined"])
     world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(starts)), starts)
     tasks, scenes = (of(cfg, store, starts) for of in (tasks_of_episodes, scenes_of_episodes))
-    out: dict[str, Any] = {}
+    won, known = {}, torch.ones(len(starts), dtype=torch.bool)
     for label in ("before", "after"):
         policy = build_policy(cfg, inputs.weights(label))
         outcome = evaluate(world, policy, list(range(len(starts))), label=f"imagined {label}")
         write_film(folder / f"media/{label}.mp4", side_by_side(world.base_env.video(0).numpy()), store.fps)
-        out[label] = {
-            **_counted(outcome.success, outcome.counted),
-            "tasks": by_task(tasks, _counted, outcome.success, outcome.counted),
-            "scenes": by_scene(tasks, scenes, _counted, outcome.success, outcome.counted),
+        won[label], known = outcome.success, known & outcome.counted
+    return {
+        label: {
+            **_counted(success, known),
+            "tasks": by_task(tasks, _counted, success, known),
+            "scenes": by_scene(tasks, scenes, _counted, success, known),
         }
-    return out
+        for label, success in won.items()
+    }
 
 
 def _counted(success: Tensor, counted: Tensor) -> dict[str, Any]:
@@ -171,13 +171,12 @@ def _counted(success: Tensor, counted: Tensor) -> dict[str, Any]:
 
 
 def _gap(truth: Tensor, success: Tensor, counted: Tensor) -> dict[str, Any]:
-    """True and imagined rates of the same starts, and how far they lie apart."""
-    imagined = success[counted]
-    return {
-        "true": rate_entry(truth),
-        "imagined": rate_entry(imagined),
-        "gap": float(imagined.float().mean() - truth.float().mean()),
-    }
+    """True and imagined rates of those starts whose imagined episodes could be judged, and how far they lie
+    apart, None where there are none.
+    """
+    true, imagined = truth[counted], success[counted]
+    apart = float(imagined.float().mean() - true.float().mean()) if len(true) else None
+    return {"true": rate_entry(true), "imagined": rate_entry(imagined), "gap": apart}
 
 
 @stage(reads=(*WORLD, "measure"), place=Place.EVALUATOR)
@@ -207,6 +206,7 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         rows += compared(cfg, judge, store, episodes, made, views)
     write_text(folder / EPISODES, json.dumps(rows))
     result["frames_per_second"] = {
-        f"batch {n}": measurement.speed(simulator, store, n, cfg["measure"]["speed_chunks"]) for n in (1, 32)
+        f"batch {n}": measurement.speed(simulator, store, n, cfg["measure"]["speed_chunks"], bf16)
+        for n in (1, 32)
     }
     return result

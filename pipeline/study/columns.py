@@ -188,10 +188,10 @@ _APART = 10**12  # between the episodes of one training seed and those of the ne
 
 
 def _mean(cells: Sequence[Cell]) -> dict[str, Any]:
-    """Means of the numbers in cells; of anything else the first one's."""
+    """Means of the numbers in cells, of those cells that have one; of anything else the first one's."""
     out = dict(cells[0])
-    for key, value in out.items():
-        values = [cell.get(key) for cell in cells]
-        if isinstance(value, (int, float)) and all(isinstance(one, (int, float)) for one in values):
-            out[key] = sum(values) / len(values)  # type: ignore[arg-type]
+    for key in out:
+        values = [cell[key] for cell in cells if cell.get(key) is not None]
+        if values and all(isinstance(one, (int, float)) for one in values):
+            out[key] = sum(values) / len(values)
     return out

@@ -46,6 +46,12 @@ class SuccessOverTime(Column):
             raise ConfigError("no RL stands behind this row's policy, so there is nothing to draw")
         if not cfg["rl"]["evaluate_every"]:
             raise ConfigError("rl.evaluate_every=0 never tries the policy while it learns; say 1 or more")
+        trial, before = cfg["rl"]["evaluate_episodes"], cfg["evaluate"]["episodes"]
+        if before < trial:
+            raise ConfigError(
+                f"rl.evaluate_episodes={trial} are more than evaluate.episodes={before}, on which the policy"
+                " is tried before RL; a curve has to be of the same episodes"
+            )
         first = made.add_once("evaluate-before", prove.evaluate_physics, {"policy": "imitation"})
         return [first, *learning]
 

@@ -11,7 +11,7 @@ from typing import Any
 from envs.manifest import read_manifest
 from envs.targets import ConfigError
 from pipeline.evaluation.result import result_of
-from pipeline.evaluation.statistics import rate, rate_line
+from pipeline.evaluation.statistics import points_line, rate, rate_line
 from pipeline.stages import prove
 from pipeline.stages.measured.video import video_errors
 from pipeline.study.columns import ALL, Cell, Cfg, Column, Measured, Success, outcomes_of, together
@@ -187,11 +187,11 @@ class Gap(Column):
     def text(self, cell: Cell) -> str:
         """See Column.text."""
         sides = f"{100 * cell['imagined']:.0f}% imagined, {100 * cell['true']:.0f}% true"
-        return f"{100 * cell['gap']:+.1f} points ({sides})"
+        return f"{points_line(cell['gap'])} points ({sides})"
 
     def merit(self, cell: Cell) -> float | None:
         """See Column.merit."""
-        return -abs(cell["gap"])
+        return None if cell["gap"] is None else -abs(cell["gap"])
 
 
 class Gain(Success):

@@ -87,7 +87,7 @@ def fidelity(cfg: Cfg, root: Path) -> str:
             "first frame held": still.overall,
             **({} if coded is None else {"the same through the autoencoder": coded.overall}),
         },
-        "frames_per_second": {f"batch {n}": speed(simulator, store, n, 1) for n in (1, 32)},
+        "frames_per_second": {f"batch {n}": speed(simulator, store, n, 1, loop.bf16) for n in (1, 32)},
         "long": _long(cfg, root, subject, store, loop) if section["long"]["frames"] else None,
         "strides": None,
         "grid": None,
@@ -189,11 +189,11 @@ def _grid(cfg: Cfg, subject: Subject, loop: OpenLoop, tried: Mapping[str, Any], 
     with tqdm(total=count, desc="fidelity grid", unit="setting", dynamic_ncols=True) as bar:
 
         def measure(settings: Settings) -> Mapping[str, Any]:
-            simulator = subject.simulator(with_settings(cfg, settings))
-            found = loop.measure(simulator, {"settings": dict(settings)}).result(
-                loop.store.spec.embodiment.views, {}
-            )
+            settled = with_settings(cfg, settings)
+            simulator, bf16 = subject.simulator(settled), settled["simulator"]["bf16"]
+            found = replace(loop, bf16=bf16).measure(simulator, {"settings": dict(settings)})
+            overall = found.result(loop.store.spec.embodiment.views, {})["overall"]
             bar.update()
-            return {**found["overall"], "frames_per_second": speed(simulator, loop.store, 1, 1)}
+            return {**overall, "frames_per_second": speed(simulator, loop.store, 1, 1, bf16)}
 
         return run_grid(tried, measure)

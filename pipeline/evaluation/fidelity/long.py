@@ -85,7 +85,7 @@ def drift(
         sharpness [T], the mean gradient of generated over that of true frames: below 1 is blur, above it
         noise; end, PSNR and sharpness over the last tenth; collapsed, whether in that tenth the error is
         that of an unrelated picture or more, or the sharpness less than half or more than twice the truth's;
-        None where the sharpness does not say so and there is no unrelated picture.
+        None where the sharpness does not say so and no other episode is as long.
     """
     made = replay(simulator, store, episodes, bf16=bf16)
     true = store.frames(made.rows)
@@ -110,8 +110,10 @@ def drift(
     error, sharpness = float(errors["mse"].mean(-1)[ends].mean()), float(sharp[ends].mean())
     out["end"] = {"psnr": float(psnr(errors["mse"])[ends].mean()), "sharpness": sharpness}
     out["collapsed"] = True if not 0.5 <= sharpness <= 2.0 else None
-    if not out["collapsed"] and "unrelated" in others:
-        out["collapsed"] = error >= float(others["unrelated"][both].mean())
+    if not out["collapsed"] and "unrelated" in others and bool((both & ends).any()):
+        # Episodes begin alike, and may end alike.
+        bar = max(float(others["unrelated"][some].mean()) for some in (both, both & ends))
+        out["collapsed"] = error >= bar
     return out
 
 

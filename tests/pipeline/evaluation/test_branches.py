@@ -6,16 +6,35 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from actors.factory import build_judge, build_physics, build_policy, build_pool, open_clips
+from actors.factory import build_physics, build_policy, build_pool, open_clips
 from actors.policies.safe import SafePolicyWrapper
 from actors.world_config import world_spec
 from envs.episodes import Episode, LeRobotWriter
 from envs.initial_states import DecisionPoints
-from envs.specs import to_chunk
+from envs.judges.base import Judge, Judgement
+from envs.specs import Status, to_chunk
 from pipeline.config import load_config
 from pipeline.evaluation.branches import Branches, agreement, carry_out
+
+
+class Unmoved(Judge):
+    """Progress .3 of whatever it is shown; success in its third and fourth look, and never again."""
+
+    def __init__(self, hold: int):
+        super().__init__(hold)
+        self.looks = 0
+
+    def score(
+        self, frames: Tensor, first: Tensor, instruction: list[str], features: Tensor | None = None
+    ) -> Judgement:
+        """See Judge.score."""
+        self.looks += 1
+        same = torch.ones(frames.shape[:2])
+        status = torch.full((len(frames),), Status.OK.value)
+        return Judgement(0.9 * same if self.looks in (3, 4) else 0 * same, 0.3 * same, status)
 
 
 def test_what_was_recorded_is_carried_out_again(tmp_path: Path) -> None:
@@ -32,7 +51,7 @@ def test_what_was_recorded_is_carried_out_again(tmp_path: Path) -> None:
     store = open_clips(cfg, [tmp_path / "set"])
     points = DecisionPoints(store, torch.arange(3))
     which = (points.frame == 4).nonzero().flatten()
-    policy, judge = build_policy(cfg), build_judge(cfg).eval()
+    policy, judge = build_policy(cfg), Unmoved(hold=spec.chunk + 1).eval()
     physics = build_physics(cfg, 4)
     try:
         actor = SafePolicyWrapper(policy, spec, physics.mode)
@@ -50,8 +69,8 @@ def test_what_was_recorded_is_carried_out_again(tmp_path: Path) -> None:
         physics.close()
     recorded = [bool(store.episodes[int(number)]["success"]) for number in points.episode[which]]
     assert outcome.bool().tolist() == recorded == [True, True, False]
-    assert seen.shape == (depth, 3) and bool(torch.isfinite(seen).all())
-    assert float(seen[-1, 0]) == 1.0  # a success stays one
+    # Nothing of the outcome is in what the judge has seen, and what it took for a success stays one.
+    assert depth == 4 and seen.tolist() == [pytest.approx([value] * 3) for value in (0.3, 0.3, 1.0, 1.0)]
 
 
 def test_only_what_differs_within_a_moment_counts() -> None:
