@@ -89,9 +89,13 @@ def build_text_world(cfg: Mapping[str, Any], weights: Path | None = None) -> Tex
 
 
 def build_policy(cfg: Mapping[str, Any], weights: Path | None = None) -> TensorDictModuleBase:
-    """The policy of the policy section; see actors/policies/contract.py."""
+    """The policy of the policy section; see actors/policies/contract.py.
+
+    It stays in evaluation mode but where it is cloned: with dropout, an RL update would find other
+    likelihoods than the rollout that it learns from.
+    """
     policy: TensorDictModuleBase = build(cfg["policy"], "policy", spec=world_spec(cfg))
-    return load(policy, weights).to(device_of(cfg))
+    return load(policy, weights).to(device_of(cfg)).eval()
 
 
 def build_physics(

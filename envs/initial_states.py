@@ -101,17 +101,20 @@ def shared_out(inside: Sequence[int], extra: Sequence[int], share: float) -> lis
 
 
 def decision_points(store: ClipStore, episodes: Tensor) -> tuple[Tensor, Tensor]:
-    """Episode and frame, each int64 [N], of all chunks of `episodes` that were begun.
+    """Episode and frame, each int64 [N], of all chunks of `episodes` that were begun where there is a
+    picture.
 
     Raises:
         ConfigError: if there are none.
     """
-    if not len(episodes):
+    counts = (store.length[episodes] - 2).clamp(min=0) // store.spec.chunk + 1
+    before = counts.cumsum(0) - counts
+    within = torch.arange(int(counts.sum())) - torch.repeat_interleave(before, counts)
+    episode, frame = torch.repeat_interleave(episodes, counts), within * store.spec.chunk
+    seen = store.arrays["present"][store.start[episode] + frame]
+    if not seen.any():
         raise ConfigError(
             "no recorded episode is left to begin imagined ones in; deploy or collect more, or set"
             " rl.starts=first"
         )
-    counts = (store.length[episodes] - 2).clamp(min=0) // store.spec.chunk + 1
-    before = counts.cumsum(0) - counts
-    within = torch.arange(int(counts.sum())) - torch.repeat_interleave(before, counts)
-    return torch.repeat_interleave(episodes, counts), within * store.spec.chunk
+    return episode[seen], frame[seen]

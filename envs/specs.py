@@ -136,6 +136,17 @@ def to_chunk(commands: Tensor, command: Tensor, mode: ActionMode) -> Tensor:
     return commands if mode is ActionMode.ABSOLUTE else commands - command.unsqueeze(-2)
 
 
+def at_rest(commands: Tensor, embodiment: Embodiment) -> Tensor:
+    """Commands [..., A] by which a robot whose last ones these were stays as it is: absolute ones are held,
+    of changes only grippers are.
+    """
+    if not embodiment.delta:
+        return commands
+    moves = torch.ones(embodiment.action_dim, dtype=torch.bool, device=commands.device)
+    moves[list(embodiment.grippers)] = False
+    return torch.where(moves, 0.0, commands)
+
+
 def check_chunk(chunk: Tensor, embodiment: Embodiment) -> None:
     """Refuse chunks of the wrong width or with NaN.
 

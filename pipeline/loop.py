@@ -222,7 +222,9 @@ def add_world(graph: Graph, cfg: Cfg, data: list[str], before: World, number: in
     if "text_world" in cfg["judge"]:
         roles = {"data": data, "warm": before.text_world}
         golden = graph.add(f"text_world-{number}", judging.text_world, roles, phase=phase)
-    roles = {**inputs, "warm": before.judge, "text_world": golden}
+    kind: Any = target(cfg["judge"], "judge")
+    mixed = state if kind.reads_features else ""  # it mixes the features that such a judge reads
+    roles = {**inputs, "warm": before.judge, "text_world": golden, "state": mixed}
     judge = graph.add(f"judge-{number}", judging.judge, roles, phase=phase, **judge_files(cfg))
     return World(teacher, simulator, state, judge, golden, speeds)
 

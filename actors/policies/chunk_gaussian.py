@@ -37,7 +37,9 @@ class ChunkGaussian(Distribution):
 
     The density is that of the knots; a chunk determines them exactly (the basis has full column rank), so
     likelihood ratios are those of the chunk. It is the density of chunks that are drawn; where the mode was
-    taken instead (heads.some_drawn) its gradient with respect to the mean is zero as long as the mean stays.
+    taken instead (heads.some_drawn) its gradient with respect to the mean is zero as long as the mean stays,
+    and with respect to the spread it is not: every mode would tell it to shrink. So the spread learns only
+    where all chunks are drawn.
 
     Args:
         loc: [..., n, A] mean knots in normalised units.
@@ -96,7 +98,9 @@ class ChunkGaussian(Distribution):
             return self.rsample(sample_shape)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        normal = torch.distributions.Normal(self.loc, self.scale, validate_args=False)
+        every = (self.share >= 1)[..., None, None]
+        scale = torch.where(every, self.scale, self.scale.detach())
+        normal = torch.distributions.Normal(self.loc, scale, validate_args=False)
         return (normal.log_prob(self._encode(value)) * self.active).sum((-2, -1))
 
     def entropy(self) -> Tensor:

@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from envs.conditioning.action_vector import RESOLUTION
 from envs.embodiment import ActionKind, Embodiment
 
-RESOLUTION = 1e-4  # of any unit in use (metres, radians, degrees, shares); no motor moves by less
 MARGIN = 0.01  # share of the greatest spread among numbers of one unit, below which a number is constant
 
 

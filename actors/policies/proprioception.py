@@ -6,7 +6,7 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
 
-from actors.policies.heads import RESOLUTION
+from envs.conditioning.action_vector import RESOLUTION
 from envs.embodiment import Embodiment
 from envs.specs import COMMAND, STATE
 

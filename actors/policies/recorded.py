@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from envs.specs import CHUNK, COMMAND, EPISODE, ActionMode, WorldSpec, to_chunk
+from envs.specs import CHUNK, COMMAND, EPISODE, ActionMode, WorldSpec, at_rest, to_chunk
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Commands:
 
 class RecordedActions(TensorDictModuleBase):
     """Acts as somebody did before from the same starts, and rests when the recording is over: absolute
-    commands stay in force, deltas are zero.
+    commands stay in force, of changes only grippers do.
 
     Args:
         commands: of the episodes that begin at a world's initial states, in their order.
@@ -49,7 +49,6 @@ class RecordedActions(TensorDictModuleBase):
         ahead = self.elapsed()[:, None] + torch.arange(1, self.spec.chunk + 1)
         last = self.commands.length[which][:, None] - 1
         given = self.commands.values[which[:, None], torch.minimum(ahead, last)]
-        if self.spec.embodiment.delta:
-            given = torch.where((ahead > last).unsqueeze(-1), 0.0, given)
+        given = torch.where((ahead > last).unsqueeze(-1), at_rest(given, self.spec.embodiment), given)
         observed[CHUNK] = to_chunk(given, in_force, self.mode).to(observed[COMMAND].device)
         return observed

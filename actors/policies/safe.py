@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from actors.policies.contract import VISUAL_FEATURES, input_keys, inputs_for
-from envs.specs import CHUNK, COMMAND, INVALID_ACTION, LOG_PROB, ActionMode, WorldSpec
+from envs.specs import CHUNK, COMMAND, INVALID_ACTION, LOG_PROB, ActionMode, WorldSpec, at_rest, to_chunk
 from envs.targets import ConfigError
 
 
@@ -39,7 +39,9 @@ class SafePolicyWrapper(TensorDictModuleBase):
         Raises:
             ConfigError: if the policy's chunks are of another size than the world takes.
         """
-        output = self.policy(inputs_for(observed, self.policy))
+        # Features that lie there are those of the decision before.
+        seen = observed.exclude(VISUAL_FEATURES)
+        output = self.policy(inputs_for(seen, self.policy))
         for key in self.policy.out_keys:
             value = output.get(key, None)
             if value is not None:
@@ -64,5 +66,5 @@ class SafePolicyWrapper(TensorDictModuleBase):
 
     def _rest(self, command: Tensor) -> Tensor:
         """The chunk [B, K, A] by which a robot stays as it is: its command in force, or no change."""
-        holds = self.mode is ActionMode.ABSOLUTE and not self.spec.embodiment.delta
-        return (command if holds else torch.zeros_like(command)).unsqueeze(1).expand(-1, self.spec.chunk, -1)
+        held = command.unsqueeze(1).expand(-1, self.spec.chunk, -1)
+        return to_chunk(at_rest(held, self.spec.embodiment), command, self.mode)

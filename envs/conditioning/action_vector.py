@@ -7,7 +7,9 @@ from torch import Tensor, nn
 
 from envs.embodiment import Embodiment
 
-_CONSTANT = 1e-3  # spread (metres, radians, shares) below which a number is a constant that tells nothing
+# Spread below which a number is a constant, in any unit in use (metres, radians, degrees, shares): no motor
+# moves by less.
+RESOLUTION = 1e-4
 
 
 class ActionVector(nn.Module):
@@ -52,4 +54,4 @@ class ActionVector(nn.Module):
 
 def _per_spread(spread: Tensor) -> Tensor:
     """One over a spread [A]; 0 where a number is a constant."""
-    return torch.where(spread > _CONSTANT, 1 / spread.clamp(min=_CONSTANT), 0.0)
+    return torch.where(spread > RESOLUTION, 1 / spread.clamp(min=RESOLUTION), 0.0)

@@ -254,13 +254,13 @@ class _Builder:
         return end_effector_poses(self.spec.embodiment, torch.from_numpy(episode.commands), self.kinematics)
 
     def _cameras(self, episode: Episode) -> Tensor:
-        """Camera poses [T, V, 4, 4]: wrist cameras where the commands lead them, as in imagination, where
-        nobody can measure them; as recorded where commands do not say it.
+        """Camera poses [T, V, 4, 4] as in imagination, where nobody can measure them: wrist cameras where the
+        commands lead them; all where they were at first if commands do not say it.
         """
         assert episode.c2w is not None
         c2w, poses = torch.from_numpy(episode.c2w), self._poses(episode)
         if poses is None:
-            return c2w
+            return c2w[:1].expand_as(c2w)
         return follow_wrists(c2w[0], poses[0], poses, self.spec.embodiment.wrists)
 
     def _pose_maps(self, episode: Episode, c2w: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -5,6 +5,8 @@ A batch is a function of (seed, step) alone, so a resumed run sees the batches i
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -94,7 +96,7 @@ class ClipStore(EpisodeStore):
 
     def sample(self, episodes: Tensor, count: int, spec: ClipSpec, generator: torch.Generator) -> TensorDict:
         """`count` random clips of the given episodes, every frame that has a successor being equally likely
-        to begin one.
+        to begin one; where it has no picture, the last one before it that has.
         """
         if not len(episodes):
             raise EpisodeError("no episode is left to draw clips from; collect more, or widen the selection")
@@ -103,4 +105,11 @@ class ClipStore(EpisodeStore):
         draw = torch.randint(int(edges[-1]), (count,), generator=generator)
         chosen = torch.searchsorted(edges, draw, right=True)
         begin = draw - (edges[chosen] - choices[chosen])
-        return self.clips(episodes[chosen], begin, spec)
+        start = self.start[episodes[chosen]]
+        return self.clips(episodes[chosen], self._seen[start + begin].maximum(start) - start, spec)
+
+    @cached_property
+    def _seen(self) -> Tensor:
+        """Of every row the last one up to it that has a picture, int64 [N]; -1 where none has."""
+        present = self.arrays["present"]
+        return torch.where(present, torch.arange(len(present)), -1).cummax(0).values

@@ -116,7 +116,7 @@ class Judge(nn.Module):
                 [N, TEXT_BYTES]; frames and first uint8 [N, V, 3, H, W], or, for a judge that
                 `reads_features`, features float32 [N, D] of the frame's chunk and offset int64 [N], its
                 place in that chunk.
-            share: fraction of successes among the labels, by which the classes are balanced.
+            share: fraction of successes among the batch's labels, by which the classes are balanced.
         """
         raise NotImplementedError
 

@@ -46,7 +46,8 @@ class FittedJudge(Judge):
         logit, nearing = self(data).unbind(-1)
         known = torch.isfinite(data["label"])
         count, label = known.sum().clamp(min=1), torch.nan_to_num(data["label"])
-        weight = torch.where(label > 0.5, 0.5 / max(share, 1e-3), 0.5 / max(1 - share, 1e-3)) * known
+        share = min(max(share, 0.02), 0.98)
+        weight = torch.where(label > 0.5, 0.5 / share, 0.5 / (1 - share)) * known
         success = (F.binary_cross_entropy_with_logits(logit, label, reduction="none") * weight).sum() / count
         target = torch.nan_to_num(data["progress"])
         shaped = F.binary_cross_entropy_with_logits(nearing, target, reduction="none") * known

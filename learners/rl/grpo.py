@@ -108,7 +108,9 @@ class GRPO:
         togo = reward.flip(1).cumsum(1).flip(1)
         score = togo if self.config.shaped else togo[:, :1].expand_as(togo)
         groups = score.unflatten(0, (-1, size))  # [G, size, T]
-        there = mine.unflatten(0, (-1, size)).float()
+        # A whole episode's return is compared with those of all, also of the ones that have ended by now.
+        alive = mine if self.config.shaped else mine.any(1, keepdim=True).expand_as(mine)
+        there = alive.unflatten(0, (-1, size)).float()
         count = there.sum(1, keepdim=True).clamp(min=1)
         mean = (groups * there).sum(1, keepdim=True) / count
         spread = (((groups - mean).square() * there).sum(1, keepdim=True) / count).sqrt()
@@ -125,7 +127,7 @@ class GRPO:
         data = transitions(batch, keep, keys, advantage=advantage.flatten(0, 1).unsqueeze(-1))
         return data, {
             "groups_dropped": float(alike.float().mean()),
-            "advantage_std": float(data["advantage"].std()),
+            "advantage_std": float(data["advantage"].std(unbiased=False)) if len(data) else 0.0,
         }
 
     def loss(self, minibatch: TensorDict) -> tuple[Tensor, dict[str, float]]:

@@ -20,8 +20,10 @@ from learners.stages.imitation import chunks_ahead
 from learners.stages.observed import observe
 
 _AT_ONCE = 256  # frames per pass
-_UNLIKELY = 8.0  # nats below what is usual
-_SAMPLES = 8  # of a policy, that tell what is usual; not every distribution knows its entropy
+# Nats below the least likely of so many samples of the policy. The more numbers a chunk has, the further
+# apart its own samples lie, and some of them may be its mode.
+_UNLIKELY = 8.0
+_SAMPLES = 16
 
 
 class RecordedDecisions:
@@ -52,9 +54,9 @@ class RecordedDecisions:
         self.known[CHUNK] = chunks_ahead(store, self.known["row"], mode)
         if not len(self.known):
             return
-        likely, usual = zip(*(self._likely(some) for some in self.known.split(_AT_ONCE)), strict=True)
+        likely, sayable = zip(*(self._likely(some) for some in self.known.split(_AT_ONCE)), strict=True)
         self.known[LOG_PROB] = torch.cat(likely)
-        self.known = self.known[torch.cat(usual)]
+        self.known = self.known[torch.cat(sayable)]
 
     def __len__(self) -> int:
         return len(self.known)
@@ -67,11 +69,11 @@ class RecordedDecisions:
         device = device_of(self.policy)
         said = distribution(self.policy, inputs_for(self._seen(some), self.policy))
         likely = said.log_prob(some[CHUNK].to(device))
-        # What is usual is told by the same draws each time, so that a resumed run tells the same.
+        # What may be said is told by the same draws each time, so that a resumed run tells the same.
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             seed_process(0)
-            usual = torch.stack([said.log_prob(said.sample()) for _ in range(_SAMPLES)]).mean(0)
-        return likely.cpu(), (likely > usual - _UNLIKELY).cpu()
+            least = torch.stack([said.log_prob(said.sample()) for _ in range(_SAMPLES)]).amin(0)
+        return likely.cpu(), (likely > least - _UNLIKELY).cpu()
 
     def _seen(self, some: TensorDict) -> TensorDict:
         """Decisions [N] with what the policy reads: no pictures if it was left its features alone."""

@@ -23,6 +23,7 @@ from envs.specs import (
     IMAGE,
     STATE,
     ActionMode,
+    at_rest,
     to_chunk,
 )
 from envs.targets import ConfigError
@@ -131,10 +132,7 @@ def chunks_ahead(store: ClipStore, rows: Tensor, mode: ActionMode) -> Tensor:
     commands, robot = store.arrays["commands"], store.spec.embodiment
     ahead, last = rows[:, None] + torch.arange(1, store.spec.chunk + 1), last_rows(store, rows)[:, None]
     chunks = commands[torch.minimum(ahead, last)]
-    if robot.delta:
-        moves = torch.ones(robot.action_dim, dtype=torch.bool)
-        moves[list(robot.grippers)] = False
-        chunks = torch.where((ahead > last)[..., None] & moves, 0.0, chunks)
+    chunks = torch.where((ahead > last)[..., None], at_rest(chunks, robot), chunks)
     return to_chunk(chunks, commands[rows], mode)
 
 

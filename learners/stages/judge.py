@@ -70,7 +70,6 @@ class JudgeData:
             labelled = generated.select(*names)[torch.isfinite(self.labels[generated["row"]])]
             if len(labelled):
                 self.pools.append(_Pool(self.labels, when, labelled))
-        self.share = float(self.labels[given["row"]].mean().clamp(0.02, 0.98))
 
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
         """A batch [count] for Judge.loss, with uint8 frames."""
@@ -170,13 +169,14 @@ def train_judge(
         return data.sample(options.part, generator)
 
     def loss(batch: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
+        share = float(batch["label"].mean())  # of the batch, which is not the data's
         if not data.pictures:
-            return judge.loss(batch, data.share)
+            return judge.loss(batch, share)
         views = batch["frames"].shape[1]  # the same colours for both, as one camera would give them
         both = augment(torch.cat((batch["frames"], batch["first"]), 1), generator, _SHIFT)
         shown = batch.copy()
         shown["frames"], shown["first"] = both.split(views, 1)
-        return judge.loss(shown, data.share)
+        return judge.loss(shown, share)
 
     return fit("judge", judge, batch, loss, options, folder, watch="frame_accuracy")
 

@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from actors.policies.contract import with_text
+from envs.conditioning.action_vector import RESOLUTION
 from envs.episodes.clips import ClipStore
 from envs.rng import seed_process
 from envs.specs import ActionMode
@@ -28,7 +29,6 @@ from learners.training.fit import FitConfig, fit
 from learners.training.parallel import Trainee
 
 _TRACES = 0.1  # weight of where hands will be, beside the others
-_SPREAD = 1e-3  # of a number of the chunk below which it is a constant that nobody need predict
 
 
 class PerceptionTasks(nn.Module):
@@ -79,8 +79,8 @@ class PerceptionTasks(nn.Module):
         won = (torch.nan_to_num(progress) > 0).float() - 0.5
         conditioned = hidden + self.outcome(torch.where(known, won, 0.0)[:, None])
         guess = self.acted(F.silu(conditioned)).unflatten(-1, tuple(self.centre.shape))
-        active = self.spread > _SPREAD
-        wanted = (chunks - self.centre) / self.spread.clamp(min=_SPREAD)
+        active = self.spread > RESOLUTION
+        wanted = (chunks - self.centre) / self.spread.clamp(min=RESOLUTION)
         acted = ((guess - wanted).abs() * active).sum() / (active.sum().clamp(min=1) * len(chunks))
         logits = self.soon(hidden)[:, 0].float()
         soon = F.binary_cross_entropy_with_logits(logits, torch.nan_to_num(progress), reduction="none")

@@ -12,7 +12,7 @@ from torch import Tensor
 
 
 def as_likely_as_not(score: Tensor, true: Tensor) -> float | None:
-    """The score, 0.02..0.98, at which an outcome is as likely true as not.
+    """The score, 0.02..1, at which an outcome is as likely true as not, near 1 if none that occurs does so.
 
     The likelihood is logistic in the logit of the score (Platt 1999, with his targets, which keep it finite
     where scores part the outcomes): it uses all of them, where a threshold of best accuracy jumps with a few.
@@ -39,4 +39,4 @@ def as_likely_as_not(score: Tensor, true: Tensor) -> float | None:
         return float(value), [(gap * logits).mean(), gap.mean()]
 
     slope, offset = minimize(misfit, [1.0, 0.0], jac=True).x
-    return None if slope <= 0 else float(expit(-offset / slope).clip(0.02, 0.98))
+    return None if slope <= 0 else float(expit(-offset / slope).clip(0.02, 1.0))

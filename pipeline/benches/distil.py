@@ -132,19 +132,19 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
         else ""
     )
 
-    def judged(own: Graph, name: str, simulator: str) -> str:
+    def judged(own: Graph, name: str, simulator: str, state: str) -> str:
         """The judge of a simulator; one that sees pictures alone is the same for all."""
         if not judge_class.reads_features:
-            own, name, simulator = graph, "all", teacher
+            own, name, simulator, state = graph, "all", teacher, ""
         if f"judge-{name}" in own.nodes:
             return f"judge-{name}"
-        roles = {"data": data, "simulator": simulator, "text_world": golden}
+        roles = {"data": data, "simulator": simulator, "text_world": golden, "state": state}
         return own.add(f"judge-{name}", judging.judge, roles, phase="first")
 
     def measured(title: str, name: str, simulator: str, section: Mapping[str, Any], evaluations: int) -> None:
         own, roles = graph.under({**cfg, "simulator": section}), {"data": data, "simulator": simulator}
         state = own.add(f"state-{name}", world.state, roles, phase="first")
-        roles |= {"state": state, "judge": judged(own, name, simulator)}
+        roles |= {"state": state, "judge": judged(own, name, simulator, state)}
         rows[title] = own.add(f"measure-{name}", measure, roles, evaluations=evaluations)
 
     for steps in TEACHER:

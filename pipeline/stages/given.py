@@ -88,10 +88,13 @@ def learning_episodes(store: ClipStore) -> Tensor:
     return torch.cat((store.split("train"), store.split("calibration"))).sort().values
 
 
-def newest_episodes(store: ClipStore, episodes: Tensor) -> Tensor:
-    """Those of `episodes` that lie in the store's last data set."""
+def newest_episodes(store: ClipStore, inputs: Inputs, episodes: Tensor) -> Tensor:
+    """Those of `episodes` that come from the last stage of the role data; recordings that a user lists are
+    all of one.
+    """
     owner = torch.tensor([row["dataset"] for row in store.episodes])
-    return episodes[owner[episodes] == owner.max()]
+    first = len(store.parts) - len(datasets(inputs.folders("data")[-1:]))
+    return episodes[owner[episodes] >= first]
 
 
 def demonstrations(cfg: Cfg, store: ClipStore) -> Tensor:

@@ -76,7 +76,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         freeze_perception(policy)
         anchor.encode()
     algorithm = build_algorithm(cfg, policy)
-    inside = None if settings.starts == "first" else newest_episodes(store, learning_episodes(store))
+    inside = None if settings.starts == "first" else newest_episodes(store, inputs, learning_episodes(store))
     data, more = (datasets(inputs.folders(role)) for role in ("data", "starts"))
     extra = range(len(store), len(store) + (len(open_clips(cfg, more)) if more else 0))
     knew, decisions = _warm_up(cfg, policy, algorithm, store, settings.seed, number)
@@ -114,7 +114,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
 def _begun(store: ClipStore, inside: Tensor | None, key: bool) -> tuple[int, Sequence[int]]:
     """How many starts recorded episodes offer, and the numbers of those that are taken."""
     if inside is None:
-        return len(store), range(len(store))
+        return len(store), learning_episodes(store).tolist()
     episode, frame = decision_points(store, inside)
     chosen = key_points(store, episode, frame).nonzero().flatten().tolist() if key else range(len(frame))
     return len(frame), chosen

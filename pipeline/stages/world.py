@@ -64,13 +64,14 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     fit = in_time(inputs, "simulator", fit_options(cfg, section.pop("fit"), f"simulator_fit.{phase}.fit"))
     how = options(SimulatorFitConfig, section, f"simulator_fit.{phase}")
     store = open_store(cfg, inputs)
-    episodes = learning_episodes(store)
     prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg, inputs.weights("warm"))
+    # What a world says of a task's end is calibrated on episodes that it has not learned from.
+    episodes = store.split("train") if model.says_done else learning_episodes(store)
     stats = (
         train_simulator(
             *(model, store, episodes, how, fit, folder),
-            newest=newest_episodes(store, episodes),
+            newest=newest_episodes(store, inputs, episodes),
             fresh=phase == "first",
             look=Film(model, store, folder, cfg["simulator"]["bf16"]),
         )
@@ -94,7 +95,7 @@ def student(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     phase = inputs.settings["phase"]
     store = open_store(cfg, inputs)
     episodes = learning_episodes(store)
-    newest = newest_episodes(store, episodes)
+    newest = newest_episodes(store, inputs, episodes)
     key, taught = f"distill.{phase}", cfg["simulator_fit"][phase]["strides"]
     told = lacking_strides(key, cfg["distill"][phase]["strides"], f"simulator_fit.{phase}", taught)
     return {**distil(cfg, folder, inputs, key, store, episodes, newest), **told}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from envs.conditioning import ActionVector
 from envs.embodiment import Embodiment
 from envs.encoders import MultiViewEncoder, QueriedKeypoints, centres, to_signed
 from envs.specs import IMAGE
@@ -98,3 +99,11 @@ def test_cameras_that_are_not_looked_through_change_nothing() -> None:
 def test_unknown_cameras_are_named_with_those_there_are(cameras: object) -> None:
     with pytest.raises(ValueError, match=r"cameras=.* must be .* of .*\['"):
         BIMANUAL_POSES.views_of(cameras)  # type: ignore[arg-type]
+
+
+def test_small_changes_are_told_and_numbers_that_never_change_are_not() -> None:
+    vector, units = ActionVector(ARM_DELTAS), torch.tensor([6e-4, 1, 1e-6, 1])
+    commands = torch.randn(200, 4, generator=torch.Generator().manual_seed(0)) * units
+    vector.normalise(commands, torch.zeros(200, 4))
+    spread = vector(commands[None], commands[:1])[0, :, :4].std(0)
+    assert spread.tolist() == pytest.approx([1, 1, 0, 1], abs=1e-3)

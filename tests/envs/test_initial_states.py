@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torchrl.envs import TransformedEnv
 
 from envs.embodiment import Embodiment
+from envs.episodes import LeRobotWriter
 from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
 from envs.initial_states import DecisionPoints, InitialStates, decision_points, shared_out
@@ -16,9 +20,10 @@ from envs.simulators import memory
 from envs.specs import CHUNK, IMAGE, STATE, ActionMode, Rewards, memory_indices
 from envs.transforms import world_transforms
 from envs.world import WorldEnv
-from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES
+from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
 from tests.envs.simulators.test_engines import build_engine
 from tests.envs.test_world import Fixed
+from tests.moving_square import SIZE, moving_square
 
 Stores = Callable[[Embodiment], ClipStore]
 ROBOTS = pytest.mark.parametrize("robot", [BIMANUAL_POSES, ARM_DELTAS], ids=lambda robot: robot.robot)
@@ -33,6 +38,19 @@ def inside(store: ClipStore, batch: int, judge: Fixed, horizon: int) -> Transfor
     return TransformedEnv(base, world_transforms(store.spec, decoder, judge, Rewards(1.0, 1.0)))
 
 
+@pytest.fixture
+def dark(tmp_path: Path) -> ClipStore:
+    """Episodes whose every third picture is missing."""
+    robot, episodes = ARM_DELTAS.at(SIZE), []
+    for seed in range(3):
+        episode = moving_square(ARM_DELTAS, seed)
+        present = np.arange(len(episode.frames)) % 3 != 2
+        frames = episode.frames * present[:, None, None, None, None]
+        episodes.append(replace(episode, present=present, frames=frames.astype(np.uint8)))
+    LeRobotWriter(tmp_path / "dark", robot).write(episodes)
+    return ClipStore([tmp_path / "dark"], world_spec(robot, SIZE))
+
+
 @ROBOTS
 def test_every_chunk_that_was_begun_is_a_start(tiny_store: Stores, robot: Embodiment) -> None:
     store = tiny_store(robot)
@@ -42,6 +60,15 @@ def test_every_chunk_that_was_begun_is_a_start(tiny_store: Stores, robot: Embodi
         last = int(store.length[number]) - 1
         assert frame[owner == number].tolist() == list(range(0, last, store.spec.chunk))
     assert owner.unique_consecutive().tolist() == [3, 1]
+
+
+def test_nothing_begins_where_there_is_no_picture(dark: ClipStore) -> None:
+    seen, chunk = dark.arrays["present"], dark.spec.chunk
+    owner, frame = decision_points(dark, torch.arange(len(dark)))
+    assert bool(seen[dark.start[owner] + frame].all())
+    assert len(frame) < sum((int(n) - 2) // chunk + 1 for n in dark.length)
+    clips = dark.sample(torch.arange(len(dark)), 64, ClipSpec(2, chunk), torch.Generator().manual_seed(0))
+    assert bool(clips["memory", "present"][:, 0, -1].all())
 
 
 def test_no_episode_is_an_error_that_names_the_key(store: ClipStore) -> None:

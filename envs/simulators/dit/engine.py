@@ -163,8 +163,10 @@ class DiTSimulator(LatentWorld):
 
     def actions(self, inputs: TensorDict) -> Tensor:
         """See LatentWorld.actions."""
-        commands = torch.cat([inputs["memory", "commands"], inputs["future", "commands"]], 1)
-        return self.action_vector(commands, inputs["now", "command"])
+        now = inputs["now", "command"]
+        # Remembered frames lie apart: what changed on the way to each sums up to nothing.
+        led = self.action_vector(inputs["memory", "commands"].unsqueeze(2), now.unsqueeze(1)).squeeze(2)
+        return torch.cat([led, self.action_vector(inputs["future", "commands"], now)], 1)
 
     def conditioning(self, inputs: TensorDict, latent_hw: tuple[int, int]) -> Tensor:
         """See LatentWorld.conditioning; maps are averaged over the pixels of a latent."""

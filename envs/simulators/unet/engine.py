@@ -118,7 +118,7 @@ class UNetSimulator(Simulator):
 
     def fit_camera_statistics(self, frames: Tensor) -> None:
         """See Simulator.fit_camera_statistics."""
-        spread, mean = torch.std_mean(frames.to(self.mean.device).float() / 255, 0)
+        spread, mean = torch.std_mean(frames.to(self.mean.device).float() / 255, 0, correction=0)
         self.mean.copy_(mean)
         self.spread.copy_(spread)
 

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
-from actors.factory import build_judge, build_simulator, build_text_world
+from actors.factory import build_judge, build_simulator, build_state_decoder, build_text_world
 from actors.process import prepare_process
 from actors.weights import load
 from envs.episodes.clips import ClipStore
@@ -59,7 +59,8 @@ def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 @priced
 def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The judge on recorded and on generated frames; its threshold on recorded video that no judge learns
-    from. A judge without weights is only calibrated. One with a text world takes over what the role
+    from. A judge without weights is only calibrated. One that reads features sees those that the role `state`
+    makes of the simulator's, if there is one. One with a text world takes over what the role
     `text_world` has learned, and leaves it as it is.
 
     Settings: phase, first or refresh.
@@ -71,6 +72,8 @@ def judge(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     model, world = build_judge(cfg, inputs.weights("warm")), build_simulator(cfg, inputs.weights("simulator"))
     if golden := inputs.weights("text_world"):
         load(model.text_world, golden).requires_grad_(False)
+    if state := inputs.weights("state"):
+        build_state_decoder(cfg, world, state)
     model.attach(world)
     stats: dict[str, Any] = {}
     bf16 = cfg["simulator"]["bf16"]

@@ -107,3 +107,16 @@ def test_what_hardly_varies_is_told_by_the_spread_of_its_unit() -> None:
     assert varying(chunks, ARM_JOINTS).tolist() == [True, True, False, True, True, True, True]
     unknown = replace(ARM_JOINTS, action_kind=ActionKind.OTHER)
     assert bool(varying(chunks, unknown).all())
+
+
+def test_where_modes_are_taken_too_the_spread_does_not_learn() -> None:
+    torch.manual_seed(0)
+    head = ChunkGaussianHead(8, 4, 3, 2, 0.7, "absolute")
+    for share, learns in ((1.0, True), (0.5, False)):
+        head.share.fill_(share)
+        head.zero_grad(set_to_none=True)
+        dist = ChunkGaussian(**dict(zip(head.names, head(torch.randn(6, 8)), strict=True)))
+        dist.log_prob(dist.sample()).sum().backward()
+        moved = head.log_std.grad is not None and bool(head.log_std.grad.any())
+        assert moved == learns
+        assert head.mean.weight.grad is not None and bool(head.mean.weight.grad.any())

@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from actors.policies.chunk_tokens import ChunkTokens
 from actors.policies.contract import (
+    VISUAL_FEATURES,
     action_key,
     disagreement,
     distribution,
@@ -315,7 +316,7 @@ class Diverged(TensorDictModuleBase):
     [
         (BIMANUAL_POSES, ActionMode.RELATIVE, "zeros"),
         (BIMANUAL_POSES, ActionMode.ABSOLUTE, "command"),
-        (ARM_DELTAS, ActionMode.ABSOLUTE, "zeros"),
+        (ARM_DELTAS, ActionMode.ABSOLUTE, "gripper"),
     ],
 )
 def test_nan_never_reaches_a_world_and_text_reaches_the_policy(
@@ -325,11 +326,24 @@ def test_nan_never_reaches_a_world_and_text_reaches_the_policy(
     seen, policy = observations(spec, 3), Diverged(spec)
     out = SafePolicyWrapper(policy, spec, mode)(seen.clone())
     still = seen[COMMAND][0] if rests == "command" else torch.zeros(spec.action_dim)
+    if rests == "gripper":  # of changes it alone is not one
+        still[-1] = seen[COMMAND][0, -1]
     assert torch.equal(out[CHUNK][0], still.expand(spec.chunk, -1))
     assert bool((out[CHUNK][1:] == 1).all())
     assert out[INVALID_ACTION].flatten().tolist() == [True, False, False]
     assert policy.heard == bytes_to_text(seen[INSTRUCTION_UTF8])
     assert INSTRUCTION not in out.keys()  # rollouts carry numbers only
+
+
+def test_features_of_the_decision_before_are_not_handed_to_a_policy() -> None:
+    spec = world_spec(ARM_DELTAS)
+    policy = policy_of("chunk_gaussian", spec)
+    seen = observations(spec, 2)
+    seen[VISUAL_FEATURES] = torch.ones(2, 5)
+    given: list[bool] = []
+    policy.register_forward_pre_hook(lambda _, args: given.append(VISUAL_FEATURES in args[0].keys(True)))
+    SafePolicyWrapper(policy, spec, ActionMode.ABSOLUTE)(seen)
+    assert given == [False]
 
 
 def test_text_has_the_batch_of_a_rollout() -> None:

@@ -127,6 +127,18 @@ def test_pose_maps_are_those_of_the_commands(store: ClipStore, episodes: list[Ep
     assert torch.equal(store.pose_maps(rows), maps.transpose(0, 1))
 
 
+def test_cameras_on_wrists_stay_where_nobody_knows_where_changes_lead(tmp_path: Path) -> None:
+    cameras = [replace(camera, calibrated=True) for camera in ARM_DELTAS.at(SIZE).cameras]
+    cameras[1] = replace(cameras[1], wrist="arm")
+    robot = replace(ARM_DELTAS.at(SIZE), cameras=tuple(cameras))
+    moved = moving_square(robot, 0)
+    assert moved.c2w is not None
+    moved.c2w[:, 1, 0, 3] += np.arange(len(moved.c2w), dtype=np.float32)  # as imagination could not know
+    LeRobotWriter(tmp_path / "set", robot).write([moved])
+    c2w = ClipStore([tmp_path / "set"], world_spec(robot, SIZE)).arrays["c2w"]
+    assert torch.equal(c2w, c2w[:1].expand_as(c2w))
+
+
 def test_unlabelled_sets_have_no_success(tmp_path: Path) -> None:
     spec = world_spec(ARM_DELTAS.at(SIZE), SIZE)
     for name, labelled in (("told", True), ("untold", False)):

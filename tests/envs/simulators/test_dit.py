@@ -215,3 +215,13 @@ def test_one_token_tells_everybody_the_same() -> None:
     assert said.shape == (3, 1, 24) and torch.allclose(
         attention(asking, context), said.expand(-1, 5, -1), atol=1e-6
     )
+
+
+def test_of_remembered_changes_none_is_summed_up_with_others() -> None:
+    world = make("one_arm_deltas")
+    clips = clip(world.spec, 2, 3)
+    world.normalise(*(torch.randn(50, n) for n in (4, 4, 5)))
+    clips["future", "commands"][1] = clips["future", "commands"][0]
+    told = world.actions(build_inputs(world.spec, clips, 0))
+    assert not torch.equal(clips["memory", "commands"][0], clips["memory", "commands"][1])
+    assert torch.equal(told[0, 3:], told[1, 3:])

@@ -169,6 +169,17 @@ def test_grpo_compares_within_groups_and_drops_equal_ones() -> None:
         algorithm.seeds(5, 3, torch.Generator())
 
 
+def test_grpo_compares_whole_returns_also_with_episodes_that_have_ended() -> None:
+    spec = world_spec(ARM_DELTAS)
+    policy = policy_of("chunk_gaussian", spec)
+    algorithm = algorithm_of("grpo", policy, spec, group=2, normalise=False, shaped=False)
+    batch = rollout(policy, spec, [[1.0, 0.0], [0.0, 0.2]])
+    batch["next", "done"][0, 0] = True  # what its slot does after that belongs to no group
+    data, figures = algorithm.prepare(batch)
+    assert data["advantage"].flatten().tolist() == pytest.approx([0.4, -0.4, -0.4])
+    assert figures["groups_dropped"] == 0.0
+
+
 def test_grpo_stays_near_the_policy_it_began_with() -> None:
     spec = world_spec(ARM_DELTAS)
     distances = []

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from pipeline.evaluation.statistics import rate_entry
-from pipeline.stages.prove import too_kind
+from pipeline.stages.prove import _gap, too_kind
 
 
 def entry(imagined: int, true: int, episodes: int = 40) -> dict[str, Any]:
@@ -29,3 +29,10 @@ def test_without_several_tasks_all_starts_are_one() -> None:
     assert not too_kind({"tasks": {}, **entry(124, 86, 200)})  # kind, and usual
     assert not too_kind({"tasks": {}, **entry(5, 60, 200)})  # too strict teaches little, but nothing false
     assert not too_kind({"tasks": {}, **entry(4, 0, 5)})  # too few to tell
+
+
+def test_both_sides_of_a_gap_are_of_the_starts_that_could_be_judged() -> None:
+    truth = torch.arange(10) < 5
+    found = _gap(truth, truth, truth)  # the judge abstains wherever it failed
+    assert found["gap"] == 0.0 and found["true"] == found["imagined"] == rate_entry(truth[:5])
+    assert _gap(truth, truth, torch.zeros(10, dtype=torch.bool))["gap"] is None

@@ -193,3 +193,24 @@ def test_success_is_drawn_by_task_and_scene_of_a_variant(tmp_path: Path, cfg: di
     assert f"push, {one.scenes['push', 0]}: 1 of 2" in page
     alone = Success("success").read(cfg, [outcome(tmp_path / "three", [True, False])])
     assert Success("success").chart({"mine": alone}) == ""  # a suite without scenes
+
+
+def test_rows_are_ranked_on_seeds_that_they_share() -> None:
+    columns = {"speed": Speed("speed")}
+
+    def row(title: str, seed: int, frames: float | None) -> dict[str, Any]:
+        cell = None if frames is None else {"frames": frames}
+        return {
+            "row": title,
+            "place": "",
+            "title": title,
+            "seed": seed,
+            "cells": {"speed": {"batch 32": cell}},
+        }
+
+    rows = [row("a", 0, 60.0), row("a", 1, 40.0), row("b", 0, 55.0), row("b", 1, None)]
+    pooled = {"row": "a", "place": "", "title": "a", "seeds": {"speed": [0, 1]}}
+    table = {"rows": rows, "pooled": [pooled | {"cells": {"speed": {"batch 32": {"frames": 50.0}}}}]}
+    assert best_of(table, columns) == ["Best, of what was run: speed: a (seed 0)."]
+    cells = [line[1] for line in headlines(table, columns)[1:]]
+    assert cells == ["50 frames/s (seeds 0, 1)", "55 frames/s (seed 0)"]

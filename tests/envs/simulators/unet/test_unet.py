@@ -64,3 +64,9 @@ def test_sizes_that_squares_do_not_fill_are_refused(
 ) -> None:
     with pytest.raises((ValueError, ConfigError), match=said):
         unet(size, **options)
+
+
+def test_one_episode_is_enough_to_say_how_cameras_see() -> None:
+    world = unet((32, 32))
+    world.fit_camera_statistics(torch.full((1, world.spec.views, 3, 32, 32), 51, dtype=torch.uint8))
+    assert not bool(world.spread.any()) and float(world.mean.mean()) == pytest.approx(0.2)
