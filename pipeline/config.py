@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from omegaconf import OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
@@ -76,8 +78,9 @@ def offered(group: str, choice: str, overrides: Sequence[str]) -> bool:
 
 def composed(overrides: Sequence[str]) -> dict[str, Any]:
     """The resolved config, unchecked; an experiment's options of what was chosen are put in."""
+    words = [part for word in overrides for part in _replacing(word)]
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        made = compose("config", list(overrides), return_hydra_config=True)
+        made = compose("config", words, return_hydra_config=True)
     with open_dict(made):
         chosen, section = made.pop("hydra").runtime.choices, made.pop(IF_CHOSEN)
     given = [word.split("=")[0].lstrip("+~") for word in overrides]
@@ -95,6 +98,21 @@ def composed(overrides: Sequence[str]) -> dict[str, Any]:
     plain = OmegaConf.to_container(made, resolve=True)
     assert isinstance(plain, dict)
     return {str(key): value for key, value in plain.items()}
+
+
+def _replacing(word: str) -> list[str]:
+    """What Hydra is told instead of an override: one that names another class (`_target_`) replaces the whole
+    section, as the options of two classes do not mix.
+    """
+    key, _, value = word.partition("=")
+    if "_target_" not in value or key.startswith(("+", "~")) or key in groups():
+        return [word]
+    try:
+        said = OverridesParser.create().parse_override(word).value()
+    except HydraException:  # is told when all of it is composed
+        return [word]
+    # Hydra merges a mapping into one that is there, and refuses keys that this one has not
+    return [f"{key}=null", word] if isinstance(said, Mapping) and "_target_" in said else [word]
 
 
 def _of_chosen(section: Any, chosen: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:

@@ -221,7 +221,9 @@ def add_world(graph: Graph, cfg: Cfg, data: list[str], before: World, number: in
     golden = ""
     if "text_world" in cfg["judge"]:
         roles = {"data": data, "warm": before.text_world}
-        golden = graph.add(f"text_world-{number}", judging.text_world, roles, phase=phase)
+        golden = graph.add(
+            f"text_world-{number}", judging.text_world, roles, phase=phase, **judge_files(cfg, "text_world")
+        )
     kind: Any = target(cfg["judge"], "judge")
     mixed = state if kind.reads_features else ""  # it mixes the features that such a judge reads
     roles = {**inputs, "warm": before.judge, "text_world": golden, "state": mixed}

@@ -60,13 +60,19 @@ def fingerprint(paths: list[str], key: str = "task.data") -> str:
     return digest(marks)
 
 
-def judge_files(cfg: Cfg) -> dict[str, Any]:
+def judge_files(cfg: Cfg, part: str = "") -> dict[str, Any]:
     """A setting with the hashes of files that decide what the judge says, if there are any: when one changes,
     what it judged is out of date.
+
+    Args:
+        part: of section judge, such as text_world, whose files alone are meant; "" means all.
     """
     kind: Any = target(cfg["judge"], "judge")
-    found = {path.name: digest_of(path) for path in kind.files(cfg["judge"])}
-    return {"files": found} if found else {}
+    found: dict[str, list[str]] = {}
+    for path in kind.files(cfg["judge"][part] if part else cfg["judge"]):
+        found.setdefault(path.name, []).append(_whole(path, _stat(path)))
+    # by name, as a file may move; those of one name, in two folders, count in the options' order
+    return {"files": {name: " ".join(marks) for name, marks in found.items()}} if found else {}
 
 
 def files_at(cfg: Cfg, *keys: str) -> dict[str, Any]:
@@ -95,6 +101,11 @@ def _stat(path: Path) -> tuple[int, int]:
     """Size and time of the last change; within a process, a file of the same is not read again."""
     about = path.stat()
     return about.st_size, about.st_mtime_ns
+
+
+@functools.cache
+def _whole(path: Path, stat: tuple[int, int]) -> str:
+    return digest_of(path)
 
 
 @functools.cache

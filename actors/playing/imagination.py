@@ -16,6 +16,7 @@ from envs.geometry.kinematics import Kinematics
 from envs.initial_states import InitialStates
 from envs.physics.suite import Observation
 from envs.specs import CHUNK, COMMAND, PROGRESS, SUCCESS, WorldSpec, to_chunk
+from envs.transforms import JudgeReward
 
 
 class Imagined(NamedTuple):
@@ -38,6 +39,7 @@ class ImaginedSide:
 
     def __init__(self, env: TransformedEnv):
         self.env, self.world = env, env.base_env
+        self._judging = next(t for t in env.transform if isinstance(t, JudgeReward))
         self._now = TensorDict({}, [1])
         self.success = False
 
@@ -62,12 +64,13 @@ class ImaginedSide:
         """Carry out commands [L, A], L at most a chunk.
 
         The world makes whole chunks: of fewer commands the last is repeated, and what came of the repetition
-        did not happen.
+        did not happen, nor is it judged.
         """
         count, chunk = len(actions), self.chunk
         commands = torch.from_numpy(actions).float()
         whole = torch.cat([commands, commands[-1:].expand(chunk - count, -1)])[None].to(self.env.device)
         self._now[CHUNK] = to_chunk(whole, self._now[COMMAND], self.world.mode)
+        self._judging.counted = count
         after = self.env.step(self._now)
         frames = self.world.video(0)[-chunk:][:count].numpy()
         self.world.session["length"] -= chunk - count

@@ -6,8 +6,8 @@ The server sees pictures, the robot's state, and the instruction, and says a chu
 from __future__ import annotations
 
 import socket
-from typing import Any, ClassVar
-from urllib.parse import urlparse
+from typing import Any, ClassVar, Literal
+from urllib.parse import ParseResult, urlparse
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from envs.conditioning.joint_commands import JointCommands
+from envs.embodiment import Embodiment
 from envs.geometry.kinematics import Kinematics
 from envs.specs import (
     CHUNK,
@@ -39,34 +40,48 @@ class OpenPIPolicy(TensorDictModuleBase):
     """Asks an openpi server for every chunk.
 
     Args:
-        spec: of the worlds; longer answers are compressed to its chunk, as GE-Sim does.
-        url: ws://host:port.
+        spec: of the worlds.
+        url: ws://host:port or wss://host, whose path and query are kept.
         mode: of the world's chunks.
         joints: whether the server says joints of a robot whose actions are end-effector poses; they go
             through the robot's kinematics.
         grippers_last: whether the server wants the state's grippers behind all its other numbers, as GE-Sim's
-            policies do; the state must then hold the numbers of a command.
+            policies do; in the state they must have the names that they have in an action.
+        longer: what becomes of answers longer than the spec's chunk. "first" takes their first rows,
+            "compress" makes one chunk of all of them, as GE-Sim 2.0 does, so that the robot moves that much
+            faster.
 
     Raises:
-        PolicyServerError: if nobody listens there.
+        PolicyServerError: if nobody listens there, or an option cannot be with this robot.
         EmbodimentError: if joints are of no use to this robot.
     """
 
     in_keys: ClassVar[list[Any]] = [IMAGE, STATE, COMMAND, INSTRUCTION_UTF8]
     out_keys: ClassVar[list[Any]] = [CHUNK]
 
-    def __init__(self, spec: WorldSpec, url: str, mode: str, joints: bool, grippers_last: bool):
+    def __init__(
+        self,
+        spec: WorldSpec,
+        url: str,
+        mode: str,
+        joints: bool,
+        grippers_last: bool,
+        longer: Literal["first", "compress"],
+    ):
         super().__init__()
-        place, robot = urlparse(url), spec.embodiment
-        if place.scheme not in ("ws", "wss") or not place.hostname:
+        robot, place = spec.embodiment, _address(url)
+        if longer not in ("first", "compress"):
+            raise PolicyServerError(f"policy.longer={longer!r} must be first or compress")
+        if longer == "compress" and robot.delta:
             raise PolicyServerError(
-                f"policy.url={url!r} must be the address of an openpi server, such as ws://127.0.0.1:8000"
+                f"policy.longer=compress averages targets, and actions of {robot.robot} are changes, which"
+                " would have to be added up; set policy.longer=first"
             )
         if joints and robot.kinematics is None:
             raise PolicyServerError(
                 f"policy.joints=true needs the kinematics of {robot.robot}; set simulator.kinematics"
             )
-        self.spec, self.url, self.mode = spec, url, ActionMode(mode)
+        self.spec, self.url, self.mode, self.longer = spec, url, ActionMode(mode), longer
         self.to_poses = (
             JointCommands(robot, Kinematics(robot.kinematics)) if joints and robot.kinematics else None
         )
@@ -76,9 +91,9 @@ class OpenPIPolicy(TensorDictModuleBase):
             if self.to_poses is None
             else (self.to_poses.size, self.to_poses.grippers)
         )
-        last = [k for k in self.grippers if k < robot.state_dim] if grippers_last else []
+        last = _grippers_in_state(robot) if grippers_last else []
         self.state_order = [k for k in range(robot.state_dim) if k not in last] + last
-        self._client = _connect(f"{place.scheme}://{place.hostname}", place.port)
+        self._client = _connect(place)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the chunk float32 [B, K, A]."""
@@ -112,7 +127,8 @@ class OpenPIPolicy(TensorDictModuleBase):
                 f"{self.url} answered actions of shape {actions.shape}, wanted at least {chunk} finite rows"
                 f" of {self.width} numbers"
             )
-        rows = compress(torch.from_numpy(np.array(actions)), chunk, self.grippers)
+        rows = torch.from_numpy(np.array(actions))
+        rows = compress(rows, chunk, self.grippers) if self.longer == "compress" else rows[:chunk]
         return rows if self.to_poses is None else self.to_poses(rows)
 
 
@@ -130,13 +146,47 @@ def compress(commands: Tensor, count: int, grippers: tuple[int, ...]) -> Tensor:
     return out
 
 
-def _connect(host: str, port: int | None) -> Any:
+def _grippers_in_state(robot: Embodiment) -> list[int]:
+    """Positions of the grippers in the state, found by the names that they have in an action; commands of
+    joints keep the robot's own grippers.
+
+    Raises:
+        PolicyServerError: if the state has no such names.
+    """
+    names = [robot.action_names[k] for k in robot.grippers]
+    if missing := [name for name in names if name not in robot.state_names]:
+        raise PolicyServerError(
+            f"policy.grippers_last=true looks for the grippers {missing} of {robot.robot} in its state, which"
+            f" has {list(robot.state_names)}; set policy.grippers_last=false"
+        )
+    return [robot.state_names.index(name) for name in names]
+
+
+def _address(url: str) -> ParseResult:
+    """A websocket's address.
+
+    Raises:
+        PolicyServerError: if it is none.
+    """
+    try:
+        place = urlparse(url)
+        valid = place.scheme in ("ws", "wss") and bool(place.hostname) and place.port != 0
+    except ValueError:  # a port that is no port
+        valid = False
+    if not valid:
+        raise PolicyServerError(
+            f"policy.url={url!r} must be the address of an openpi server, such as ws://127.0.0.1:8000"
+        )
+    return place
+
+
+def _connect(place: ParseResult) -> Any:
     """openpi's own client; it waits for a server for ever, so whether one listens is asked before."""
     from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
-    name = urlparse(host).hostname or ""
+    host, port = place.hostname or "", place.port or (443 if place.scheme == "wss" else 80)
     try:
-        socket.create_connection((name, port or 80), timeout=10).close()
+        socket.create_connection((host, port), timeout=10).close()
     except OSError as error:
         raise PolicyServerError(f"no openpi server listens at {host}:{port} ({error})") from error
-    return WebsocketClientPolicy(host, port)
+    return WebsocketClientPolicy(place.geturl())

@@ -165,7 +165,8 @@ class Server:
             if meta.get(name) is not None
         }
         async with session.lock:
-            # the released order of calls is data, then trajectory; either order works
+            # The released order of calls is data, then trajectory; either order works, and a trajectory that
+            # came first begins with the episode.
             traj, c2w = session.traj, session.c2w
             session.restart()
             session.first, session.frame_size = frame, (height, width)
@@ -196,6 +197,7 @@ class Server:
         maps = await asyncio.to_thread(read)
         async with session.lock:
             session.traj, session.c2w = maps, np.ascontiguousarray(c2w)
+            session.traj_begin = session.frames
         return json_answer(200, {"success": True})
 
     async def step(self, request: web.Request) -> web.Response:

@@ -24,6 +24,8 @@ class Session:
     Attributes:
         number: counts sessions as they were opened; the page names it, the client_id is a secret.
         intrinsic: in pixels of the client's pictures, whose size is `frame_size`.
+        traj_begin: frames that there were when the trajectory (`traj`, `c2w`) was sent: its first row is that
+            of the frame after them.
         bound: whether it ends soon after the connection that last used it is lost; else only when it is idle.
         reply: chunk number, request and answer of the last step, for a client that asks again.
     """
@@ -44,6 +46,7 @@ class Session:
     command: NDArray[np.float32] | None = None
     traj: NDArray[np.uint8] | None = None
     c2w: NDArray[np.float32] | None = None
+    traj_begin: int = 0
     state: TensorDict | None = None
     chunk: int = 0
     frames: int = 0
@@ -62,7 +65,7 @@ class Session:
         """Forget the episode; cameras stay."""
         self.first = self.joints = self.command = self.traj = self.c2w = self.state = self.reply = None
         self.last_action = self.last_state = None
-        self.chunk = self.frames = 0
+        self.chunk = self.frames = self.traj_begin = 0
 
 
 def needs_cameras(spec: WorldSpec) -> bool:
@@ -74,16 +77,15 @@ def next_chunk(session: Session, commands: Tensor, spec: WorldSpec) -> TensorDic
     """What Simulator.step takes of one session, [1], under commands [L, A].
 
     The last command is repeated up to a chunk; of pose maps and cameras it is the part of the trajectory that
-    belongs to the chunk.
+    belongs to the chunk, whether a whole recording was sent once or a part of it for each step. Beyond its
+    end the last row is repeated.
     """
     commanded, chunk = len(commands), spec.chunk
     last = commands[-1:].expand(chunk - commanded, -1)
     future = {"commands": torch.cat([commands, last])[None]}
     if needs_cameras(spec):
         assert session.traj is not None and session.c2w is not None
-        # a whole recording, or all of what was sent for this step
-        total = len(session.traj)
-        begin = session.chunk * chunk if total >= 2 * chunk else 0
+        total, begin = len(session.traj), session.frames - session.traj_begin
         rows = np.minimum(np.minimum(np.arange(begin, begin + chunk), begin + commanded - 1), total - 1)
         future["c2w"] = torch.from_numpy(session.c2w[rows])[None]
         if spec.pose_map:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from envs.conditioning import PoseMapStyle, end_effector_poses, render_pose_map
+from envs.episodes.angles import check_radians, turned_steadily
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.episodes.formats.lerobot_robot import cameras_without_columns
@@ -35,7 +36,7 @@ from envs.manifest import check_part
 from envs.specs import WorldSpec
 
 log = logging.getLogger(__name__)
-_FORM = "5"  # changes when what a cache holds does
+_FORM = "6"  # changes when what a cache holds does
 
 
 @dataclass
@@ -236,7 +237,7 @@ class _Builder:
     def _numbers(self, episode: Episode) -> dict[str, NDArray[Any]]:
         unlabelled = np.zeros(len(episode), bool)
         numbers: dict[str, NDArray[Any]] = {
-            "commands": episode.commands,
+            "commands": turned_steadily(self.spec.embodiment, episode.commands),
             "states": episode.states,
             "success": unlabelled if episode.success is None else episode.success,
             "present": episode.present,
@@ -251,6 +252,8 @@ class _Builder:
             return torch.from_numpy(episode.poses)
         if not self.spec.embodiment.commands_poses:
             return None
+        if self.kinematics is not None:
+            check_radians(self.spec.embodiment, episode.commands, self.data.root)
         return end_effector_poses(self.spec.embodiment, torch.from_numpy(episode.commands), self.kinematics)
 
     def _cameras(self, episode: Episode) -> Tensor:

@@ -2,8 +2,8 @@
 
 A data set says it in LeRobot's own field, info.json's `splits`: a name and a range of episodes, such as
 {"train": "0:40,56:60", "held_out": "40:48", "calibration": "48:56"}; more than one range where episodes were
-appended later. A set that knows only "train", as LeRobot writes it, is divided by episode number: every
-eighth is held out, every fourth calibrates.
+appended later. A set that knows only "train", as LeRobot writes it, is divided by episode number: of every
+eight one is held out and two calibrate.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Set
 from pathlib import Path
+from zlib import crc32
 
 from envs.episodes.episode import EpisodeError
 from envs.episodes.formats.lerobot_files import read_info
@@ -100,6 +101,9 @@ def extend_splits(splits: Mapping[str, str], name: str, before: int, count: int)
 
 
 def _by_number(number: int) -> str:
-    if number % 8 == 7:
+    block, place = divmod(number, 8)
+    # Turned from one eight to the next: tasks that were recorded by turns would each be in one split alone.
+    turned = (place - crc32(str(block).encode()) * (block > 0)) % 8
+    if turned == 7:
         return "held_out"
-    return "calibration" if number % 4 == 2 else TRAIN
+    return "calibration" if turned % 4 == 2 else TRAIN

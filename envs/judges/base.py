@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -161,10 +161,17 @@ class Judge(nn.Module):
 
     @classmethod
     def files(cls, options: Mapping[str, Any]) -> tuple[Path, ...]:
-        """Files whose contents decide judgements, by options that name one: when they change, what was made
-        with the judge is out of date.
+        """Files whose contents decide judgements, by options, however deep, that name one or a folder, whose
+        own files count: when they change, what was made with the judge is out of date.
         """
-        return tuple(Path(value) for value in options.values() if isinstance(value, str) and _is_file(value))
+        return tuple(path for value in _texts(options) for path in _files_at(value))
+
+    @classmethod
+    def decisive(cls, options: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The part of the options (section judge) that decides judgements; when any of the others changes,
+        what was made with the judge stays as it is.
+        """
+        return options
 
     @classmethod
     def spent(cls, options: Mapping[str, Any]) -> dict[str, float]:
@@ -204,11 +211,25 @@ class Judge(nn.Module):
         return done.any(1)
 
 
-def _is_file(name: str) -> bool:
+def _texts(options: Any) -> Iterator[str]:
+    """The texts among options, however deep."""
+    if isinstance(options, str):
+        yield options
+    elif isinstance(options, (Mapping, list, tuple)):
+        for value in options.values() if isinstance(options, Mapping) else options:
+            yield from _texts(value)
+
+
+def _files_at(name: str) -> list[Path]:
+    """The file of this name, or the files that lie directly in that folder; hidden ones are no part of it."""
+    path = Path(name)
     try:
-        return Path(name).is_file()
-    except OSError:  # too long for a name
-        return False
+        if name and path.is_dir():
+            inside = sorted(path.iterdir())
+            return [one for one in inside if one.is_file() and not one.name.startswith(".")]
+        return [path] if path.is_file() else []
+    except OSError:  # too long for a name, or a folder of somebody else's
+        return []
 
 
 def judgement_status(success: Tensor) -> Tensor:

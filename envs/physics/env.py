@@ -67,7 +67,7 @@ class PhysicsEnv(ChunkedEnv):
             pool.close()
             raise
         self.pool, self.rewards, self.record = pool, rewards, record
-        self.tracks: deque[Track] = deque()
+        self.tracks: deque[tuple[int, Track]] = deque()  # and the slots that they were played in
         self._rows: dict[int, dict[str, Any]] = {}
         self._lost = torch.zeros(pool.slots, 1, dtype=torch.bool)
 
@@ -134,7 +134,7 @@ class PhysicsEnv(ChunkedEnv):
         for slot, values in observed.items():
             track = values.pop("track", None)
             if track is not None:
-                self.tracks.append(track)
+                self.tracks.append((slot, track))
             self._rows[slot] = values
 
     def _observation(self) -> TensorDict:
@@ -156,10 +156,10 @@ class PhysicsEnv(ChunkedEnv):
         return self._with_identity(out, [row["instruction"] for row in rows])
 
     def pop_tracks(self) -> list[Track]:
-        """Finished recorded episodes since the last call, sorted by seed."""
-        tracks = sorted(self.tracks, key=lambda track: track.seed)
+        """Finished recorded episodes since the last call, sorted by seed; of those of one seed, by slot."""
+        played = sorted(self.tracks, key=lambda one: (one[1].seed, one[0]))
         self.tracks.clear()
-        return tracks
+        return [track for _, track in played]
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """End the worker processes."""

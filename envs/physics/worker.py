@@ -42,7 +42,7 @@ class Track:
     privileged: dict[str, list[Any]] = field(default_factory=dict)
 
     def add(self, suite: TaskSuite, observed: Observation) -> None:
-        """Append things as they stand now."""
+        """Append things as they stand now; suites may hand out memory that goes on changing."""
         row = {
             "frames": rendered(suite),
             "commands": observed.command,
@@ -53,9 +53,9 @@ class Track:
         }
         for name, value in row.items():
             if value is not None:
-                self.rows.setdefault(name, []).append(value)
+                self.rows.setdefault(name, []).append(np.array(value))
         for name, value in {"progress": observed.progress, **suite.privileged()}.items():
-            self.privileged.setdefault(name, []).append(value)
+            self.privileged.setdefault(name, []).append(np.array(value))
 
     def __len__(self) -> int:
         return len(self.rows["frames"])

@@ -29,11 +29,16 @@ class JudgeReward(Transform):
         rewards: turns progress and success into a number.
         later: do not wait for judgements. Episodes then run to their horizon, and `settle` writes rewards and
             ends into the finished rollout; what a slot did after its success belongs to no episode.
+
+    Attributes:
+        counted: frames of the next steps that are judged, the first ones; None means all. What comes after
+            them did not happen.
     """
 
     def __init__(self, judge: Judge, rewards: Rewards, later: bool = False):
         super().__init__(in_keys=[FRAMES], out_keys=["reward", SUCCESS, PROGRESS, JUDGE_STATUS])
         self.judge, self.rewards, self.later = judge, rewards, later
+        self.counted: int | None = None
         self._tickets: list[Any] = []
         self._opening = (torch.zeros(0, 1), torch.zeros(0, dtype=torch.int64))
         self._run = torch.zeros(0, dtype=torch.int64)
@@ -42,7 +47,8 @@ class JudgeReward(Transform):
         self._first = torch.zeros(0, dtype=torch.uint8)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        clips = [next_tensordict[FRAMES], self._first, self.parent.base_env.instructions]
+        frames = next_tensordict[FRAMES][:, : self.counted]
+        clips = [frames, self._first, self.parent.base_env.instructions]
         if self.judge.reads_features:
             clips.append(pooled(next_tensordict[FEATURES])[:, None])
         if self.later:

@@ -28,7 +28,7 @@ from envs.specs import (
 )
 from envs.targets import ConfigError
 from learners.stages.observed import observe
-from learners.stages.pictures import augment
+from learners.stages.pictures import augmented
 from learners.stages.simulator import last_rows
 from learners.training.fit import FitConfig, fit
 from learners.training.parallel import Trainee
@@ -105,19 +105,21 @@ class Cloning:
             out["generated", IMAGE] = made["frames"]
         return out
 
-    def disturbed(self, observed: TensorDict, generator: torch.Generator) -> TensorDict:
-        """Observations [N] whose colours and states are disturbed a little, for robustness."""
-        out = observed.copy()
+    def disturbed(self, observed: TensorDict, generator: torch.Generator) -> tuple[TensorDict, Tensor]:
+        """Observations [N] whose pictures and states are disturbed a little, for robustness; and by how much
+        things in pictures have moved, float32 [N, 2], (u, v) as shares of width and height.
+        """
+        out, moved = observed.copy(), torch.zeros(len(observed), 2)
         if IMAGE in out.keys(True, True):
-            out[IMAGE] = augment(out[IMAGE], generator)
+            out[IMAGE], moved = augmented(out[IMAGE], generator)
         state = out[STATE]
         noise = torch.randn(state.shape, generator=generator) * self.state_noise
         out[STATE] = state + noise.to(state.device)
-        return out
+        return out, moved
 
     def loss(self, data: TensorDict, generator: torch.Generator) -> Tensor:
         """Imitation loss of a batch of `sample`; pictures and states are disturbed a little."""
-        observed = self.disturbed(data["observed"], generator)
+        observed, _ = self.disturbed(data["observed"], generator)
         total = imitation_loss(self.policy, with_text(observed, self.policy), data["target"])
         if "generated" not in data.keys():
             return total

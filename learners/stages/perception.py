@@ -132,9 +132,11 @@ def train_perception(
         return TensorDict({"observed": observe(store, frames.rows[pick]), **data}, [])
 
     def loss(data: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
-        observed = frames.disturbed(data["observed"], generator)
-        seen = with_text(observed, policy)  # type: ignore[arg-type]
-        return tasks.loss(seen, data["target"], data["progress"], data.get("hands", None))
+        observed, moved = frames.disturbed(data["observed"], generator)
+        seen, hands = with_text(observed, policy), data.get("hands", None)  # type: ignore[arg-type]
+        if hands is not None:  # in a shifted picture they are seen elsewhere
+            hands = hands + moved.to(hands.device)[:, None, None]
+        return tasks.loss(seen, data["target"], data["progress"], hands)
 
     # A policy is a list of parts that are asked for more than their forward pass.
     trainee = Trainee(tasks, apart=False)

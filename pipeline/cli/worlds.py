@@ -79,7 +79,7 @@ def rewards(words: Words) -> None:
     [rewards=[learned,proxy,embedding,golden_goal,rule]] [episodes=64] [variants=[out_of_domain]]
     experiment=...
     """
-    from pipeline.config import choices, load_config
+    from pipeline.config import choices, load_config, read_config
 
     own, rest = {"rewards": "learned,proxy,embedding,golden_goal,rule", "episodes": "64", "variants": ""}, []
     for word in words:
@@ -99,10 +99,13 @@ def rewards(words: Words) -> None:
     from pipeline.graph.owner import owning
     from pipeline.track import tracking
 
-    others = [word for word in rest if not word.startswith(("judge=", "judge."))]
-    configs = {name: load_config([*others, f"judge={name}"]) for name in names if name != "rule"}
-    for name, other in configs.items():  # what is said of the run's own judge by judge.<option> stays said
-        configs[name] = cfg if other["judge"]["_target_"] == cfg["judge"]["_target_"] else other
+    others = [word for word in rest if not word.lstrip("+~").startswith(("judge=", "judge."))]
+    # What judge.<option> says is said of the run's own judge; two choices may share a class.
+    chosen = read_config([word for word in rest if not word.lstrip("+~").startswith("judge.")])["judge"]
+    configs = {}
+    for name in (name for name in names if name != "rule"):
+        asked = [*others, f"judge={name}"]
+        configs[name] = cfg if read_config(asked)["judge"] == chosen else load_config(asked)
     if "rule" in names:
         configs["rule"] = cfg
     variants = listed(own["variants"]) if own["variants"] else list(cfg["task"].get("variants", {}))

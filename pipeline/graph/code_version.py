@@ -1,4 +1,5 @@
-"""The version of a stage's code: hashes of every source file that its module imports, directly or not.
+"""The version of a stage's code: hashes of every source file that its module imports, directly or not, and of
+descriptions and texts that lie beside one, such as a robot's.
 
 Imports are found in the syntax tree, also those inside functions, so nothing is run. Comments, docstrings and
 formatting do not count. Installed packages count by their version.
@@ -18,6 +19,7 @@ from typing import Any
 from envs.targets import ROOMS
 
 ROOT = Path(__file__).resolve().parents[2]
+_BESIDE = ("*.xml", "*.txt")
 _INSTALLED = ("site-packages", "dist-packages")
 
 
@@ -31,7 +33,7 @@ def code_of(module: str, config: Mapping[str, Any]) -> dict[str, str]:
     out: dict[str, str] = {}
     for name in sorted({module, *(target.rpartition(".")[0] for target in targets(config))}):
         for found in _closure(name):
-            out |= _version(found)
+            out |= _version(found) | _beside(found)
     return out
 
 
@@ -134,12 +136,26 @@ def _file_hash(path: Path) -> str:
     return digest(ast.dump(tree))
 
 
+@cache
+def _beside(module: str) -> dict[str, str]:
+    """{path: hash} of what lies beside a package's module and is no Python, but read by it."""
+    path = _source(module)
+    # a module without a package may lie among anything
+    if path is None or not ("." in module or path.name == "__init__.py"):
+        return {}
+    found = sorted(one for pattern in _BESIDE for one in path.parent.glob(pattern))
+    return {_name(one): hashlib.sha256(one.read_bytes()).hexdigest()[:12] for one in found}
+
+
+def _name(path: Path) -> str:
+    return str(path.relative_to(ROOT)) if path.is_relative_to(ROOT) else str(path)
+
+
 def _version(module: str) -> dict[str, str]:
     """{path: hash} of a module that has sources here, {distribution: version} of an installed one."""
     path = _source(module)
     if path is not None:
-        name = str(path.relative_to(ROOT)) if path.is_relative_to(ROOT) else str(path)
-        return {name: _file_hash(path)}
+        return {_name(path): _file_hash(path)}
     top = module.split(".")[0]
     if top in ROOMS:
         return {}

@@ -11,6 +11,7 @@ from typing import Any
 from tqdm import tqdm
 
 from envs.manifest import check, read_manifest
+from envs.targets import target
 from learners.training.checkpoint import clear_checkpoints
 from pipeline.graph.artefact import Identity, finish
 from pipeline.graph.clock import WorkClock
@@ -87,7 +88,10 @@ class Graph:
         read = sections(self.cfg, stage.reads_of(settings))
         identity = Identity(
             stage=name,
-            config={path: digest(json.dumps(value, sort_keys=True)) for path, value in read.items()},
+            config={
+                path: digest(json.dumps(_decisive(path, value), sort_keys=True))
+                for path, value in read.items()
+            },
             settings=settings,
             parents={parent: self.key(parent) for parent in parents},
             roles={role: list(_names(names)) for role, names in roles.items()},
@@ -218,6 +222,14 @@ class Graph:
 
 def _names(names: str | Sequence[str]) -> tuple[str, ...]:
     return (names,) if isinstance(names, str) else tuple(names)
+
+
+def _decisive(path: str, section: Any) -> Any:
+    """The part of a section that decides what comes out of a stage that reads it."""
+    if path != "judge" or not isinstance(section, Mapping) or "_target_" not in section:
+        return section
+    kind: Any = target(section, "judge")
+    return kind.decisive(section) if hasattr(kind, "decisive") else section
 
 
 def _brief(result: Mapping[str, Any]) -> str:

@@ -234,7 +234,8 @@ def run_recorded(cfg: Cfg, policy: Any, seeds: list[int], stochastic: bool = Tru
                 label="deploy",
                 sampling_seed=cfg["seed"] * 1000 + begin,
             )
-            tracks = {track.seed: track for track in env.pop_tracks()}
+            # Slots beyond the last episode play it again; the first one counts, as it does in `evaluate`.
+            tracks = {track.seed: track for track in reversed(env.pop_tracks())}
             yield [tracks[seed] for seed in part if seed in tracks]
     finally:
         env.close()

@@ -18,7 +18,7 @@ from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import (
     POLICY,
-    WORLD,
+    SIMULATOR,
     Cfg,
     demonstrations,
     fit_options,
@@ -50,7 +50,7 @@ def imitation(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return {**_both(stats, seen), "demos": len(demos)}
 
 
-@stage(reads=(*WORLD, "policy", "imitation", "clone", "microbatches"), place=Place.LEARNERS)
+@stage(reads=(*SIMULATOR, "policy", "imitation", "clone"), place=Place.LEARNERS)
 def clone(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The deployed policy, perception and all, learns from what worked in physics, and to see generated
     pictures as it sees true ones.

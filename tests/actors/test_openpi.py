@@ -22,6 +22,7 @@ from envs.geometry.kinematics import Kinematics
 from envs.specs import CHUNK, COMMAND, IMAGE, STATE, WorldSpec
 from tests.arms import two_arms
 from tests.embodiments import (
+    ARM_DELTAS,
     ARM_JOINTS,
     BIMANUAL_JOINTS,
     BIMANUAL_POSES,
@@ -36,8 +37,10 @@ class PolicyServer:
 
     def __init__(self, act: Callable[[dict[str, Any]], Any]):
         self.seen: list[dict[str, Any]] = []
+        self.paths: list[str] = []
 
         def talk(socket: Any) -> None:
+            self.paths.append(socket.request.path)
             pack = msgpack_numpy.Packer()
             socket.send(pack.pack({"name": "test"}))
             for message in socket:
@@ -65,8 +68,11 @@ def still() -> Iterator[PolicyServer]:
     server.server.shutdown()
 
 
-def ask(spec: WorldSpec, url: str, mode: str, joints: bool = False) -> tuple[TensorDict, OpenPIPolicy]:
-    policy = OpenPIPolicy(spec, url, mode, joints, grippers_last=True)
+def ask(
+    spec: WorldSpec, url: str, mode: str, joints: bool = False, **options: Any
+) -> tuple[TensorDict, OpenPIPolicy]:
+    given = {"grippers_last": True, "longer": "first"} | options
+    policy = OpenPIPolicy(spec, url, mode, joints, **given)
     return policy(observations(spec, 2)), policy
 
 
@@ -104,6 +110,52 @@ def test_pose_worlds_get_poses_through_the_kinematics(still: PolicyServer, tmp_p
         ask(world_spec(BIMANUAL_POSES), still.url, "absolute", joints=True)
 
 
+def test_grippers_are_found_in_the_state_by_name(still: PolicyServer) -> None:
+    names = BIMANUAL_JOINTS.state_names
+    turned = replace(BIMANUAL_JOINTS, state_names=(*names[8:], *names[:8]))  # the right arm first
+    said, _ = ask(world_spec(turned), still.url, "absolute")
+    state = said[STATE][0].tolist()
+    shown = still.seen[0]["observation.state"].tolist()
+    assert shown == pytest.approx([*state[:7], *state[8:15], state[15], state[7]])
+    nameless = replace(ARM_JOINTS, state_names=(*ARM_JOINTS.state_names[:6], "opening"))
+    with pytest.raises(PolicyServerError, match=r"gripper\.pos.*policy\.grippers_last=false"):
+        ask(world_spec(nameless), still.url, "absolute")
+    said, _ = ask(world_spec(nameless), still.url, "absolute", grippers_last=False)
+    assert still.seen[-2]["observation.state"].tolist() == pytest.approx(said[STATE][0].tolist())
+
+
+def test_of_longer_answers_the_first_rows_are_taken_unless_asked_otherwise() -> None:
+    rows = np.repeat(np.arange(10, dtype=np.float32)[:, None], 16, 1)
+    server = PolicyServer(lambda _: {"actions": rows})
+    spec = world_spec(BIMANUAL_JOINTS)
+    said, _ = ask(spec, server.url, "absolute")
+    assert said[CHUNK][0, :, 0].tolist() == [0.0, 1.0, 2.0, 3.0]
+    said, _ = ask(spec, server.url, "absolute", longer="compress")
+    assert torch.equal(said[CHUNK][0], compress(torch.from_numpy(rows), 4, (7, 15)))
+    with pytest.raises(PolicyServerError, match=r"set policy\.longer=first"):
+        ask(world_spec(ARM_DELTAS), server.url, "absolute", grippers_last=False, longer="compress")
+    with pytest.raises(PolicyServerError, match=r"policy\.longer='last'"):
+        ask(spec, server.url, "absolute", longer="last")
+    server.server.shutdown()
+
+
+def test_the_whole_url_reaches_the_server(still: PolicyServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = world_spec(BIMANUAL_JOINTS)
+    ask(spec, f"{still.url}/policies/pi?robot=2", "absolute")
+    assert still.paths == ["/policies/pi?robot=2"]
+    tried: list[tuple[str, int]] = []
+
+    def refuse(address: tuple[str, int], timeout: float) -> None:
+        tried.append(address)
+        raise ConnectionRefusedError("nobody")
+
+    monkeypatch.setattr("socket.create_connection", refuse)
+    for url in ("wss://policy.test/pi", "ws://policy.test", "wss://policy.test:8443"):
+        with pytest.raises(PolicyServerError, match="no openpi server listens"):
+            ask(spec, url, "absolute")
+    assert tried == [("policy.test", 443), ("policy.test", 80), ("policy.test", 8443)]
+
+
 def test_long_chunks_are_compressed_as_gesim_does() -> None:
     rows = torch.stack([torch.arange(10.0), torch.arange(10.0)], 1)
     made = compress(rows, 4, (1,))
@@ -127,5 +179,6 @@ def test_what_a_policy_server_may_get_wrong() -> None:
         server.server.shutdown()
     with pytest.raises(PolicyServerError, match="no openpi server listens"):
         ask(spec, "ws://127.0.0.1:9", "absolute")
-    with pytest.raises(PolicyServerError, match="address of an openpi server"):
-        ask(spec, "", "absolute")
+    for url in ("", "ws://127.0.0.1:99999"):
+        with pytest.raises(PolicyServerError, match="address of an openpi server"):
+            ask(spec, url, "absolute")

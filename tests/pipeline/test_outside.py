@@ -136,6 +136,25 @@ def test_files_that_a_config_names_are_known_by_their_content(
     assert changed(before, keys(cfg, tmp_path)) == before.keys() - same
 
 
+def test_files_deep_in_a_judges_options_are_known_by_their_content(tmp_path: Path) -> None:
+    folder, network = tmp_path / "t5", tmp_path / "alex.pth"
+    folder.mkdir()
+    cfg = load_config(["experiment=smoke", "judge=golden_goal"])
+    cfg["judge"]["metric"] = {"_target_": "envs.judges.lpips.LPIPS", "network": str(network)}
+    cfg["judge"]["text_world"]["words"]["folder"] = str(folder)
+    for path in (network, folder / "alex.pth", folder / ".hidden"):
+        path.write_text("one")
+    before = keys(cfg, tmp_path)
+    (folder / ".hidden").write_text("another")
+    assert keys(cfg, tmp_path) == before
+    (folder / "alex.pth").write_text("three")
+    assert {"text_world-1", "judge-1", "rl-1"} <= changed(before, keys(cfg, tmp_path))
+    before = keys(cfg, tmp_path)
+    network.write_text("three")
+    metric = changed(before, keys(cfg, tmp_path))
+    assert {"judge-1", "rl-1"} <= metric and not metric & {"text_world-1", "clone-1", "simulator-1"}
+
+
 def test_a_robots_own_kinematics_are_known_by_their_source(tmp_path: Path) -> None:
     cfg = load_config(["experiment=smoke"])
     marks = []

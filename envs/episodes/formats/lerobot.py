@@ -235,7 +235,8 @@ class LeRobotDataset:
         if success is not None:
             # Row t says what the action taken there led to; the last row's belongs to the last frame seen.
             done = success[:, 0].astype(bool)
-            known["success"] = np.concatenate([[False], done[:-1]])
+            # What was done stays done, also where a suite says it of each step by itself.
+            known["success"] = np.logical_or.accumulate(np.concatenate([[False], done[:-1]]))
             known["success"][-1] |= done[-1]
         if reward is not None:
             known["reward"] = np.concatenate([[0.0], reward[:-1, 0]]).astype(np.float32)

@@ -39,6 +39,9 @@ from envs.specs import Status, WorldSpec
 from envs.targets import OptionsOf, build
 from envs.targets import options as options_of
 
+_SERVED = ("url", "key")  # of chat; answers are remembered without them, too
+_ASKED = ("asking", "budget")
+
 
 class Ticket(NamedTuple):
     """Clips that are being judged, on their way to shares [T] and a status each."""
@@ -112,6 +115,12 @@ class VLMJudge(Judge):
     def files(cls, options: Mapping[str, Any]) -> tuple[Path, ...]:
         """See Judge.files: the prompt."""
         return (prompt_file(options["prompt"]),)
+
+    @classmethod
+    def decisive(cls, options: Mapping[str, Any]) -> Mapping[str, Any]:
+        """See Judge.decisive: not where the model is served, how patiently it is asked, or for how much."""
+        chat = {key: value for key, value in options["chat"].items() if key not in _SERVED}
+        return {key: value for key, value in options.items() if key not in _ASKED} | {"chat": chat}
 
     @classmethod
     def spent(cls, options: Mapping[str, Any]) -> dict[str, float]:

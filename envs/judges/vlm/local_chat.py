@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import hashlib
 import json
 import threading
@@ -17,7 +18,8 @@ from envs.ranges import Count, NonNegative
 from envs.rng import vote_generator
 from envs.targets import ConfigError
 
-_HEAD = 1 << 20  # bytes of each file of weights that tell it from others
+_SLICE = 1 << 20  # bytes of a part of a file of weights that is read to tell it from others
+_SLICES = 16  # of these, spread over the file
 
 
 class LocalChat:
@@ -60,11 +62,23 @@ class LocalChat:
     @property
     def name(self) -> str:
         """See Chat.name: what the folder holds, wherever it lies."""
-        found = hashlib.sha256((self.folder / "config.json").read_bytes())
+        return json.dumps([self._mark, self.dtype, self.max_tokens, self.temperature])
+
+    @functools.cached_property
+    def _mark(self) -> str:
+        """A hash of the folder's configs and templates, and of parts of its weights."""
+        found = hashlib.sha256()
+        texts = [path for kind in ("*.json", "*.jinja") for path in self.folder.glob(kind)]
+        for path in sorted(texts):
+            found.update(f"{path.name}:{path.stat().st_size}:".encode() + path.read_bytes())
         for path in sorted(self.folder.glob("*.safetensors")):
+            size = path.stat().st_size
+            found.update(f"{path.name}:{size}:".encode())
             with path.open("rb") as file:
-                found.update(f"{path.name}:{path.stat().st_size}".encode() + file.read(_HEAD))
-        return json.dumps([found.hexdigest(), self.dtype, self.max_tokens, self.temperature])
+                for n in range(_SLICES):
+                    file.seek(max(0, size - _SLICE) * n // (_SLICES - 1))
+                    found.update(file.read(_SLICE))
+        return found.hexdigest()
 
     async def greet(self) -> None:
         """See Chat.greet; loads the model."""

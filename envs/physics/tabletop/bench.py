@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.physics.mujoco_suite import steps_per_frame
 from envs.physics.suite import HeldCondition, checked_action
 from envs.physics.tabletop.actions import ActionInterface, Target
 from envs.physics.tabletop.arms import ArmKinematics
@@ -53,8 +54,10 @@ class Bench:
         self.actions = actions(self.arms, control_hz)
         self.condition = HeldCondition(hold, control_hz)
         robot = self.arms.model
-        self.glides = max(1, round(1.0 / (control_hz * GLIDE)))
-        self.substeps = max(1, round(1.0 / (control_hz * self.glides * robot.opt.timestep)))
+        steps = steps_per_frame(control_hz, round(1.0 / robot.opt.timestep, 6))
+        wanted = 1.0 / (control_hz * GLIDE)
+        self.glides = min((n for n in range(1, steps + 1) if steps % n == 0), key=lambda n: abs(n - wanted))
+        self.substeps = steps // self.glides
         self._slides = np.array([[robot.joint(f"{s}_slide_{t}").qposadr[0] for t in "ab"] for s in ARMS])
 
     # -- episode ---------------------------------------------------------------------------------------------

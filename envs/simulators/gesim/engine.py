@@ -66,6 +66,9 @@ class Sampling:
     Args:
         kind: "distilled" or "edm"; "" takes what the checkpoint was made for.
         steps: of the sampler; 0 takes the released number, 4 or 15.
+
+    Raises:
+        ValueError: if the sampler cannot take so many steps.
     """
 
     kind: Literal["", "distilled", "edm"]
@@ -77,12 +80,28 @@ class Sampling:
                 f"simulator.sampling.steps={self.steps}, but the distilled sampler has {len(DISTILLED)}"
                 " levels; use simulator.sampling.kind=edm for more"
             )
+        if self.kind == "edm":
+            _check_edm(self.steps)
 
     def sampler(self, edm: EDM, distilled: bool) -> Sampler:
-        """The sampler; `edm` and `distilled` are what the checkpoint says."""
+        """The sampler; `edm` and `distilled` are what the checkpoint says.
+
+        Raises:
+            ValueError: if it cannot take so many steps.
+        """
         if self.kind == "edm" or (not self.kind and not distilled):
+            _check_edm(self.steps)
             return EDM(self.steps or edm.steps, edm.sigma_max, edm.sigma_min, edm.rho)
         return Distilled(DISTILLED[: self.steps or len(DISTILLED)])
+
+
+def _check_edm(steps: int) -> None:
+    """Refuse a number of EDM steps of which none has a length."""
+    if steps == 1:
+        raise ValueError(
+            "simulator.sampling.steps=1 of the undistilled sampler (edm) would show noise, for its last step"
+            " has no length; set simulator.sampling.steps=2 or more, or 0 for the released number"
+        )
 
 
 @dataclass(frozen=True)

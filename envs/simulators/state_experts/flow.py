@@ -165,7 +165,10 @@ class FlowStateDecoder(StateDecoder):
         past, spread = history["states"], self.tokens.state_std
         noise = torch.randn(past.shape, generator=generator).to(past.device)
         disturbed = disturb_history(past, generator) + _DISTURBANCE * spread * noise
-        tokens, origin = self.tokens.clean(future["commands"], history["commands"], disturbed)
+        kept = slice(self.every - 1, None, self.every)  # as in `decode`; the disturbance shifts by frames
+        tokens, origin = self.tokens.clean(
+            future["commands"], history["commands"][:, kept], disturbed[:, kept]
+        )
         target = (future["states"] - self.tokens.state_mean) / spread - origin
         noise = torch.randn(target.shape, generator=generator).to(target.device)
         level = torch.rand(len(target), generator=generator).to(target.device)

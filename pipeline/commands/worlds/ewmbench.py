@@ -33,6 +33,7 @@ from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.grippers.ruler import GripperRuler, gripper_ruler, known_ends, looked_through
 from pipeline.evaluation.judging import cost_text
 from pipeline.graph.code_version import code_of
+from pipeline.outside import KINEMATICS, files_at, fingerprint
 from pipeline.stages.judging.cost import COST, Spending
 
 _MODULE = "pipeline.evaluation.ewmbench.samples"
@@ -121,7 +122,7 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
         section["strict_parity"],
     )
     looked = _identity(section, subject, store, instruments, ruler)
-    world = {**looked, "world": subject.identity("simulator"), "engine": code_of(_MODULE, cfg["simulator"])}
+    world = {**looked, **_engine(subject)}
     samples = Samples(
         subject.simulator(),
         store,
@@ -211,15 +212,25 @@ def _identity(
     ruler: GripperRuler | None,
 ) -> dict[str, Any]:
     """What measurements of recorded videos depend on."""
-    sizes = {str(folder): len(part.frames) for folder, part in zip(subject.data, store.parts, strict=True)}
     return {
-        "data": sizes,
+        "data": fingerprint([str(folder) for folder in subject.data], "imagined.data"),
         "size": list(store.spec.size),
         "extractors": [instruments.patches.name, instruments.frames.name, list(instruments.views)],
         "detector": None if ruler is None else ruler.identity,
         "reader": None if instruments.reader is None else instruments.reader.identity,
         "strict_parity": instruments.strict_parity,
         "code": code_of(_MODULE, {name: section[name] for name in ("patches", "frames")}),
+    }
+
+
+def _engine(subject: Subject) -> dict[str, Any]:
+    """What generated videos depend on beside the recorded ones."""
+    cfg = subject.cfg
+    return {
+        "world": subject.identity("simulator"),
+        "task": {key: cfg["task"][key] for key in ("size", "chunk", "horizon")},
+        "kinematics": files_at(cfg, KINEMATICS),
+        "engine": code_of(_MODULE, cfg["simulator"]),
     }
 
 

@@ -29,6 +29,7 @@ from pipeline.evaluation.grippers.detecting import (
 from pipeline.evaluation.grippers.detector import GripperDetector
 from pipeline.evaluation.grippers.end_effectors import EndEffectors, arm_names, known_end_effectors
 from pipeline.graph.code_version import code_of, digest
+from pipeline.outside import KINEMATICS, files_at, fingerprint
 
 _MODULE = "pipeline.evaluation.grippers.detecting"
 
@@ -120,9 +121,10 @@ def gripper_ruler(cfg: Mapping[str, Any], store: ClipStore, data: Sequence[Path]
         return GripperRuler(load(detector, path).to(device_of(cfg)).eval(), fixed, sights, path)
     assert sights is not None
     about = {
-        "data": {str(folder): len(part.frames) for folder, part in zip(data, store.parts, strict=True)},
+        "data": fingerprint([str(folder) for folder in data], "imagined.data"),
         "robot": [robot.robot, list(store.spec.size), list(sights.views)],
         "ends": [sights.ends.source, pose_style(cfg).tool_offset],
+        "kinematics": [cfg["simulator"].get("kinematics"), files_at(cfg, KINEMATICS)],
         "section": section,
         "code": code_of(_MODULE, {}),
     }

@@ -22,7 +22,7 @@ from actors.playing.imagination import ImaginedSide, start_of
 from envs.conditioning import PoseMapStyle
 from envs.embodiment import Embodiment
 from envs.initial_states import InitialStates
-from envs.judges.base import Judge
+from envs.judges.base import Judge, Judgement
 from envs.physics.suite import Observation
 from envs.specs import ActionMode, Rewards, WorldSpec
 from envs.transforms import world_transforms
@@ -149,6 +149,24 @@ def test_imagination_alone_is_played(robot: Embodiment) -> None:
     assert played.dreamt is not None and played.dreamt.success
     with pytest.raises(Unplayable, match="needs physics"):
         played.hand_over("expert")
+
+
+class Late(Judge):
+    """Success from the third frame of a clip on; progress counts frames in hundredths."""
+
+    def score(self, frames: torch.Tensor, first: torch.Tensor, instruction: list[str]) -> Judgement:
+        at = torch.arange(frames.shape[1]).expand(len(frames), -1)
+        return Judgement((at >= 2).float(), (at + 1) / 100, torch.zeros(len(frames), dtype=torch.int64))
+
+
+def test_frames_that_did_not_happen_are_not_judged() -> None:
+    side = imagination(BIMANUAL_POSES, Late(2))
+    side.reset(None, 3)
+    action = side.command[None]
+    for count, success in ((2, False), (3, False), (1, False), (4, True)):
+        shown = side.step(action.repeat(count, 0))
+        assert len(shown.frames) == count and shown.success is success
+        assert shown.progress == pytest.approx(count / 100)
 
 
 def in_browser(talk: Callable[[TestClient[Any, Any]], Awaitable[None]], imagined: bool = False) -> None:

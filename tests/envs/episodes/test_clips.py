@@ -19,10 +19,11 @@ import torch
 from envs.conditioning import PoseMapStyle, end_effector_poses, render_pose_map
 from envs.embodiment import Embodiment
 from envs.episodes import Episode, EpisodeError, LeRobotDataset, LeRobotWriter
+from envs.episodes.angles import check_radians
 from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
 from envs.episodes.privileged import read_privileged
-from envs.episodes.splits import write_splits
+from envs.episodes.splits import range_of, write_splits
 from envs.geometry.cameras import follow_wrists
 from envs.simulators.inputs import build_inputs
 from envs.specs import WorldSpec
@@ -139,6 +140,26 @@ def test_cameras_on_wrists_stay_where_nobody_knows_where_changes_lead(tmp_path: 
     assert torch.equal(c2w, c2w[:1].expand_as(c2w))
 
 
+def test_joints_in_degrees_are_refused_where_kinematics_take_radians() -> None:
+    commands = moving_square(ARM_JOINTS, 0).commands
+    check_radians(ARM_JOINTS, commands, Path("set"))
+    commands[:, 0] *= 45.0
+    with pytest.raises(EpisodeError, match=r"set: a joint is commanded to 4.*convert degrees"):
+        check_radians(ARM_JOINTS, commands, Path("set"))
+
+
+def test_angles_that_pass_pi_do_not_jump(tmp_path: Path) -> None:
+    robot = BIMANUAL_POSES.at(SIZE)
+    turning = moving_square(robot, 0)
+    steady = 3.0 + 0.05 * np.arange(len(turning.commands))
+    turning.commands[:, 3] = (steady + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(np.diff(turning.commands[:, 3])).max() > 6
+    LeRobotWriter(tmp_path / "set", robot).write([turning])
+    commands = ClipStore([tmp_path / "set"], SPEC).arrays["commands"]
+    assert torch.allclose(commands[:, 3], torch.from_numpy(steady).float(), atol=1e-5)
+    assert torch.equal(commands[:, 4:], torch.from_numpy(turning.commands[:, 4:]))
+
+
 def test_unlabelled_sets_have_no_success(tmp_path: Path) -> None:
     spec = world_spec(ARM_DELTAS.at(SIZE), SIZE)
     for name, labelled in (("told", True), ("untold", False)):
@@ -182,8 +203,17 @@ def test_missing_calibration_is_named(tmp_path: Path) -> None:
 # -- splits
 def test_splits_of_a_set_that_names_none_go_by_number(store: ClipStore) -> None:
     parts = {name: store.split(name).tolist() for name in ("train", "held_out", "calibration")}
-    assert parts["held_out"] == [7, 15] and parts["calibration"] == [2, 6, 10, 14, 18]
     assert sorted(number for part in parts.values() for number in part) == list(range(20))
+    for begin in (0, 8):
+        mine = {name: [n for n in part if begin <= n < begin + 8] for name, part in parts.items()}
+        assert (len(mine["held_out"]), len(mine["calibration"])) == (1, 2)
+
+
+def test_tasks_that_were_recorded_by_turns_are_in_every_split() -> None:
+    for tasks in (2, 4, 8):
+        for name in ("train", "held_out", "calibration"):
+            mine = range_of({"train": "0:160"}, name, 160, Path("set"))
+            assert {number % tasks for number in mine} == set(range(tasks)), (tasks, name)
 
 
 def test_splits_are_those_of_each_data_set(dataset: Path, tmp_path: Path) -> None:
@@ -191,7 +221,8 @@ def test_splits_are_those_of_each_data_set(dataset: Path, tmp_path: Path) -> Non
     shutil.copytree(dataset, root)
     write_splits(root, {"train": 12, "held_out": 5, "calibration": 3})
     store = ClipStore([dataset, root], SPEC)
-    assert store.split("held_out").tolist() == [7, 15, *range(32, 37)]
+    first = range_of({"train": "0:20"}, "held_out", 20, dataset)
+    assert store.split("held_out").tolist() == [*first, *range(32, 37)]
     with pytest.raises(EpisodeError, match=r"'test' must be among them"):
         store.split("test")
 

@@ -322,11 +322,11 @@ def test_fewer_episodes_can_be_kept_in_splits(dataset: Path, tmp_path: Path) -> 
     root = tmp_path / "set"
     shutil.copytree(dataset, root)
     whole = read_splits(root)  # by number, as the set names none
-    assert whole["held_out"] == [7, 15] and len(whole["train"]) == 13
+    assert whole["held_out"] == [7, 14] and len(whole["train"]) == 13
     keep_in_splits(root, {"train": whole["train"][:4], "held_out": whole["held_out"], "calibration": []})
     info = json.loads((root / "meta/info.json").read_text())
-    assert info["splits"] == {"train": "0:2,3:5", "held_out": "7:8,15:16", "calibration": "0:0"}
-    assert read_splits(root) == {"train": [0, 1, 3, 4], "held_out": [7, 15], "calibration": []}
+    assert info["splits"] == {"train": "0:2,3:5", "held_out": "7:8,14:15", "calibration": "0:0"}
+    assert read_splits(root) == {"train": [0, 1, 3, 4], "held_out": [7, 14], "calibration": []}
 
 
 def test_appending_leaves_splits_as_they_are(tmp_path: Path) -> None:

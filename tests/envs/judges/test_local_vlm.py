@@ -57,6 +57,19 @@ def test_answers_belong_to_the_weights_wherever_they_lie(folder: Path, tmp_path:
     assert chat(moved).name != chat(folder).name
 
 
+@pytest.mark.parametrize("changed", ["model.safetensors", "chat_template.jinja", "tokenizer_config.json"])
+def test_answers_belong_to_templates_and_to_all_of_large_weights(changed: str, tmp_path: Path) -> None:
+    large = bytearray(40 << 20)
+    (tmp_path / "model.safetensors").write_bytes(large)
+    for name in ("config.json", "chat_template.jinja", "tokenizer_config.json"):
+        (tmp_path / name).write_text("{}")
+    before = chat(tmp_path).name
+    assert chat(tmp_path).name == before
+    large[15 << 20 : 25 << 20] = b"!" * (10 << 20)  # of the same size, ends and all
+    (tmp_path / changed).write_bytes(large if changed == "model.safetensors" else b"[]")
+    assert chat(tmp_path).name != before
+
+
 def test_what_is_missing_is_told_by_its_key(folder: Path, tmp_path: Path) -> None:
     for nothing in ("", tmp_path, tmp_path / "nowhere"):
         with pytest.raises(ConfigError, match=r"judge\.chat\.path=.* must be a folder with config\.json"):

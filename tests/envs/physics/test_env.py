@@ -86,3 +86,15 @@ def test_pictures_for_people_have_any_size() -> None:
     pool = TaskPool(PUSH["suite"], PUSH["name"], 1, 8, 1)
     assert pool.picture(3, (40, 60)).shape == (3, 3, 40, 60)
     assert np.std(pool.picture(3, (40, 60))) > 10
+
+
+def test_of_an_episode_that_is_played_again_the_first_slot_comes_first() -> None:
+    env = env_of(3, 4, record=True)
+    env.schedule([5, 5, 5])
+    now = env.reset()
+    now[CHUNK] = torch.zeros(3, 4, SPEC.action_dim)
+    now[CHUNK][:, :, 0] = 0.01 * torch.arange(3)[:, None]
+    env.step(now)
+    ends = [float(np.asarray(track.rows["commands"][-1])[0]) for track in env.pop_tracks()]
+    assert ends == sorted(ends) and ends[0] < ends[1]
+    env.close()

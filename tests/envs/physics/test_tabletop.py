@@ -10,7 +10,7 @@ import torch
 
 from envs.geometry.cameras import project
 from envs.geometry.kinematics import Kinematics
-from envs.physics.suite import build_suite
+from envs.physics.suite import SuiteError, build_suite
 from envs.physics.tabletop.actions import MAX_JOINT_SPEED
 from envs.physics.tabletop.suite import Tabletop
 from envs.targets import ConfigError
@@ -127,3 +127,11 @@ def test_block_is_seen_where_it_is() -> None:
 def test_unknown_actions_are_named() -> None:
     with pytest.raises(ConfigError, match=r"task\.suite\.actions='voice' .*end_effector.*joints"):
         tabletop(0, actions="voice")
+
+
+def test_a_rate_that_the_simulation_does_not_divide_into_is_refused() -> None:
+    for rate in (5.0, 8.0, 10.0, 25.0, 50.0):
+        bench = tabletop(0, control_hz=rate)._bench
+        assert bench.glides * bench.substeps * 0.005 == pytest.approx(1 / rate)
+    with pytest.raises(SuiteError, match=r"task\.suite\.control_hz=15.0 must divide 200"):
+        tabletop(0, control_hz=15.0)

@@ -21,7 +21,7 @@ from envs.initial_states import InitialStates
 from envs.judges.learned import LearnedJudge
 from envs.simulators import memory
 from envs.simulators.gesim.checkpoint import CheckpointError, load_released, load_state_network
-from envs.simulators.gesim.engine import GESimulator
+from envs.simulators.gesim.engine import GESimulator, Sampling
 from envs.simulators.gesim.state_expert import GESimStateExpert
 from envs.simulators.inputs import build_inputs
 from envs.simulators.samplers import EDM, Distilled
@@ -125,6 +125,40 @@ def test_parity_repeats_the_released_quirks(folder: Path) -> None:
     first = torch.full((1, 5, 16), -1.0)
     thinned = expert._thinned(past, first, torch.tensor([3]))[0, :, 0]
     assert expert.memory_frames == 20 and thinned.tolist() == [-1, -1, 14, 19]
+
+
+def test_one_step_of_the_undistilled_sampler_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"simulator\.sampling\.steps=1 of the undistilled"):
+        Sampling("edm", 1)
+    path = write_checkpoint(tmp_path / "v1", expert=False)
+    with pytest.raises(ValueError, match=r"simulator\.sampling\.steps=2 or more"):
+        build(path, sampling={"kind": "", "steps": 1})
+    assert Sampling("", 1).sampler(EDM(), True).evaluations == 1
+    assert Sampling("edm", 2).sampler(EDM(), True) == EDM(2)
+
+
+def test_a_thinned_state_expert_trains_on_the_history_that_it_decodes_from() -> None:
+    world = build(None, parity="released")
+    expert = GESimStateExpert(world, None)
+    clips = clip(SPEC, 1, 4)
+    past = torch.arange(20.0)[None, :, None].expand(1, -1, 16)
+    history = TensorDict({"commands": past, "states": past}, [1])
+    seen: list[tuple[torch.Tensor, torch.Tensor]] = []
+    clean = expert.tokens.clean
+
+    def watch(
+        commands: torch.Tensor, past_commands: torch.Tensor, past_states: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        seen.append((past_commands, past_states))
+        return clean(commands, past_commands, past_states)
+
+    expert.tokens.clean = watch  # type: ignore[method-assign]
+    features = expert.read(expert.look(world, build_inputs(SPEC, clips, 0)))
+    loss = expert.loss(features, history, clips["future"], torch.Generator().manual_seed(0))
+    commands, states = seen[0]
+    assert torch.isfinite(loss) and commands[0, :, 0].tolist() == [4, 9, 14, 19]
+    # shifted by at most three frames, as it would be unthinned
+    assert states.shape == (1, 4, 16) and (states - commands).abs().max() < 4
 
 
 def test_it_trains_whole_and_for_other_robots() -> None:

@@ -17,7 +17,7 @@ from envs.judges import MissingFeatures, RuleJudge
 from envs.simulators.features import features_of_episodes
 from learners.stages.generated import generated_frames, recorded_features
 from learners.stages.judge import JudgeData, calibrate, frame_targets, judge_recordings, train_judge
-from learners.stages.pictures import augment
+from learners.stages.pictures import augment, augmented
 from learners.stages.simulator import units
 from learners.training.fit import FitConfig
 from tests.embodiments import ARM_DELTAS, EMBODIMENTS, world_spec
@@ -201,6 +201,15 @@ def test_pictures_are_disturbed_alike_in_all_views_and_by_the_generator_alone() 
     assert torch.equal(out, augment(pictures, torch.Generator().manual_seed(0), shift=0.1))
     still = augment(pictures, torch.Generator().manual_seed(0), shift=0.0)
     assert float((still.float() - pictures.float()).abs().mean()) < 20
+
+
+def test_it_is_told_where_things_in_shifted_pictures_have_gone() -> None:
+    dot = torch.zeros(32, 1, 3, 40, 80, dtype=torch.uint8)
+    dot[..., 20, 50] = 255
+    out, by = augmented(dot, torch.Generator().manual_seed(0), shift=0.1)
+    place = out[:, 0].float().sum(1).flatten(1).argmax(1)
+    seen = torch.stack(((place % 80) / 80, (place // 80) / 40), 1)
+    assert torch.allclose(seen, torch.tensor([50 / 80, 20 / 40]) + by) and len(by.unique(dim=0)) > 10
 
 
 def test_shifts_move_by_whole_pixels_and_repeat_the_border() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from envs.geometry.cameras import project
 from envs.rng import constant_generator
 from envs.simulators.replay import replay
 from envs.targets import ConfigError
+from pipeline.config import load_config
 from pipeline.evaluation.ewmbench.choose import in_pictures
 from pipeline.evaluation.ewmbench.features import ClipFrames, ClipTexts, DinoPatches
 from pipeline.evaluation.fidelity.end_effector import (
@@ -22,6 +24,7 @@ from pipeline.evaluation.fidelity.end_effector import (
     end_effector_summary,
     end_effector_text,
 )
+from pipeline.evaluation.grippers import ruler
 from pipeline.evaluation.grippers.detecting import (
     WEIGHTS,
     Sights,
@@ -72,6 +75,34 @@ def test_end_effectors_are_known_from_what_the_robot_knows(
     assert float(found.positions[..., 2].max()) == pytest.approx(0.7, abs=1e-4)  # seven links of 10 cm
 
 
+def test_a_detector_belongs_to_what_its_data_hold_and_to_the_robot(
+    store: ClipStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used: list[Path] = []
+    monkeypatch.setattr(ruler, "train_detector", lambda sights, section, folder, device: used.append(folder))
+    data, robot = tmp_path / "set", tmp_path / "robot.urdf"
+    shutil.copytree(store.parts[0].folder, data)
+    cfg = load_config(["experiment=smoke"])
+
+    def find() -> None:
+        ruler.gripper_ruler(cfg, store, [data], tmp_path)
+
+    find()
+    find()
+    assert len(set(used)) == 1
+    video = next((data / "videos").rglob("*.mp4"))
+    content = bytearray(video.read_bytes())
+    content[-100] ^= 1
+    video.write_bytes(content)  # as many frames, recorded anew
+    find()
+    robot.write_text("one")
+    cfg["simulator"]["kinematics"] = {"model": str(robot), "joints": [], "flanges": []}
+    find()
+    robot.write_text("three")
+    find()
+    assert len(set(used)) == 4
+
+
 def test_a_detector_learns_what_projection_says(store: ClipStore, tmp_path: Path) -> None:
     sights = Sights.of(store, known_end_effectors(store, 0.15), (0, 1, 2))
     assert sights.views == (0,)  # the others are on wrists
@@ -86,12 +117,12 @@ def test_a_detector_learns_what_projection_says(store: ClipStore, tmp_path: Path
     assert torch.equal(*found) and (tmp_path / WEIGHTS).is_file()
     empty = frames[:1, ..., :1, :1].expand_as(frames[:1])  # the square is gone, and with it the left arm
     assert torch.isnan(detector.detect(empty, torch.arange(1))[0, 0, 0]).all()
-    ruler = GripperRuler(detector, sights.views, None, tmp_path / WEIGHTS)
-    flat = in_pictures(store, ruler, held)  # where space is unknown
+    taught = GripperRuler(detector, sights.views, None, tmp_path / WEIGHTS)
+    flat = in_pictures(store, taught, held)  # where space is unknown
     assert [tuple(path.shape) for path in flat.paths] == [(13, 2, 2)] * len(held)
     assert "picture plane" in flat.by and float(flat.paths[0].nan_to_num(0).max()) <= 1
     # In space: of one camera alone, across its line of sight. A pixel is 2.7 cm there.
-    space = EndEffectorRuler(ruler, sights.ends, ("top",))
+    space = EndEffectorRuler(taught, sights.ends, ("top",))
     made = replay(Drawing(store.spec, "right"), store, held, bf16=False)
     summary = end_effector_summary(space, [space.measure(store, held, made, store.frames(made.rows))])
     assert summary["generated_cm"]["median"] < 6 and summary["recorded_cm"]["median"] < 6

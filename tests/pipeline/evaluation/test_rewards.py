@@ -17,6 +17,8 @@ from envs.judges import RuleJudge
 from envs.physics.suite import build_suite, scene_of
 from envs.specs import Status
 from envs.targets import ConfigError
+from pipeline.cli import worlds
+from pipeline.commands.worlds import rewards
 from pipeline.commands.worlds.rewards import Plan, compare_rewards
 from pipeline.config import load_config
 from pipeline.evaluation.judging import Scores
@@ -141,6 +143,21 @@ def test_the_command_compares_judges_on_recordings(tmp_path: Path) -> None:
         compare_rewards(cfg, tmp_path / "smoke", Plan({"rule": cfg}, 4, ()))
     with pytest.raises(ConfigError, match=r"variants=\['moon'\]"):
         compare_rewards(cfg, tmp_path / "smoke", Plan({"rule": cfg}, 4, ("moon",)))
+
+
+def test_a_row_is_measured_by_the_judge_that_it_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plans: list[Plan] = []
+    monkeypatch.setattr(rewards, "compare_rewards", lambda cfg, root, plan, tracker: plans.append(plan))
+    words = ["experiment=smoke", "track=disabled", f"runs={tmp_path}", "judge=golden_goal_full"]
+    worlds.rewards(
+        ["rewards=[golden_goal,golden_goal_full,rule]", *words, "judge.threshold=0.7", "variants=[x]"]
+    )
+    judges = {name: cfg["judge"] for name, cfg in plans[0].configs.items()}
+    assert judges["golden_goal"] == load_config(["judge=golden_goal"])["judge"]  # of the same class
+    assert judges["golden_goal_full"] == judges["rule"]
+    assert judges["rule"] == load_config(["judge=golden_goal_full", "judge.threshold=0.7"])["judge"]
 
 
 def test_episodes_of_unseen_scenes(tmp_path: Path) -> None:

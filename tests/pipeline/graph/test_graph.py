@@ -139,7 +139,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def fresh_key(root: Path, cfg: dict[str, Any]) -> str:
     """A key as another process would find it."""
-    for cached in ("_closure", "_source", "_tree", "_imports", "_file_hash"):
+    for cached in ("_closure", "_source", "_tree", "_imports", "_file_hash", "_beside"):
         getattr(code_version, cached).cache_clear()
     return build(root, cfg).key("a")
 
@@ -152,6 +152,20 @@ def test_code_behind_a_target_is_part_of_the_key(tmp_path: Path, package: Path) 
     assert fresh_key(tmp_path, cfg) == first
     (package / "part.py").write_text("VALUE = 2\n")
     assert fresh_key(tmp_path, cfg) != first
+
+
+def test_a_description_beside_the_code_is_part_of_the_key(tmp_path: Path, package: Path) -> None:
+    cfg = {**CFG, "x": {"_target_": "theirs.model.run"}}
+    keys = [fresh_key(tmp_path, cfg)]
+    for name in ("robot.xml", "prompt.txt"):
+        for content in ("one", "two"):
+            (package / name).write_text(content)
+            keys.append(fresh_key(tmp_path, cfg))
+    assert len(set(keys)) == len(keys)
+    (package.parent / "notes.txt").write_text("of somebody")  # is beside a package, and no part of it
+    (package / "log.csv").write_text("1")
+    assert fresh_key(tmp_path, cfg) == keys[-1]
+    assert "envs/physics/tabletop/robot.xml" in code_of("envs.physics.tabletop.scene", {})
 
 
 def test_stages_say_why_they_will_run_again(tmp_path: Path, package: Path) -> None:

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 from envs.embodiment import Embodiment
 from envs.targets import ConfigError
-from pipeline.commands.worlds.ewmbench import ewmbench
+from pipeline.commands.worlds.ewmbench import Extractors, _engine, _identity, ewmbench
+from pipeline.commands.worlds.subject import Subject
 from pipeline.config import load_config
+from pipeline.evaluation.ewmbench.measure import Instruments
 from tests.embodiments import ARM_DELTAS
 from tests.envs.judges.chat_server import MODEL, Asked, serving
 from tests.worlds import scripted_set, untrained_world
@@ -70,6 +74,30 @@ def test_two_arms_in_physics_with_a_model_that_reads(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"ewmbench\.patches\._target_=.*should be a PatchExtractor"):
         words += ["ewmbench.patches._target_=pipeline.evaluation.fidelity.extractors.PyramidFrames"]
         ewmbench(load_config(words), tmp_path / "run")
+
+
+def test_what_was_measured_belongs_to_recordings_and_to_the_shape_of_the_task(
+    tmp_path: Path, tiny_data: Callable[[Embodiment], Path]
+) -> None:
+    data = tmp_path / "set"
+    shutil.copytree(tiny_data(ARM_DELTAS), data)
+    words = [*SMOKE, "task=lerobot", f"task.data=[{data}]", "task.chunk=4", "task.horizon=8"]
+
+    def identities(*more: str) -> tuple[str, str]:
+        cfg = load_config([*words, *more])
+        subject = Subject.of(cfg, tmp_path / "run")
+        kinds = Extractors.of(cfg["ewmbench"])
+        looking = Instruments(kinds.patches, kinds.frames, (0,), None, (), None, False)
+        found = (_identity(cfg["ewmbench"], subject, subject.store(), looking, None), _engine(subject))
+        return json.dumps(found[0]), json.dumps(found[1])
+
+    recorded, made = identities()
+    assert identities() == (recorded, made)
+    for word in ("task.chunk=2", "task.horizon=12"):
+        assert identities(word)[1] != made, word
+    tables = next((data / "data").rglob("*.parquet"))
+    pq.write_table(pq.read_table(tables), tables, compression="gzip")  # another file with as many frames
+    assert identities()[0] != recorded
 
 
 def test_one_arm_that_nobody_calibrated(tmp_path: Path, tiny_data: Callable[[Embodiment], Path]) -> None:
