@@ -30,6 +30,7 @@ from pipeline.evaluation.measurement import evenly, groups, speed
 from pipeline.graph.code_version import code_of
 from pipeline.graph.kept import Kept
 from pipeline.loop import has_physics
+from pipeline.outside import fingerprint
 
 Cfg = Mapping[str, Any]
 _MODULE = "pipeline.evaluation.fidelity.open_loop"
@@ -64,7 +65,7 @@ def fidelity(cfg: Cfg, root: Path) -> str:
     loop = OpenLoop(
         *(store, episodes, cfg["simulator"]["bf16"], labels, extractors, section["clip"], hands),
         kept=kept,
-        identity=identity_of(subject, store),
+        identity=identity_of(subject),
     )
     place = {int(number): n for n, number in enumerate(episodes)}
     mine = {
@@ -174,13 +175,12 @@ def _long(cfg: Cfg, root: Path, subject: Subject, store: ClipStore, loop: OpenLo
     return {"wanted": section["frames"], **out}
 
 
-def identity_of(subject: Subject, store: ClipStore) -> dict[str, Any]:
+def identity_of(subject: Subject) -> dict[str, Any]:
     """What rollouts of a subject's simulator depend on beside episodes and options that are tried."""
-    sizes = {str(folder): len(part.frames) for folder, part in zip(subject.data, store.parts, strict=True)}
     return {
         "world": subject.identity("simulator"),
         "task": {key: subject.cfg["task"][key] for key in ("size", "chunk", "horizon")},
-        "data": sizes,
+        "data": fingerprint([str(folder) for folder in subject.data], "imagined.data"),
         "code": code_of(_MODULE, subject.cfg["simulator"]),
     }
 

@@ -23,6 +23,7 @@ from pipeline.evaluation.value.candidates import Candidate
 from pipeline.evaluation.value.trials import Imagination, Physics
 from pipeline.evaluation.value.whole import Onlooker
 from pipeline.graph.kept import Kept, Tensors
+from pipeline.outside import fingerprint
 
 Cfg = Mapping[str, Any]
 _SIDE_BY_SIDE = 64  # imagined episodes
@@ -126,7 +127,8 @@ class Comparison:
 
     def _where(self, episodes: Tensor) -> dict[str, Any]:
         """What tells recorded starts from others."""
-        return {"data": [str(path) for path in self.data], "episodes": episodes.tolist()}
+        mark = fingerprint([str(path) for path in self.data], "imagined.data")
+        return {"data": mark, "episodes": episodes.tolist()}
 
     def _about(self, candidate: Candidate) -> dict[str, Any]:
         """What tells a candidate's behaviour from others'; names are none of it."""
