@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -20,8 +21,8 @@ from pipeline.config import load_config
 from pipeline.evaluation.by_task import evenly, tasks_of_seeds
 from pipeline.graph.stage import Inputs
 from pipeline.stages.collect import collect, scripted_jobs, split_counts
-from pipeline.stages.given import demonstrations, imagined_chunks
-from tests.embodiments import ARM_DELTAS
+from pipeline.stages.given import DATASETS, datasets, demonstrations, imagined_chunks, newest_episodes
+from tests.embodiments import ARM_DELTAS, world_spec
 from tests.moving_square import moving_square
 
 
@@ -152,3 +153,18 @@ def test_imagined_episodes_are_as_long_whatever_a_chunk_has(
 ) -> None:
     cfg = {"rl": {"horizon": horizon}, "task": {"chunk": chunk, "horizon": 20 if chunk < 20 else 100}}
     assert imagined_chunks(cfg) == chunks
+
+
+def test_of_sets_that_a_user_lists_none_is_newer_than_the_others(tmp_path: Path) -> None:
+    robot = ARM_DELTAS.at((32, 32))
+    folders = [tmp_path / "one", tmp_path / "two", tmp_path / "deploy/dataset"]
+    for folder in folders:
+        LeRobotWriter(folder, robot).write([moving_square(ARM_DELTAS, seed) for seed in range(2)])
+    listed = tmp_path / "recordings"
+    listed.mkdir()
+    (listed / DATASETS).write_text(json.dumps([str(folder) for folder in folders[:2]]))
+    spec, stages = world_spec(robot), (listed, tmp_path / "deploy")
+    for count, newest in ((1, [0, 1, 2, 3]), (2, [4, 5])):
+        store = ClipStore(datasets(stages[:count]), spec)
+        found = newest_episodes(store, Inputs({"data": stages[:count]}), torch.arange(len(store)))
+        assert found.tolist() == newest
