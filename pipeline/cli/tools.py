@@ -150,40 +150,22 @@ def submit(words: Words) -> None:
     runs=/shared/runs
     """
     from pipeline.commands.submit import submit as send
+    from pipeline.config import read_config
 
     if not words or not words[0].startswith("http"):
         raise ConfigError(
             "say where: worldloop submit http://head:8265 rl experiment=quickstart launch=ray launch.actors=8"
             " runs=/shared/runs"
         )
-    runs = _runs_of(words[2:])
+    # A command has words of its own (policy=rl-2 of evaluate), and tells mistakes itself.
+    naming = ("runs", "experiment", "hydra.searchpath")
+    runs = str(read_config([word for word in words[2:] if word.partition("=")[0] in naming])["runs"])
     if words[1:] and not Path(runs).is_absolute():
         raise ConfigError(
             f"runs={runs} would lie in the job's working folder, which Ray throws away; name a folder that"
             " all nodes share, as runs=/shared/runs"
         )
     send(words[0], words[1:])
-
-
-def _runs_of(words: Words) -> str:
-    """The folder of runs that a submitted command's words name. Only what the config knows is read here: a
-    command has words of its own (policy=rl-2 of evaluate), and tells mistakes itself.
-    """
-    from pipeline.config import composed, groups, offered, read_config
-
-    said = [word for word in words if word.startswith("runs=")]
-    if said:
-        return str(read_config(said[-1:])["runs"])
-    sections, known = composed([]), groups()
-    searched = [word for word in words if word.startswith("hydra.searchpath=")]
-    mine = list(searched)
-    for word in (word for word in words if "=" in word):
-        key, _, value = word.partition("=")
-        if key in known:
-            mine += [word] * offered(key, value, searched)
-        elif key.lstrip("+~").partition(".")[0] in sections:
-            mine.append(word)
-    return str(read_config(mine)["runs"])
 
 
 def chaos(words: Words) -> None:
