@@ -33,7 +33,6 @@ from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.grippers.ruler import GripperRuler, gripper_ruler, known_ends, looked_through
 from pipeline.evaluation.judging import cost_text
 from pipeline.graph.code_version import code_of
-from pipeline.outside import KINEMATICS, files_at, fingerprint
 from pipeline.stages.judging.cost import COST, Spending
 
 _MODULE = "pipeline.evaluation.ewmbench.samples"
@@ -122,7 +121,7 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
         section["strict_parity"],
     )
     looked = _identity(section, subject, store, instruments, ruler)
-    world = {**looked, **_engine(subject)}
+    world = {**looked, **subject.generated(_MODULE)}
     samples = Samples(
         subject.simulator(),
         store,
@@ -213,24 +212,13 @@ def _identity(
 ) -> dict[str, Any]:
     """What measurements of recorded videos depend on."""
     return {
-        "data": fingerprint([str(folder) for folder in subject.data], "imagined.data"),
+        "data": subject.data_mark(),
         "size": list(store.spec.size),
         "extractors": [instruments.patches.name, instruments.frames.name, list(instruments.views)],
         "detector": None if ruler is None else ruler.identity,
         "reader": None if instruments.reader is None else instruments.reader.identity,
         "strict_parity": instruments.strict_parity,
         "code": code_of(_MODULE, {name: section[name] for name in ("patches", "frames")}),
-    }
-
-
-def _engine(subject: Subject) -> dict[str, Any]:
-    """What generated videos depend on beside the recorded ones."""
-    cfg = subject.cfg
-    return {
-        "world": subject.identity("simulator"),
-        "task": {key: cfg["task"][key] for key in ("size", "chunk", "horizon")},
-        "kinematics": files_at(cfg, KINEMATICS),
-        "engine": code_of(_MODULE, cfg["simulator"]),
     }
 
 

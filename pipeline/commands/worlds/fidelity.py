@@ -30,7 +30,6 @@ from pipeline.evaluation.measurement import evenly, groups, speed
 from pipeline.graph.code_version import code_of
 from pipeline.graph.kept import Kept
 from pipeline.loop import has_physics
-from pipeline.outside import fingerprint
 
 Cfg = Mapping[str, Any]
 _MODULE = "pipeline.evaluation.fidelity.open_loop"
@@ -65,7 +64,7 @@ def fidelity(cfg: Cfg, root: Path) -> str:
     loop = OpenLoop(
         *(store, episodes, cfg["simulator"]["bf16"], labels, extractors, section["clip"], hands),
         kept=kept,
-        identity=identity_of(subject),
+        identity=subject.generated(_MODULE),
     )
     place = {int(number): n for n, number in enumerate(episodes)}
     mine = {
@@ -173,16 +172,6 @@ def _long(cfg: Cfg, root: Path, subject: Subject, store: ClipStore, loop: OpenLo
     bf16, distance = cfg["simulator"]["bf16"], loop.distance
     out = loop.kept.figures("long", about, lambda: drift(simulator, store, episodes, bf16, distance))
     return {"wanted": section["frames"], **out}
-
-
-def identity_of(subject: Subject) -> dict[str, Any]:
-    """What rollouts of a subject's simulator depend on beside episodes and options that are tried."""
-    return {
-        "world": subject.identity("simulator"),
-        "task": {key: subject.cfg["task"][key] for key in ("size", "chunk", "horizon")},
-        "data": fingerprint([str(folder) for folder in subject.data], "imagined.data"),
-        "code": code_of(_MODULE, subject.cfg["simulator"]),
-    }
 
 
 def _grid(cfg: Cfg, subject: Subject, loop: OpenLoop, tried: Mapping[str, Any], count: int) -> dict[str, Any]:

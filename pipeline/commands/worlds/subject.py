@@ -17,8 +17,10 @@ from envs.manifest import mark_of
 from envs.simulators.base import Simulator
 from envs.simulators.state_experts.base import StateDecoder
 from envs.targets import ConfigError
+from pipeline.graph.code_version import code_of
 from pipeline.graph.graph import Graph
 from pipeline.loop import build_loop, has_physics
+from pipeline.outside import KINEMATICS, files_at, fingerprint
 from pipeline.stages.given import datasets, learns
 
 Cfg = Mapping[str, Any]
@@ -98,6 +100,25 @@ class Subject:
         decoder = _with_weights(build_state_decoder(self.cfg, simulator), self.weights["state"]).eval()
         decoder.attach(simulator)
         return decoder
+
+    def generated(self, module: str) -> dict[str, Any]:
+        """What videos that its simulator generates of recorded episodes depend on, beside which episodes and
+        options that are tried.
+
+        Args:
+            module: that makes them, by name.
+        """
+        return {
+            "world": self.identity("simulator"),
+            "task": {key: self.cfg["task"][key] for key in ("size", "chunk", "horizon")},
+            "data": self.data_mark(),
+            "kinematics": files_at(self.cfg, KINEMATICS),
+            "engine": code_of(module, self.cfg["simulator"]),
+        }
+
+    def data_mark(self) -> str:
+        """Changes when its data sets do."""
+        return fingerprint([str(folder) for folder in self.data], "imagined.data")
 
     def judge(self) -> Judge:
         """The judge."""

@@ -13,7 +13,7 @@ import pytest
 
 from envs.embodiment import Embodiment
 from envs.targets import ConfigError
-from pipeline.commands.worlds.ewmbench import Extractors, _engine, _identity, ewmbench
+from pipeline.commands.worlds.ewmbench import Extractors, _identity, ewmbench
 from pipeline.commands.worlds.subject import Subject
 from pipeline.config import load_config
 from pipeline.evaluation.ewmbench.measure import Instruments
@@ -88,7 +88,10 @@ def test_what_was_measured_belongs_to_recordings_and_to_the_shape_of_the_task(
         subject = Subject.of(cfg, tmp_path / "run")
         kinds = Extractors.of(cfg["ewmbench"])
         looking = Instruments(kinds.patches, kinds.frames, (0,), None, (), None, False)
-        found = (_identity(cfg["ewmbench"], subject, subject.store(), looking, None), _engine(subject))
+        found = (
+            _identity(cfg["ewmbench"], subject, subject.store(), looking, None),
+            subject.generated("pipeline.commands.worlds.ewmbench"),
+        )
         return json.dumps(found[0]), json.dumps(found[1])
 
     recorded, made = identities()
