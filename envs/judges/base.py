@@ -107,7 +107,7 @@ class Judge(nn.Module):
         """
         raise NotImplementedError
 
-    def loss(self, data: TensorDict, share: float) -> tuple[Tensor, dict[str, Any]]:
+    def loss(self, data: TensorDict) -> tuple[Tensor, dict[str, Any]]:
         """Training loss and figures to log; a judge without weights of its own has none.
 
         Args:
@@ -116,7 +116,6 @@ class Judge(nn.Module):
                 [N, TEXT_BYTES]; frames and first uint8 [N, V, 3, H, W], or, for a judge that
                 `reads_features`, features float32 [N, D] of the frame's chunk and offset int64 [N], its
                 place in that chunk.
-            share: fraction of successes among the batch's labels, by which the classes are balanced.
         """
         raise NotImplementedError
 

@@ -41,12 +41,14 @@ class FittedJudge(Judge):
             " longer or on more episodes (judge_fit)"
         )
 
-    def loss(self, data: TensorDict, share: float) -> tuple[Tensor, dict[str, Any]]:
-        """Class-balanced cross-entropy of success plus cross-entropy of progress; see Judge.loss."""
+    def loss(self, data: TensorDict) -> tuple[Tensor, dict[str, Any]]:
+        """Cross-entropy of success, its classes balanced by their shares in the batch, plus that of progress;
+        see Judge.loss.
+        """
         logit, nearing = self(data).unbind(-1)
         known = torch.isfinite(data["label"])
         count, label = known.sum().clamp(min=1), torch.nan_to_num(data["label"])
-        share = min(max(share, 0.02), 0.98)
+        share = (label.sum() / count).clamp(0.02, 0.98)
         weight = torch.where(label > 0.5, 0.5 / share, 0.5 / (1 - share)) * known
         success = (F.binary_cross_entropy_with_logits(logit, label, reduction="none") * weight).sum() / count
         target = torch.nan_to_num(data["progress"])

@@ -169,14 +169,13 @@ def train_judge(
         return data.sample(options.part, generator)
 
     def loss(batch: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
-        share = float(batch["label"].mean())  # of the batch, which is not the data's
         if not data.pictures:
-            return judge.loss(batch, share)
+            return judge.loss(batch)
         views = batch["frames"].shape[1]  # the same colours for both, as one camera would give them
         both = augment(torch.cat((batch["frames"], batch["first"]), 1), generator, _SHIFT)
         shown = batch.copy()
         shown["frames"], shown["first"] = both.split(views, 1)
-        return judge.loss(shown, share)
+        return judge.loss(shown)
 
     return fit("judge", judge, batch, loss, options, folder, watch="frame_accuracy")
 

@@ -202,7 +202,7 @@ def test_every_weight_is_learned_or_at_least_used(name: str, judge: Judge, spec:
         data["label"], data["progress"] = torch.tensor([0.0, 1.0] * 3), torch.linspace(0, 1, 6)
         for part in seen:
             data["features"], data["offset"] = part[:, 0], torch.arange(6) % spec.chunk
-        judge.loss(data, 0.5)[0].backward()
+        judge.loss(data)[0].backward()
         assert not [key for key, value in trained if value.grad is None or not bool(value.grad.any())]
     before = judge.score(frames, first, texts, *seen)
     turn = [*EMBODIMENTS].index(spec.embodiment.robot)  # all robots have the same; they share the work

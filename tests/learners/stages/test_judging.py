@@ -14,6 +14,7 @@ from envs.embodiment import Embodiment
 from envs.episodes import LeRobotWriter
 from envs.episodes.clips import ClipStore
 from envs.judges import MissingFeatures, RuleJudge
+from envs.judges.fitted import FittedJudge
 from envs.simulators.features import features_of_episodes
 from learners.stages.generated import generated_frames, recorded_features
 from learners.stages.judge import JudgeData, calibrate, frame_targets, judge_recordings, train_judge
@@ -141,7 +142,7 @@ def test_a_frame_without_label_moves_no_weight(tiny_store: Stores) -> None:
     batch = JudgeData(store, torch.arange(8), 2, 0.9).sample(6, torch.Generator().manual_seed(0))
     batch["label"][:] = torch.nan
     batch["progress"][:] = torch.nan
-    value, figures = judge.loss(batch, 0.5)
+    value, figures = judge.loss(batch)
     value.backward()
     assert float(figures["success"]) == 0.0
     assert not any(bool(p.grad.any()) for p in judge.parameters() if p.grad is not None)
@@ -221,3 +222,24 @@ def test_shifts_move_by_whole_pixels_and_repeat_the_border() -> None:
     moved = out[:, 16] - 16
     assert moved.abs().max() == 3 and len(moved.unique()) == 7
     assert torch.equal(out, (torch.arange(32) + moved[:, None]).clamp(0, 31))
+
+
+class Blind(FittedJudge):
+    """Says the same of every frame."""
+
+    def __init__(self) -> None:
+        super().__init__(hold=1, margin=0.0, discount=0.9)
+        self.said = torch.nn.Parameter(torch.zeros(2))
+
+    def forward(self, data: TensorDict) -> torch.Tensor:
+        """See FittedJudge."""
+        return self.said.expand(len(data), 2)
+
+
+def test_a_judge_that_sees_nothing_learns_to_say_as_likely_as_not(tiny_store: Stores) -> None:
+    batch = JudgeData(tiny_store(ARM_DELTAS), torch.arange(20), 1, 0.9).sample(
+        30, torch.Generator().manual_seed(0)
+    )
+    judge = Blind()
+    judge.loss(batch)[0].backward()
+    assert judge.said.grad is not None and float(judge.said.grad[0]) == pytest.approx(0.0, abs=1e-6)
