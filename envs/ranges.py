@@ -13,7 +13,19 @@ Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
 Port = Annotated[int, Ge(0), Le(65535)]  # 0 lets the system choose
 Share = Annotated[float, Ge(0), Le(1)]
+Fraction = Annotated[float, Gt(0), Lt(1)]
 Decay = Annotated[float, Ge(0), Lt(1)]  # what is left of something after each step
 Discount = Annotated[float, Gt(0), Le(1)]
 
-__all__ = ["Count", "Decay", "Discount", "Natural", "NonNegative", "Port", "Positive", "Seed", "Share"]
+__all__ = [
+    "Count",
+    "Decay",
+    "Discount",
+    "Fraction",
+    "Natural",
+    "NonNegative",
+    "Port",
+    "Positive",
+    "Seed",
+    "Share",
+]

@@ -4,6 +4,7 @@ a rollout.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
@@ -13,7 +14,7 @@ from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
 
 from envs.ranges import Count, Natural, NonNegative, Positive, Share
-from envs.specs import CHUNK, INVALID_ACTION, JUDGE_STATUS, LOG_PROB, LOST, Status
+from envs.specs import CHUNK, INVALID_ACTION, JUDGE_STATUS, LOG_PROB, LOST, Status, WorldSpec
 
 
 @dataclass(frozen=True)
@@ -145,6 +146,24 @@ class Anchor(Protocol):
     def loss(self, data: TensorDict, generator: torch.Generator) -> Tensor:
         """Its scalar loss."""
         ...
+
+
+def clip_bounds(low: float, high: float, numbers: int | None, spec: WorldSpec) -> tuple[float, float]:
+    """How far below and above one the likelihood ratio of a whole chunk may go before it is clipped.
+
+    The logarithm of a chunk's ratio is a sum over its numbers. If each of them moves as far, its spread grows
+    with the root of their count: bounds meant for few numbers clip chunks of many at steps that change
+    nothing else.
+
+    Args:
+        low, high: bounds for chunks of `numbers` numbers, low below one.
+        numbers: see there; None: the bounds are for chunks as they are.
+        spec: of the world that is acted in; its chunks have K A numbers.
+    """
+    if numbers is None:
+        return low, high
+    wider = math.sqrt(spec.chunk * spec.embodiment.action_dim / numbers)
+    return 1 - (1 - low) ** wider, (1 + high) ** wider - 1
 
 
 def first_episode(done: Tensor) -> Tensor:

@@ -20,10 +20,10 @@ from torch.distributions import kl_divergence
 from torchrl.objectives import ClipPPOLoss
 
 from actors.policies.contract import action_key, distribution, input_keys, trained_part, with_text
-from envs.ranges import Count, NonNegative, Positive
+from envs.ranges import Count, Fraction, NonNegative, Positive
 from envs.specs import LOG_PROB, WorldSpec
 from envs.targets import options
-from learners.rl.algorithm import first_episode, sound, transitions
+from learners.rl.algorithm import clip_bounds, first_episode, sound, transitions
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,9 @@ class GRPOConfig:
         group: episodes per start frame.
         normalise: divide by the group's standard deviation; without, advantages keep the reward's unit (Liu
             et al. 2025).
-        clip_low, clip_high: bounds of the likelihood ratio below and above one.
+        clip_low, clip_high: bounds below and above one of the likelihood ratio of a chunk of `clip_numbers`
+            numbers, see clip_bounds.
+        clip_numbers: None: of chunks as they are.
         kl: weight of the KL to the policy that RL started from.
         entropy: weight of the entropy bonus.
         shaped: credit each chunk with the reward that is still to come instead of the whole episode's.
@@ -42,8 +44,9 @@ class GRPOConfig:
 
     group: Count
     normalise: bool
-    clip_low: Positive
+    clip_low: Fraction
     clip_high: Positive
+    clip_numbers: Count | None
     kl: NonNegative
     entropy: NonNegative
     shaped: bool
@@ -70,7 +73,7 @@ class GRPO:
         self.objective = ClipPPOLoss(
             self.policy,
             None,
-            clip_epsilon=(config.clip_low, config.clip_high),
+            clip_epsilon=clip_bounds(config.clip_low, config.clip_high, config.clip_numbers, spec),
             entropy_bonus=config.entropy > 0,
             entropy_coeff=config.entropy,
             functional=False,

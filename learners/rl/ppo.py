@@ -20,11 +20,11 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from actors.policies.contract import action_key, device_of, input_keys, trained_part, with_text
-from envs.ranges import Count, Discount, Natural, NonNegative, Positive, Share
+from envs.ranges import Count, Discount, Fraction, Natural, NonNegative, Positive, Share
 from envs.rng import order_generator
 from envs.specs import LOG_PROB, WorldSpec
 from envs.targets import options
-from learners.rl.algorithm import sound, transitions
+from learners.rl.algorithm import clip_bounds, sound, transitions
 from learners.rl.critic import build_critic
 
 
@@ -34,7 +34,8 @@ class PPOConfig:
 
     Args:
         gamma, lam: discount per chunk and GAE's lambda.
-        clip: clipping of the likelihood ratio.
+        clip: clipping of the likelihood ratio of a chunk of `clip_numbers` numbers, see clip_bounds.
+        clip_numbers: None: of chunks as they are.
         entropy: weight of the entropy bonus.
         critic: weight of the value loss.
         critic_width, critic_lr: hidden size and learning rate of the value network.
@@ -44,7 +45,8 @@ class PPOConfig:
 
     gamma: Discount
     lam: Share
-    clip: Positive
+    clip: Fraction
+    clip_numbers: Count | None
     entropy: NonNegative
     critic: NonNegative
     critic_width: Count
@@ -75,7 +77,7 @@ class PPO:
         self.objective = ClipPPOLoss(
             self.policy,
             self.critic,
-            clip_epsilon=config.clip,
+            clip_epsilon=clip_bounds(config.clip, config.clip, config.clip_numbers, spec),
             entropy_bonus=config.entropy > 0,
             entropy_coeff=config.entropy,
             critic_coeff=config.critic,

@@ -33,6 +33,7 @@ _GRPO: dict[str, Any] = {
     "normalise": True,
     "clip_low": 0.2,
     "clip_high": 0.28,
+    "clip_numbers": None,
     "kl": 0.0,
     "entropy": 0.0,
     "shaped": False,

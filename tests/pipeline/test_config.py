@@ -128,7 +128,7 @@ WRONG: dict[type, list[Any]] = {
 }
 # other packages' options; where null has a meaning
 FREE = ("simulator.scratch", "policy.policy", "judge.chat.body")
-NULLABLE = ("rl.horizon", "task.suite", "finetune.weights", "judge.chat.key")
+NULLABLE = ("rl.horizon", "task.suite", "finetune.weights", "judge.chat.key", "algorithm.clip_numbers")
 
 
 WHOLE = "experiment=quickstart"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -9,9 +11,10 @@ from tensordict import TensorDict
 from envs.specs import INVALID_ACTION, JUDGE_STATUS, LOST, SUCCESS, Status
 from envs.targets import ConfigError, options
 from learners.rl.alarms import Alarms
-from learners.rl.algorithm import RLConfig, finite, first_episode, judged, sound, whole
+from learners.rl.algorithm import RLConfig, clip_bounds, finite, first_episode, judged, sound, whole
 from learners.rl.update import outcome
 from learners.training.fit import TrainingDiverged
+from tests.embodiments import ARM_DELTAS, world_spec
 from tests.learners.rl.test_algorithms import RL
 
 DONE = torch.tensor([[False, True, False, True], [False, False, False, True]])
@@ -35,6 +38,22 @@ def test_an_episode_that_a_judge_a_nan_or_a_crash_spoiled_is_left_out_whole() ->
     batch["next"].update({"reward": torch.ones(2, 4, 1), SUCCESS: torch.ones(2, 4, 1, dtype=torch.bool)})
     told = outcome(batch)
     assert (told["dropped_by_physics"], told["dropped_nan"], told["dropped_by_judge"]) == (1.0, 1.0, 0.0)
+
+
+def test_a_chunk_of_many_numbers_is_clipped_as_often_as_one_of_few_if_each_moves_as_far() -> None:
+    """A step by 6% of the exploration of every number of independent normal distributions."""
+    outside = []
+    for actions in (1, 4, 16):
+        spec = replace(world_spec(ARM_DELTAS), chunk=actions)
+        numbers = actions * ARM_DELTAS.action_dim
+        low, high = clip_bounds(0.2, 0.28, 8, spec)
+        noise = torch.randn(4000, numbers, generator=torch.Generator().manual_seed(actions))
+        ratio = (0.06 * noise - 0.06**2 / 2).sum(1).exp()
+        outside.append(float(((ratio < 1 - low) | (ratio > 1 + high)).float().mean()))
+        assert 0 < low < 1
+    assert max(outside) - min(outside) < 0.06 and min(outside) > 0.1
+    assert clip_bounds(0.2, 0.28, None, spec) == (0.2, 0.28)
+    assert clip_bounds(0.2, 0.28, numbers, spec) == pytest.approx((0.2, 0.28))
 
 
 def test_alarms() -> None:
