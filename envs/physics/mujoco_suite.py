@@ -1,9 +1,12 @@
-"""What task suites on MuJoCo share: pictures, what each pixel shows, calibration, and steps per frame."""
+"""What task suites on MuJoCo share: pictures, what each pixel shows, calibration, steps per frame, and an
+error where physics diverges.
+"""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from typing import NamedTuple
+from weakref import WeakSet
 
 import mujoco
 import numpy as np
@@ -13,6 +16,19 @@ from envs.physics.render import Offscreen, calibration, offscreen_for
 from envs.physics.suite import Array, SuiteError, TaskSuite
 
 _SLOWEST = 5.0  # frames per second that an error still names
+# Contexts for pictures that a process keeps beyond one for each of its suites: these may all be in episodes
+# of different tasks, which are rendered by turns, and tasks that are not in play come back.
+_SPARE_CONTEXTS = 8
+_SUITES: WeakSet[MujocoSuite] = WeakSet()  # of this process
+_DIVERGED = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
+
+
+class SimulationDiverged(RuntimeError):
+    """Positions, velocities or accelerations were no longer numbers, or too large: the episode is void."""
 
 
 class World(NamedTuple):
@@ -29,7 +45,8 @@ class World(NamedTuple):
 
 
 class MujocoSuite(TaskSuite):
-    """A suite whose episodes are MuJoCo worlds; subclasses say by `world` which one is open.
+    """A suite whose episodes are MuJoCo worlds; subclasses say by `world` which one is open, and by
+    `carry_out` what an action does in it.
 
     Args:
         size: (height, width) of every picture.
@@ -38,10 +55,37 @@ class MujocoSuite(TaskSuite):
 
     def __init__(self, size: tuple[int, int], views: tuple[str, ...]):
         self.size, self.views = size, views
+        _SUITES.add(self)
 
     @abstractmethod
     def world(self) -> World:
         """That of the episode which was reset last."""
+
+    @abstractmethod
+    def carry_out(self, action: Array) -> None:
+        """What TaskSuite.step promises.
+
+        Raises:
+            ValueError: if the action [A] is not finite or has another shape.
+        """
+
+    def step(self, action: Array) -> None:
+        """See TaskSuite.step.
+
+        Raises:
+            ValueError: as `carry_out` does.
+            SimulationDiverged: if physics did. MuJoCo itself prints a warning, puts all things where the
+                model's file has them, and goes on.
+        """
+        warnings = self.world().data.warning
+        for kind in _DIVERGED:
+            warnings[kind].number = 0
+        self.carry_out(action)
+        found = [kind.name for kind in _DIVERGED if warnings[kind].number]
+        if found:
+            raise SimulationDiverged(
+                f"physics diverged under the action {np.round(action, 3).tolist()}: {', '.join(found)}"
+            )
 
     def render(self) -> NDArray[np.uint8]:
         """Pictures uint8 [V, 3, H, W] without shadows and reflections, which cost eight times all else in
@@ -71,7 +115,7 @@ class MujocoSuite(TaskSuite):
 
     def _offscreen(self, size: tuple[int, int]) -> Offscreen:
         assets, model, _ = self.world()
-        return offscreen_for(assets, model, size)
+        return offscreen_for(assets, model, size, len(_SUITES) + _SPARE_CONTEXTS)
 
 
 def steps_per_frame(control_hz: float, sim_hz: float) -> int:

@@ -122,7 +122,7 @@ class OGBench(MujocoSuite):
         self.condition.reset()
         self._satisfied = False
 
-    def step(self, action: Array) -> None:
+    def carry_out(self, action: Array) -> None:
         """Hold one action [5] for a frame; what exceeds -1..1 is cut.
 
         Raises:

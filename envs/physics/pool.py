@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.machine import available_cores
+from envs.physics import process
 from envs.physics.process import PoolError, WorkerProcess
 from envs.physics.suite import task_names
 from envs.physics.worker import Track, WorkerSpec
@@ -88,7 +89,7 @@ class TaskPool:
         """
         return self._scatter("step", chunks)
 
-    def script(self, jobs: list[tuple[int, float]], chunk: int) -> list[Track]:
+    def script(self, jobs: list[tuple[int, float]], chunk: int | None) -> list[Track]:
         """Scripted episodes for (seed, noise_level) pairs, in the order of `jobs`; those that are given up
         are missing. See Worker.script.
 
@@ -98,8 +99,10 @@ class TaskPool:
         self._begun += len(jobs)
         return self._deal("script", jobs, chunk)
 
-    def segment(self, jobs: list[tuple[int, NDArray[Any]]]) -> list[tuple[NDArray[np.uint8] | None, Any]]:
-        """Labels and pictures of repeated episodes, in the order of `jobs`; see Worker.segment.
+    def segment(
+        self, jobs: list[tuple[int, NDArray[Any]]]
+    ) -> list[tuple[NDArray[np.uint8] | None, NDArray[np.uint8], dict[str, NDArray[Any]]]]:
+        """What repeated episodes show, in the order of `jobs`; see Worker.segment.
 
         Raises:
             PoolError: if an episode crashes physics again and again.
@@ -121,7 +124,7 @@ class TaskPool:
         for remote in self._remotes:
             give(remote)
         while busy:
-            for pipe in wait(list(busy)):
+            for pipe in wait(list(busy), process.PATIENCE) or list(busy):  # none: all that are left hang
                 assert isinstance(pipe, Connection)
                 remote, number = busy.pop(pipe)
                 for one in self._answer(remote, [other for other, _ in busy.values()]):

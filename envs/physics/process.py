@@ -2,7 +2,8 @@
 
 A process that dies takes its episodes with it. They run again, one at a time, bit for bit as before; so an
 episode in which physics crashes again and again is found and given up, and the others go on. A suite that
-raises an error stands wherever that left it: its process is replaced as well.
+raises an error stands wherever that left it, and one that says nothing for PATIENCE may never come back:
+their processes are replaced as well.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from envs.targets import ConfigError
 
 log = logging.getLogger(__name__)
 RETRIES = 3  # replacements of a process that may die in a row at one request
+PATIENCE = 3600.0  # s for an answer, which may be to many slots' chunks or a whole episode of a slow suite
 Request = tuple[str, tuple[Any, ...]]  # a method of Worker and its arguments
 
 
@@ -32,9 +34,7 @@ class PoolError(RuntimeError):
 
 
 class _Died(Exception):
-    """The process at the other end of a pipe is gone, or its suite raised an error, whose traceback this
-    holds.
-    """
+    """The process at the other end of a pipe is gone, or no good any more for what this says."""
 
 
 @dataclass
@@ -124,10 +124,8 @@ class WorkerProcess:
     def _replace(self, died: _Died) -> None:
         """Another process in place of one that died or failed; says why, at length the first time."""
         code, before = self.close(0.0), self._trouble
-        self._trouble = (
-            f"raised an error:\n{died}"
-            if str(died)
-            else f"died (exit code {code}): out of memory, a broken GL driver, or a suite that crashes"
+        self._trouble = str(died) or (
+            f"died (exit code {code}): out of memory, a broken GL driver, or a suite that crashes"
         )
         what = "did the same again" if self._trouble == before else self._trouble
         log.warning("its episodes run again, for physics worker %d %s", self.index, what)
@@ -191,6 +189,8 @@ class WorkerProcess:
 
     def _read(self) -> Any:
         try:
+            if not self.pipe.poll(PATIENCE):
+                raise _Died(f"did not answer for {PATIENCE:g} s: a suite that hangs")
             status, value = self.pipe.recv()
         except (EOFError, OSError) as error:
             raise _Died from error
@@ -199,5 +199,5 @@ class WorkerProcess:
         if status == "broken":
             raise PoolError(f"physics worker {self.index} cannot start:\n{value}")
         if status == "error":
-            raise _Died(value)
+            raise _Died(f"raised an error:\n{value}")
         return value

@@ -1,4 +1,4 @@
-"""Offscreen OpenGL: one context per process and picture size, shared by every bench of that process."""
+"""Offscreen OpenGL: contexts by assets and picture size, shared by all benches of a process."""
 
 from __future__ import annotations
 
@@ -62,6 +62,13 @@ class Offscreen:
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._rect = mujoco.MjrRect(0, 0, width, height)
         self._pixels = np.empty((height, width, 3), np.uint8)
+
+    def free(self) -> None:
+        """Give back its memory; it renders no more."""
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()
+        atexit.unregister(self._gl.free)
 
     def render(
         self, model: mujoco.MjModel, data: mujoco.MjData, views: tuple[str, ...], shadows: bool
@@ -141,19 +148,23 @@ def parts_of(model: mujoco.MjModel) -> NDArray[np.uint8]:
     return np.array(kinds, np.uint8)
 
 
-_CONTEXTS: dict[tuple[str, tuple[int, int]], Offscreen] = {}
+_CONTEXTS: dict[tuple[str, tuple[int, int]], Offscreen] = {}  # the one unused for longest first
 
 
-def offscreen_for(assets: str, model: mujoco.MjModel, size: tuple[int, int]) -> Offscreen:
-    """The process's context, made at first use.
+def offscreen_for(assets: str, model: mujoco.MjModel, size: tuple[int, int], most: int) -> Offscreen:
+    """The process's context, good until the next call; made where there is none.
 
     Args:
         assets: a name that models with equal meshes, textures and geoms share.
         model: one of them.
         size: (height, width) of the pictures.
+        most: contexts that are kept; the software driver takes over 100 MB for one of Meta-World's tasks and
+            .3 s to make it.
     """
-    if (assets, size) not in _CONTEXTS:
-        _CONTEXTS[assets, size] = Offscreen(model, size)
+    context = _CONTEXTS.pop((assets, size), None)
+    while len(_CONTEXTS) >= most:
+        _CONTEXTS.pop(next(iter(_CONTEXTS))).free()
+    _CONTEXTS[assets, size] = context or Offscreen(model, size)
     return _CONTEXTS[assets, size]
 
 

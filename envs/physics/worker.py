@@ -177,9 +177,9 @@ class Worker:
                 out[index]["track"], slot.track = slot.track, None
         return out
 
-    def script(self, jobs: list[tuple[int, float]], chunk: int) -> list[Track]:
+    def script(self, jobs: list[tuple[int, float]], chunk: int | None) -> list[Track]:
         """Whole episodes of scripted behaviours for (seed, noise_level) pairs; recorded to the horizon, or to
-        the end of the `chunk` actions in which they succeed.
+        the end of the `chunk` actions in which they succeed, if it is not None.
         """
         out = []
         suite = self.slots[0].suite
@@ -190,7 +190,7 @@ class Worker:
             track = Track(seed, observed.instruction, observed.intrinsic)
             track.add(suite, observed)
             for step in range(self.spec.horizon):
-                if observed.success and step % chunk == 0:
+                if observed.success and chunk is not None and step % chunk == 0:
                     break
                 suite.step(act())
                 observed = suite.observe()
@@ -198,23 +198,26 @@ class Worker:
             out.append(track)
         return out
 
-    def segment(self, jobs: list[tuple[int, Array]]) -> list[tuple[NDArray[np.uint8] | None, Array]]:
+    def segment(
+        self, jobs: list[tuple[int, Array]]
+    ) -> list[tuple[NDArray[np.uint8] | None, Array, dict[str, Array]]]:
         """For episodes that are repeated from (seed, commands [T, A]), of which the first is in force at the
         start: what each pixel shows, uint8 [T, V, H, W] (TaskSuite.segment), None of suites that do not know;
-        and pictures uint8 [2, V, 3, H, W] of the first and the last frame, by which one sees whether it is
-        the same episode.
+        and, by which one sees whether it is the same episode, pictures uint8 [2, V, 3, H, W] of the first and
+        the last frame, and TaskSuite.privileged at the start.
         """
         out = []
         suite = self.slots[0].suite
         for seed, commands in jobs:
             self._lay_out(suite, seed)
             labels, pictures = [suite.segment()], [rendered(suite)]
+            start = {name: np.array(value) for name, value in suite.privileged().items()}
             for command in commands[1:]:
                 suite.step(command)
                 labels.append(suite.segment())
             pictures.append(rendered(suite))
             known = [one for one in labels if one is not None]
-            out.append((np.stack(known) if len(known) == len(labels) else None, np.stack(pictures)))
+            out.append((np.stack(known) if len(known) == len(labels) else None, np.stack(pictures), start))
         return out
 
     def picture(self, seed: int, size: tuple[int, int]) -> NDArray[np.uint8]:

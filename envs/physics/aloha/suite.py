@@ -20,6 +20,7 @@ from envs.physics.aloha.cameras import CAMERAS, load_model, wrist_of
 from envs.physics.aloha.experts import NoisyScript
 from envs.physics.aloha.scripts import Insertion, Script, TransferCube
 from envs.physics.mujoco_suite import MujocoSuite, World, steps_per_frame
+from envs.physics.starts import STARTS, belongs, check_starts
 from envs.physics.suite import (
     Expert,
     HeldCondition,
@@ -30,6 +31,7 @@ from envs.physics.suite import (
     checked_action,
 )
 from envs.ranges import NonNegative, Positive
+from envs.rng import Stream, episode_rng
 
 SIM_HZ = 50.0  # at which gym-aloha's own step takes actions
 MAX_SPEED = 4.0  # rad/s that a command may change by; much faster ones make the simulation unstable
@@ -39,6 +41,11 @@ _INSTRUCTIONS = {
     "insertion": "pick up the red peg and the blue socket and insert the peg into the socket",
 }
 _SCRIPTS: dict[str, type[Script]] = {"transfer_cube": TransferCube, "insertion": Insertion}
+# Low and high x, y in metres of the cube, or of the peg and the socket, where gym-aloha draws them.
+_GROUND = {
+    "transfer_cube": np.array([(0.0, 0.4), (0.2, 0.6)]),
+    "insertion": np.array([(0.1, 0.4, -0.2, 0.4), (0.2, 0.6, -0.1, 0.6)]),
+}
 INSTALL = (
     "python -m pip install gymnasium==1.4.0 dm-env==1.6 dm-tree==0.1.10 lxml==6.1.3 && "
     "python -m pip install --no-deps dm_control==1.0.41 gym-aloha==0.1.5"
@@ -59,13 +66,15 @@ class Aloha(MujocoSuite):
         size: (height, width) of every picture.
         cameras: names out of cameras.CAMERAS, in the views' order.
         calibrated: whether intrinsics and camera poses are told.
+        starts: which of those drawn: all, inner, or outer, unseen where inner ones are learned from; see
+            starts.belongs.
 
     Raises:
         SuiteError: if gym-aloha is not installed, or an option does not fit.
     """
 
     tasks = tuple(_INSTRUCTIONS)
-    offers = MappingProxyType({"cameras": tuple(CAMERAS)})
+    offers = MappingProxyType({"cameras": tuple(CAMERAS), "starts": STARTS})
 
     def __init__(
         self,
@@ -74,6 +83,7 @@ class Aloha(MujocoSuite):
         size: tuple[int, int],
         cameras: tuple[str, ...],
         calibrated: bool,
+        starts: str,
     ):
         try:
             with warnings.catch_warnings():
@@ -82,10 +92,12 @@ class Aloha(MujocoSuite):
         except ImportError as error:
             raise SuiteError(f"task=aloha needs more packages ({error}): {INSTALL}") from error
         check_cameras(cameras, CAMERAS)
+        check_starts(starts)
         super().__init__(size, tuple(CAMERAS[name] for name in cameras))
         self.substeps = steps_per_frame(control_hz, SIM_HZ)
         self.condition = HeldCondition(hold, control_hz)
         self._benches: dict[str, _Bench] = {}
+        self._starts = starts
         names = tuple(f"{side}_{part}" for side in SIDES for part in (*JOINTS, "gripper"))
         self.embodiment = Embodiment(
             robot="aloha",
@@ -105,12 +117,12 @@ class Aloha(MujocoSuite):
         """Draw the places of cube, or peg and socket, from `seed`."""
         if task not in self._benches:
             check_task(task, self.tasks)
-            self._benches[task] = _Bench(task)
+            self._benches[task] = _Bench(task, self._starts)
         self._task, self._bench = task, self._benches[task]
         self._bench.reset(seed)
         self.condition.reset()
 
-    def step(self, action: Array) -> None:
+    def carry_out(self, action: Array) -> None:
         """Go over to one command [14] in the course of a frame; what exceeds the joints' limits or speed is
         cut.
 
@@ -154,7 +166,7 @@ class Aloha(MujocoSuite):
 class _Bench:
     """One of gym-aloha's tasks in dm_control's physics."""
 
-    def __init__(self, task: str):
+    def __init__(self, task: str, starts: str):
         from dm_control import mujoco
         from dm_control.rl.control import PhysicsError
         from gym_aloha import utils
@@ -166,6 +178,7 @@ class _Bench:
             "transfer_cube": utils.sample_box_pose,
             "insertion": lambda seed: np.concatenate(utils.sample_insertion_pose(seed)),
         }[task]
+        self._starts, self._ground = starts, _GROUND[task]
         self._task: Any = {"transfer_cube": sim.TransferCubeTask, "insertion": sim.InsertionTask}[task]()
         self.model = load_model(str(ASSETS_DIR / f"bimanual_viperx_{task}.xml"))
         self._physics = mujoco.Physics.from_model(mujoco.wrapper.MjModel(self.model))
@@ -178,8 +191,13 @@ class _Bench:
         self._speed = np.tile([MAX_SPEED] * len(JOINTS) + [np.inf], 2)
 
     def reset(self, seed: int) -> None:
-        """Lay out the episode that gym-aloha draws from a seed, of which it takes 32 bits."""
-        self._sim.BOX_POSE[0] = self._draw(seed % 2**32)
+        """Lay out the episode that gym-aloha draws from a seed, of which it takes 32 bits; where its start is
+        not one of those chosen, from further ones.
+        """
+        poses, rng = self._draw(seed % 2**32), episode_rng(seed, Stream.START)
+        while not belongs(self._starts, poses.reshape(-1, 7)[:, :2].flatten(), *self._ground):
+            poses = self._draw(int(rng.integers(2**32)))
+        self._sim.BOX_POSE[0] = poses
         self._task.initialize_episode(self._physics)
         self.command = self.state()
         self.reward = self._task.get_reward(self._physics)

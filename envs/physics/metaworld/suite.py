@@ -15,9 +15,11 @@ import mujoco
 import numpy as np
 
 from envs.embodiment import ActionKind, Arm, Camera, Embodiment
+from envs.physics.metaworld.held_policy import HeldPolicy
 from envs.physics.metaworld.noisy_policy import NoisyPolicy
 from envs.physics.metaworld.words import instruction_of
 from envs.physics.mujoco_suite import MujocoSuite, World, steps_per_frame
+from envs.physics.starts import STARTS, belongs, check_starts
 from envs.physics.suite import (
     Array,
     Expert,
@@ -63,12 +65,14 @@ class MetaWorld(MujocoSuite):
         size: (height, width) of every picture.
         cameras: names out of CAMERAS, in the views' order.
         calibrated: whether intrinsics and camera poses are told.
+        starts: which of those drawn: all, inner, or outer, unseen where inner ones are learned from; see
+            starts.belongs.
 
     Raises:
         SuiteError: if metaworld is not installed, or an option does not fit.
     """
 
-    offers = MappingProxyType({"cameras": tuple(CAMERAS)})
+    offers = MappingProxyType({"cameras": tuple(CAMERAS), "starts": STARTS})
 
     def __init__(
         self,
@@ -77,6 +81,7 @@ class MetaWorld(MujocoSuite):
         size: tuple[int, int],
         cameras: tuple[str, ...],
         calibrated: bool,
+        starts: str,
     ):
         try:
             import metaworld
@@ -85,6 +90,7 @@ class MetaWorld(MujocoSuite):
             raise SuiteError(f"task=metaworld needs more packages ({error}): {INSTALL}") from error
         warnings.filterwarnings("ignore", "Constant.s. may be too high")  # its experts' saturated actions
         check_cameras(cameras, CAMERAS)
+        check_starts(starts)
         super().__init__(size, tuple(SCENE[1] if name == SCENE[0] else name for name in cameras))
         self._classes: dict[str, Any] = metaworld.ALL_V3_ENVIRONMENTS
         self._experts: dict[str, Any] = ENV_POLICY_MAP
@@ -92,6 +98,7 @@ class MetaWorld(MujocoSuite):
         self.substeps = steps_per_frame(control_hz, SIM_HZ)
         self.condition = HeldCondition(hold, control_hz)
         self._envs: dict[str, Any] = {}
+        self._starts = starts
         self._task = ""
         names = ("x", "y", "z", "gripper")
         self.embodiment = Embodiment(
@@ -109,7 +116,7 @@ class MetaWorld(MujocoSuite):
         """Draw object and goal of `task` from `seed`."""
         if task not in self._envs:
             check_task(task, self.tasks)
-            self._envs[task] = _open(self._classes[task])
+            self._envs[task] = _open(self._classes[task], self._starts)
         self._task, self._env = task, self._envs[task]
         self._env.seed(seed)
         self._env.reset()
@@ -123,7 +130,7 @@ class MetaWorld(MujocoSuite):
         self._satisfied = bool(info["success"])
         self.condition.reset()
 
-    def step(self, action: Array) -> None:
+    def carry_out(self, action: Array) -> None:
         """Hold one action [4] for a frame; what exceeds -1..1 is cut.
 
         Raises:
@@ -161,16 +168,25 @@ class MetaWorld(MujocoSuite):
         return {"object_poses": self._sight[4:18].reshape(2, 7).copy(), "goal": self._sight[36:39].copy()}
 
     def expert(self, noise_level: float, rng: np.random.Generator) -> Expert:
-        """Meta-World's scripted policy of the task, bent by noise; see NoisyPolicy."""
-        policy = self._experts[self._task]()
+        """Meta-World's scripted policy of the task, bent by noise; see HeldPolicy, NoisyPolicy."""
+        policy, hold = self._experts[self._task](), HeldPolicy(self._env, self.substeps)
         return NoisyPolicy(
-            policy.get_action, lambda: self._sight.copy(), noise_level, rng, 1 / self.embodiment.fps
+            policy.get_action, lambda: self._sight.copy(), hold, noise_level, rng, 1 / self.embodiment.fps
         )
 
 
-def _open(factory: Any) -> Any:
+def _open(factory: Any, starts: str) -> Any:
     """One of Meta-World's environments, whose starts come from its seed and whose goal experts can see."""
     env = factory()
+    draw = env._get_state_rand_vec
+
+    def chosen() -> Array:
+        space, drawn = env._random_reset_space, draw()
+        while not belongs(starts, drawn, space.low, space.high):
+            drawn = draw()
+        return drawn
+
+    env._get_state_rand_vec = chosen
     env._partially_observable = False
     vars(env).pop(
         "sawyer_observation_space", None

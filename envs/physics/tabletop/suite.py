@@ -72,7 +72,7 @@ class TwoArmSuite(MujocoSuite):
             kinematics=kind.kinematics(),
         )
 
-    def step(self, action: Array) -> None:
+    def carry_out(self, action: Array) -> None:
         """Carry out one absolute action [A]; too fast or too far is carried out as far as limits allow."""
         self._bench.step(action)
 

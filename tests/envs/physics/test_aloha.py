@@ -73,6 +73,19 @@ def test_starts_and_dynamics_are_those_of_gym_aloha(task: str, monkeypatch: pyte
         assert env.task.get_reward(physics) == 4 * ours.observe().progress
 
 
+@pytest.mark.parametrize("task", ["transfer_cube", "insertion"])
+def test_every_start_is_either_inner_or_outer(suite: Aloha, task: str) -> None:
+    inner, outer = (built(starts=starts) for starts in ("inner", "outer"))
+    found = []
+    for seed in range(12):
+        for one in (suite, inner, outer):
+            one.reset(task, seed)
+        poses = [one.privileged()["object_poses"] for one in (suite, inner, outer)]
+        assert 0.42 <= poses[1][0, 1] <= 0.58  # of .4..6 m
+        found.append(tuple(np.array_equal(poses[0], chosen) for chosen in poses[1:]))
+    assert set(found) == {(True, False), (False, True)}
+
+
 def test_fourteen_joint_commands_move_two_arms(suite: Aloha) -> None:
     robot = suite.embodiment
     assert robot.action_kind is ActionKind.JOINTS and not robot.delta

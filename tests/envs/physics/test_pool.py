@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,9 +15,10 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 
 from actors.rollouts.evaluate import evaluate
+from envs.physics import process
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import PoolError, TaskPool
-from envs.physics.suite import build_suite
+from envs.physics.suite import Array, build_suite
 from envs.physics.worker import Worker, WorkerSpec
 from envs.specs import CHUNK, LOST, STATE, ActionMode, Rewards, WorldSpec
 from envs.targets import ConfigError
@@ -159,6 +162,32 @@ def test_an_error_of_the_suite_counts_like_a_crash_and_is_told(
     assert caplog.text.count(why) == 1 and "seed 10; it is dropped" in caplog.text
     with pytest.raises(PoolError, match=f"(?s)in 2 of 3 episodes.*{why}"):
         pool.script([(30, 1.0)], 1)
+    pool.close()
+
+
+class Hanging(Counting):
+    """Counts, and hangs at the first action above 1 of all its processes, which leaves the file `once`."""
+
+    def __init__(self, once: str):
+        super().__init__("")
+        self.once = Path(once)
+
+    def step(self, action: Array) -> None:
+        super().step(action)
+        if action[0] > 1 and not self.once.exists():
+            self.once.touch()
+            time.sleep(600)
+
+
+def test_a_worker_that_hangs_counts_like_one_that_died(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    suite = {"_target_": f"{__name__}.Hanging", "once": str(tmp_path / "once")}
+    pool = TaskPool(suite, "count", 2, 8, 2)
+    monkeypatch.setattr(process, "PATIENCE", 8.0)
+    tracks = pool.script([(seed, float(seed == 2)) for seed in range(4)], 1)
+    assert [track.privileged["count"][-1] for track in tracks] == [8.0, 9.0, 10.0, 11.0]
+    assert (tmp_path / "once").exists() and "did not answer for 8 s" in caplog.text and not pool.lost
     pool.close()
 
 

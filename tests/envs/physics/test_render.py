@@ -10,7 +10,7 @@ import mujoco.egl
 import numpy as np
 import pytest
 
-from envs.physics.render import Offscreen
+from envs.physics.render import Offscreen, offscreen_for
 
 MODEL = "<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>"
 
@@ -33,6 +33,24 @@ def test_pixels_are_means_where_the_buffer_holds_twice_the_size():
     assert len(np.unique(hard[0])) < len(np.unique(soft[0]))  # edges between red and black
     assert np.array_equal(soft, again)
     assert abs(hard[0].mean() - soft[0].mean()) < 8
+
+
+def test_contexts_beyond_the_most_are_freed_the_one_unused_for_longest_first():
+    model = mujoco.MjModel.from_xml_string(SCENE.format(32))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+
+    def picture(assets: str) -> tuple[Offscreen, np.ndarray]:
+        context = offscreen_for(assets, model, (16, 16), most=2)
+        return context, context.render(model, data, ("top",), shadows=False)
+
+    one, first = picture("one")
+    two, _ = picture("two")
+    assert picture("one")[0] is one
+    picture("three")
+    assert two._gl._context is None and picture("one")[0] is one
+    anew, again = picture("two")
+    assert anew is not two and np.array_equal(first, again)
 
 
 def test_a_context_interrupted_while_it_starts_leaves_no_traceback(monkeypatch: pytest.MonkeyPatch):

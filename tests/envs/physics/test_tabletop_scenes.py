@@ -114,6 +114,22 @@ def test_other_words_at_the_same_first_frame_make_the_expert_do_the_other_thing(
             assert not asked.satisfied(suite._bench.data) and len(commands) > 5
 
 
+def test_out_of_domain_the_words_may_ask_for_the_familiar_thing() -> None:
+    task = task_section("tabletop")
+    own, other = (built(**task["variants"][name]) for name in ("out_of_domain", "out_of_domain_swapped"))
+    seen = {SCENES[name].thing for name in task["suite"]["domains"]["in_domain"]}
+    asked = set()
+    for seed in range(20):
+        own.reset("pull", seed)
+        other.reset("pull", seed)
+        layout = other.request.layout
+        assert np.array_equal(own.request.layout.objects, layout.objects)
+        assert THINGS[layout.scene.thing].words in own.instruction
+        assert THINGS[layout.companion].words in other.instruction and layout.companion in seen
+        asked.add(layout.scene.thing in seen)
+    assert asked == {True, False}
+
+
 def test_other_tasks_share_the_first_frame(suite: TabletopScenes) -> None:
     frames, words = [], set()
     for task in suite.tasks:

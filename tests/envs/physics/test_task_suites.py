@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from torchrl.envs.utils import check_env_specs
 
 from envs.episodes import Episode
 from envs.physics.env import PhysicsEnv
+from envs.physics.mujoco_suite import MujocoSuite, SimulationDiverged
 from envs.physics.pool import TaskPool, Track
 from envs.physics.render import PARTS
 from envs.physics.suite import Observation, TaskSuite, build_suite
@@ -127,6 +129,25 @@ def test_the_first_picture_shows_what_is_there(task: dict[str, Any], suite: Task
     thing, later = (labels[main] == PARTS["object"] for labels in there if labels is not None)
     if thing.sum() >= 30:  # a few pixels may be hidden, or settle
         assert (thing & later).sum() > 0.7 * (thing | later).sum()
+
+
+def test_physics_that_diverges_is_an_error_or_changes_nothing(
+    task: dict[str, Any], suite: TaskSuite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not isinstance(suite, MujocoSuite):
+        pytest.skip("not on MuJoCo")
+    monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log
+    for bad in (1e13, np.nan):
+        act(suite, task["name"], 1, 0.0, 2)
+        before = suite.observe().state
+        suite.world().data.qvel[0] = bad
+        try:
+            suite.step(suite.observe().command)
+        except SimulationDiverged as error:
+            assert "BADQVEL" in str(error)
+        else:
+            assert np.array_equal(suite.observe().state, before)
+    assert not act(suite, task["name"], 1, 0.0, 2)[-1].success  # another episode is as good as before
 
 
 def test_the_expert_succeeds_and_chance_does_not(task: dict[str, Any], suite: TaskSuite) -> None:

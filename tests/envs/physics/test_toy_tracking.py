@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
@@ -40,3 +41,12 @@ def test_an_oracle_wins_a_coward_does_not() -> None:
     assert not bool(after["truncated"][2:].any())
     after[CHUNK] = torch.full((4, 4, 2), -1.0)
     assert bool(env.step(after)["next", "truncated"][2:].all())
+
+
+def test_words_of_a_suite_that_are_cut_are_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    env = ToyTrackingEnv(2)
+    for name in ("first", "second", "first"):
+        env.toy.instruction = f"follow the {name} of all the targets " + "that move about " * 20
+        env.reset()
+    said = [entry.getMessage() for entry in caplog.records if "256 bytes" in entry.getMessage()]
+    assert len(said) == 2 and "'follow the first of" in said[0] and "'follow the second of" in said[1]
