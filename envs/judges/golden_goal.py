@@ -83,7 +83,8 @@ class GoldenGoalJudge(GoalJudge):
     def remedy(cls, options: Mapping[str, Any]) -> str:
         """See Judge.remedy."""
         ending, fallback = options["text_world"].get("ending", {}), options["fallback"]
-        settings = ", ".join(f"judge.text_world.ending.{key}={value}" for key, value in ending.items())
+        told = {key: "null" if value is None else value for key, value in ending.items()}
+        settings = ", ".join(f"judge.text_world.ending.{key}={value}" for key, value in told.items())
         return (
             f"its text world does not say in the goals it imagines that the task is done ({settings}), and"
             f" judge.fallback={fallback}: train it longer (text_world_fit), change these, or set"

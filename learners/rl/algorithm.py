@@ -62,6 +62,8 @@ class RLConfig:
             alone; 0 for never.
         evaluate_episodes: of each such trial.
         seed: of start frames, exploration and minibatches.
+        episodes: learned from in all, or a few more (see `within`), with which it ends if `iterations` are
+            not over before; rates then fall by their share. None: as many as there are.
     """
 
     iterations: Count
@@ -90,6 +92,7 @@ class RLConfig:
     evaluate_every: Natural
     evaluate_episodes: Count
     seed: Natural
+    episodes: Count | None = None
 
     def __post_init__(self) -> None:
         if self.envs % self.shards:
@@ -170,6 +173,27 @@ def first_episode(done: Tensor) -> Tensor:
     """Which steps [B, T] belong to the first episode of their slot, from done flags [B, T]."""
     before = torch.cat([torch.zeros_like(done[:, :1]), done[:, :-1]], 1)
     return before.long().cumsum(1) == 0
+
+
+def episode_counts(batch: TensorDict, algorithm: Algorithm) -> Tensor:
+    """How many episodes of each slot of a rollout [B, T] are for learning, int64 [B]: all, with the
+    unfinished last one, or the first one alone, if the algorithm learns from no other.
+    """
+    done = batch["next", "done"].squeeze(-1)
+    if algorithm.supports_delayed_reward:
+        return torch.ones(len(done), dtype=torch.int64)
+    return done.sum(1) + (~done[:, -1]).long()
+
+
+def within(batch: TensorDict, algorithm: Algorithm, episodes: int) -> TensorDict:
+    """The first slots of a rollout [B, T] that hold so many episodes, if it holds as many; groups stay whole.
+
+    All that a slot holds is kept, and two slots at least: of a single number there is no spread. What is left
+    out was played, but nobody learns from it.
+    """
+    counts, size = episode_counts(batch, algorithm), max(2, algorithm.group_size)
+    needed = int((counts.cumsum(0) - counts < episodes).sum())
+    return batch[: -(-needed // size) * size]
 
 
 def judged(batch: TensorDict) -> Tensor:

@@ -32,7 +32,7 @@ def dataset_rollout(
     Args:
         policy: whose visual features the critic reads; of one that writes none, pictures and text are given.
         episodes: labelled ones, int64 [N].
-        discount: per frame, of progress towards success; the judge's.
+        discount: per frame, of progress towards success; the judge's, if it learns progress by one.
 
     Returns:
         TensorDict [N, T] with what critics read of each decision and of what followed, reward, ends, `row`

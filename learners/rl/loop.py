@@ -28,7 +28,7 @@ from actors.rollouts.host import Weights, trained_weights
 from envs.rng import iteration_generator, sampling_seed, update_seed
 from envs.targets import ConfigError
 from learners.rl.alarms import Alarms
-from learners.rl.algorithm import Algorithm, RLConfig
+from learners.rl.algorithm import Algorithm, RLConfig, episode_counts, within
 from learners.rl.feed import AsyncFeed, Feed
 from learners.rl.film import film_rollouts
 from learners.rl.recorded import TrueExperience
@@ -113,6 +113,9 @@ def train_rl(
         generator = iteration_generator(config.seed, iteration)
         return starts.seeds(algorithm.seeds(len(starts.pool), config.envs, generator), iteration)
 
+    def share_over(iteration: int) -> float:
+        return iteration / config.iterations if config.episodes is None else episodes / config.episodes
+
     def sampling(iteration: int, shard: int) -> int:
         return sampling_seed(config.seed, iteration, shard)
 
@@ -156,7 +159,7 @@ def train_rl(
         for iteration in range(first, first if over else config.iterations):
             began = time.perf_counter()
             for group, lr in zip(optimiser.param_groups, rates, strict=True):
-                group["lr"] = lr * (1 - iteration / config.iterations)
+                group["lr"] = lr * (1 - share_over(iteration))
             before = facts_of(iteration)
             try:
                 batch, supply = from_leader(partial(gather, iteration, trainee(trained_weights, policy)))
@@ -167,14 +170,16 @@ def train_rl(
                     checkpoints.save(iteration, state(), before)
                 raise
             collected = time.perf_counter()
+            if config.episodes is not None:
+                batch = within(batch, algorithm, config.episodes - episodes)
             starts.check_groups(batch, algorithm.group_size)
             seed = update_seed(config.seed, iteration)
             figures = update(batch, algorithm, trainee, optimiser, config, seed, true)
             updated = time.perf_counter()
             spent["rollout"] += collected - began
             spent["update"] += updated - collected
-            done = batch["next", "done"]
-            episodes += int(done.sum() + (~done[:, -1]).sum())
+            episodes += int(episode_counts(batch, algorithm).sum())
+            last = iteration + 1 == config.iterations or share_over(iteration + 1) >= 1
             spoiled = {reason: int(figures[key]) for reason, (key, _) in _SPOILED.items()}
             ledger.settle(len(batch), spoiled)
             if feed is not None:
@@ -185,7 +190,7 @@ def train_rl(
             figures |= supply | {"time/rollout": collected - began, "time/update": updated - collected}
             figures["time/learning"] = sum(spent.values())
             enough = False
-            if watch is not None and watch.due(iteration, config.iterations):
+            if watch is not None and (last or watch.due(iteration, config.iterations)):
                 weights = trainee(trained_weights, policy)
                 seen, enough = from_leader(partial(watch.look, iteration, weights))
                 figures |= seen
@@ -216,7 +221,7 @@ def train_rl(
                     f"{name}: about {(updated - began) * (config.iterations - first - 1) / 60:.1f} min for"
                     f" {config.iterations - first - 1} more iterations"
                 )
-            over = enough or iteration + 1 == config.iterations
+            over = enough or last
             stop = from_leader(stop_requested)
             if (iteration + 1) % config.checkpoint_every == 0 or over or stop:
                 checkpoints.save(iteration + 1, state(), facts_of(iteration + 1))

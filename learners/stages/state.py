@@ -24,6 +24,8 @@ from learners.training.lora import low_rank
 # Clips whose features are computed once and kept: at most so many, in batches of so many, as few as still let
 # each be learned from so many times, and as many as fit into so many bytes.
 _CLIPS, _AT_ONCE, _VISITS, _KEPT = 6000, 50, 16, 2 * 2**30
+# Bytes of a batch up to which the training thread picks its rows itself (.03 ms for .3 MB; see ahead.py).
+_AT_HAND = 2**20
 
 
 def train_state(
@@ -63,12 +65,10 @@ def train_state(
     one = clips.sample(1, drawn)
     began = time.perf_counter()
     count = min(_CLIPS, options.steps * options.batch // _VISITS, _KEPT // max(1, one["shown"].nbytes))
-    kept = clips.many(count, drawn) if count >= options.part else None
+    kept = _Kept(clips.many(count, drawn), options.part) if count >= options.part else None
     ahead = time.perf_counter() - began
 
-    def batch(step: int, generator: torch.Generator) -> TensorDict:
-        if kept is not None:
-            return kept[torch.randint(len(kept), (options.part,), generator=generator)]
+    def sample(step: int, generator: torch.Generator) -> TensorDict:
         return store.sample(episodes, options.part, clips.spec, generator)
 
     def loss(clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
@@ -77,10 +77,28 @@ def train_state(
         return decoder.loss(features, data["history"], data["future"], generator), {}
 
     with low_rank(decoder, lora):
-        stats = fit("state", decoder, batch, loss, options, folder)
+        stats = fit("state", decoder, kept or sample, loss, options, folder)
     for name, parameter in simulator.named_parameters():
         parameter.requires_grad_(wanted[name])
     return {**stats, "features_seconds": ahead}
+
+
+class _Kept:
+    """Random rows of what is kept, as `fit` asks for them.
+
+    Args:
+        clips: [N] of them, in main memory.
+        count: of a batch.
+    """
+
+    def __init__(self, clips: TensorDict, count: int):
+        self.clips, self.count = clips, count
+        self.at_hand = count * clips.bytes() <= _AT_HAND * len(clips)
+
+    def __call__(self, step: int, generator: torch.Generator) -> TensorDict:
+        """A batch [count]."""
+        pick = torch.randint(len(self.clips), (self.count,), generator=generator)
+        return self.clips.apply(lambda rows: rows.index_select(0, pick), batch_size=[self.count])
 
 
 class _Features:

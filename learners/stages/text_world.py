@@ -67,7 +67,8 @@ def train_text_world(
     folder: Path,
     tokenizer: FitConfig | None = None,
 ) -> dict[str, Any]:
-    """Train `world` in place on those of the episodes that are labelled successes.
+    """Train `world` in place on those of the episodes that are labelled successes, and set how long its
+    golden trajectories may become by the time that these took (TextWorld.longest).
 
     Args:
         stride: see SuccessfulClips.
@@ -77,7 +78,8 @@ def train_text_world(
         What `fit` does, how many episodes it learned from, and what the tokenizer's training says.
 
     Raises:
-        ConfigError: if none of them is a success, or an instruction is longer than its encoder takes.
+        ConfigError: if none of them is a success, or an instruction of the store, whatever its split, is
+            longer than its encoder takes.
     """
     good = episodes[[store.episodes[number]["success"] is True for number in episodes.tolist()]]
     if not len(good):
@@ -85,7 +87,9 @@ def train_text_world(
             "no episode of the data is labelled a success (next.success), and a text world learns from those"
             " alone; collect or label some, or use a judge without judge.text_world"
         )
-    world.check([store.instructions[number] for number in good.tolist()])
+    # All of them: calibration and measurements ask about episodes that it does not learn from.
+    world.check(store.instructions)
+    world.longest.fill_(longest_of(store, good, stride))
     about: dict[str, Any] = {}
     if tokenizer is not None:
         kept = train_tokenizer(world, store, episodes, tokenizer, folder / "tokenizer")
@@ -97,6 +101,16 @@ def train_text_world(
 
     stats = fit("text_world", world, batch, world.loss, options, folder)
     return {**stats, **about, "successes": len(good)}
+
+
+def longest_of(store: ClipStore, episodes: Tensor, stride: Count) -> int:
+    """Frames, `stride` recorded ones apart, after which the task is done in the slowest of these successful
+    episodes, int64 [N], and a quarter more; at least 1.
+    """
+    done = store.arrays["success"]
+    spans = zip(store.start[episodes].tolist(), store.length[episodes].tolist(), strict=True)
+    slowest = max(int(done[start : start + length].long().argmax()) for start, length in spans)
+    return max(1, -(-5 * slowest // (4 * stride)))
 
 
 def calibrate_ending(

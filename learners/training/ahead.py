@@ -1,4 +1,7 @@
-"""Batches made ahead: while one is learned from, a thread gathers the next from disk and moves it over."""
+"""Batches made ahead: while one is learned from, a thread gathers the next from disk and moves it over.
+
+Where handing a batch over takes longer than making it, it is made when it is asked for.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,8 @@ class BatchesAhead:
 
     Args:
         batch: (step, generator) -> anything; runs in another thread, so it must not read what training
-            changes.
+            changes. If it has a true attribute `at_hand`, it runs in this one, when its batch is asked for:
+            two threads wait for Python's lock at every operation, which a few rows in memory are not worth.
         seed: of the generators, see envs/rng.py.
         steps: numbers of the steps.
         parts: the microbatches of this process, of every step.
@@ -37,9 +41,11 @@ class BatchesAhead:
         # two teams wait for each other at every operation (a U-Net's step on two cores: 204 ms, so 143).
         self._thread = ThreadPoolExecutor(1, "batches", initializer=torch.set_num_threads, initargs=(1,))
         self._next: Future[Drawn] | None = None
+        self._at_hand = getattr(batch, "at_hand", False)
 
     def __enter__(self) -> BatchesAhead:
-        self._submit_next()
+        if not self._at_hand:
+            self._submit_next()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -51,6 +57,8 @@ class BatchesAhead:
         Raises:
             Exception: whatever making it raised.
         """
+        if self._at_hand:
+            return self._make(*next(self._order))
         assert self._next is not None, "there are no more batches"
         drawn = self._next.result()
         self._submit_next()

@@ -119,7 +119,7 @@ def fit(
         module: what is trained; parameters without gradient are left alone. A Trainee, where it is to be
             gathered otherwise than those are by default.
         batch: (step, generator) -> config.part samples of anything `loss` understands; made ahead in another
-            thread, see ahead.py.
+            thread unless it is at hand, see ahead.py.
         loss: (batch, generator) -> scalar loss and figures to log.
         folder: receives checkpoints and metrics.jsonl; a checkpoint found there is resumed.
         watch: the figure shown while it runs.

@@ -14,6 +14,7 @@ from torch import Tensor
 from actors.factory import build_judge, build_physics, build_policy, build_simulator, build_state_decoder
 from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
+from envs.episodes.clips import ClipStore
 from envs.episodes.filming import side_by_side, write_film
 from envs.files import write_atomically, write_text
 from envs.rng import Purpose, episode_seeds
@@ -22,6 +23,7 @@ from pipeline.evaluation import measurement
 from pipeline.evaluation.by_task import (
     by_scene,
     by_task,
+    evenly,
     held_out_first,
     scenes_of_episodes,
     tasks_of_episodes,
@@ -44,14 +46,14 @@ _TOO_KIND = 0.2  # so far apart lie the confidence intervals of imagined and tru
 @priced
 def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """How far imagination and truth lie apart for the policy just deployed: same starts, same stochastic
-    policy. Leaves a video of an imagined episode, and one of a held-out true one above which its actions are
-    imagined.
+    policy; held-out episodes first. Leaves a video of an imagined episode, and one of a held-out true one
+    above which its actions are imagined.
 
     Settings: number of the round.
     """
     number = inputs.settings["number"]
     store = open_store(cfg, inputs)
-    mine = store.select([f"policy-{number}"])[: cfg["measure"]["starts"]]
+    mine = unseen_first(cfg, store, store.select([f"policy-{number}"]), cfg["measure"]["starts"])
     prepare_process(cfg["seed"], cfg["threads"])
     policy = build_policy(cfg, inputs.weights("policy"))
     truth = episode_success(store, mine)
@@ -60,12 +62,9 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     outcome = evaluate(world, policy, seeds, stochastic=True, label="gap", sampling_seed=cfg["seed"])
     write_film(folder / "media/imagined.mp4", side_by_side(world.base_env.video(0).numpy()), store.fps)
     tasks, judge = tasks_of_episodes(cfg, store, mine), world.transform[-1].judge
-    result = {
-        "round": number,
-        **_gap(truth, outcome.success, outcome.counted),
-        "tasks": by_task(tasks, _gap, truth, outcome.success, outcome.counted),
-    }
     held = store.split("held_out")
+    sides = (truth, outcome.success, outcome.counted, torch.isin(mine, held))
+    result = {"round": number, **_gap(*sides), "tasks": by_task(tasks, _gap, *sides)}
     held = held[torch.isin(held, store.select(["policy-*"]))]
     if len(held):
         simulator = world.base_env.simulator
@@ -75,6 +74,17 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         write_film(folder / "media/held-out.mp4", paired_frames(store, held, made, 0), store.fps, rest=REST)
         result["replayed"] = judge_table(judge, scores, made.valid, store, held)
     return {**result, "judged_by": judge.facts(), "alarms": too_kind(result)}
+
+
+def unseen_first(cfg: Cfg, store: ClipStore, episodes: Tensor, count: int) -> Tensor:
+    """`count` of a store's `episodes` int64 [N], of each split shared out over tasks: those that are held
+    out, then those that judges alone have not seen, and only then those that everything has learned from.
+    """
+    chosen = episodes[:0]
+    for split in ("held_out", "calibration", "train"):
+        mine = episodes[torch.isin(episodes, store.split(split))]
+        chosen = torch.cat((chosen, evenly(cfg, store, mine, count - len(chosen))))
+    return chosen
 
 
 def too_kind(result: Mapping[str, Any]) -> list[str]:
@@ -88,7 +98,8 @@ def too_kind(result: Mapping[str, Any]) -> list[str]:
             seen, so = (f"{one['successes']} of {one['episodes']}" for one in (imagined, true))
             out.append(
                 f"{task or 'the task'} succeeds in {seen} imagined and {so} true episodes from the same"
-                " starts, so that it succeeds in imagination says little; deploy more episodes"
+                f" starts, {entry['unseen']} of them held out, so that it succeeds in imagination says"
+                " little; deploy more episodes"
                 " (rounds.deploy), or train simulator and judge for longer (simulator_fit, judge_fit)"
             )
     return out
@@ -170,13 +181,14 @@ def _counted(success: Tensor, counted: Tensor) -> dict[str, Any]:
     return {**rate_entry(success[counted]), "dropped": int((~counted).sum())}
 
 
-def _gap(truth: Tensor, success: Tensor, counted: Tensor) -> dict[str, Any]:
-    """True and imagined rates of those starts whose imagined episodes could be judged, and how far they lie
-    apart, None where there are none.
+def _gap(truth: Tensor, success: Tensor, counted: Tensor, unseen: Tensor) -> dict[str, Any]:
+    """True and imagined rates of those starts whose imagined episodes could be judged; how far they lie
+    apart, None where there are none; and how many of these starts nothing has learned from.
     """
     true, imagined = truth[counted], success[counted]
     apart = float(imagined.float().mean() - true.float().mean()) if len(true) else None
-    return {"true": rate_entry(true), "imagined": rate_entry(imagined), "gap": apart}
+    rates = {"true": rate_entry(true), "imagined": rate_entry(imagined)}
+    return {**rates, "gap": apart, "unseen": int(unseen[counted].sum())}
 
 
 @stage(reads=(*WORLD, "measure"), place=Place.EVALUATOR)

@@ -145,9 +145,11 @@ def _warm_up(
     """
     past = store.select([f"policy-{number}"])
     past = past[torch.isin(past, learning_episodes(store)) & store.arrays["labelled"][past]]
-    discount = cfg["judge"].get("discount")
-    if not hasattr(algorithm, "warm_up") or discount is None or not len(past):
+    if not hasattr(algorithm, "warm_up") or not len(past):
         return {}, None
+    # A judge that is not taught by it measures progress otherwise, and it is 1 where the task is done all the
+    # same: for what physics has told, the discounted time that perception learns stands in.
+    discount = cfg["judge"].get("discount", cfg["imitation"]["discount"])
     rollout = dataset_rollout(policy, store, past, rewards_of(cfg), discount)
     rollout, knew = algorithm.warm_up(rollout, seed)
     if action_key(policy) != CHUNK:
@@ -161,13 +163,17 @@ def _warm_up(
 def rl_in_physics(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The same algorithm in physics, from the first policy: a control of imagination.
 
-    Settings: iterations.
+    Settings: iterations; or episodes, after which it ends. What the last rollout plays beyond them is neither
+    learned from nor counted.
     """
     prepare_process(cfg["seed"], cfg["threads"])
-    iterations = inputs.settings["iterations"]
+    episodes = inputs.settings.get("episodes")
+    # every iteration begins rl.envs episodes at least
+    iterations = inputs.settings["iterations"] if episodes is None else -(-episodes // cfg["rl"]["envs"])
+    limits = {"iterations": iterations, "episodes": episodes}
     policy = build_policy(cfg, inputs.weights("policy"))
     lr = rl_rate(policy, cfg["rl"]["lr"])
-    settings = rl_options(cfg, iterations=iterations, anchor=0.0, seed=cfg["seed"] * 100, lr=lr)
+    settings = rl_options(cfg, **limits, anchor=0.0, seed=cfg["seed"] * 100, lr=lr)
     if settings.freeze_perception:
         freeze_perception(policy)
     algorithm = build_algorithm(cfg, policy)

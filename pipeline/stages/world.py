@@ -63,11 +63,9 @@ def simulator(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     section = dict(cfg["simulator_fit"][phase])
     fit = in_time(inputs, "simulator", fit_options(cfg, section.pop("fit"), f"simulator_fit.{phase}.fit"))
     how = options(SimulatorFitConfig, section, f"simulator_fit.{phase}")
-    store = open_store(cfg, inputs)
+    store, episodes = _lessons(cfg, inputs)
     prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg, inputs.weights("warm"))
-    # What a world says of a task's end is calibrated on episodes that it has not learned from.
-    episodes = store.split("train") if model.says_done else learning_episodes(store)
     stats = (
         train_simulator(
             *(model, store, episodes, how, fit, folder),
@@ -93,12 +91,21 @@ def student(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     Settings: phase, first or refresh.
     """
     phase = inputs.settings["phase"]
-    store = open_store(cfg, inputs)
-    episodes = learning_episodes(store)
+    store, episodes = _lessons(cfg, inputs)
     newest = newest_episodes(store, inputs, episodes)
     key, taught = f"distill.{phase}", cfg["simulator_fit"][phase]["strides"]
     told = lacking_strides(key, cfg["distill"][phase]["strides"], f"simulator_fit.{phase}", taught)
     return {**distil(cfg, folder, inputs, key, store, episodes, newest), **told}
+
+
+def _lessons(cfg: Cfg, inputs: Inputs) -> tuple[ClipStore, Tensor]:
+    """The role `data`, and which of its episodes a simulator learns from, int64 [N]: the same ones whatever
+    the engine. In which frames of the calibration split the task is done is not told: what a world says of
+    that is calibrated there.
+    """
+    store = open_store(cfg, inputs)
+    store.arrays["labelled"][store.split("calibration")] = False
+    return store, learning_episodes(store)
 
 
 def lacking_strides(key: str, known: Sequence[int], teacher: str, taught: Sequence[int]) -> dict[str, str]:

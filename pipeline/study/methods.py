@@ -177,11 +177,13 @@ class WorldFrom(Method):
 
 def add_rl_in_physics(graph: Graph, cfg: Cfg, equal: Equal) -> str:
     """Add RL in physics from the loop's first policy, and return its name."""
-    few = max(1, round(deployed_episodes(cfg) / cfg["rl"]["envs"]))
-    iterations = {"episodes": few, "steps": imagined_iterations(cfg)}[equal]
+    if equal == "episodes":
+        amount = {"episodes": deployed_episodes(cfg)}
+    else:
+        amount = {"iterations": imagined_iterations(cfg)}
     name = f"rl-in-physics-equal-{equal}"
     first = "explore" if "explore" in graph.nodes else "imitation"
-    return graph.add(name, rl.rl_in_physics, {"policy": first}, iterations=iterations)
+    return graph.add(name, rl.rl_in_physics, {"policy": first}, **amount)
 
 
 def privileged_note(cfg: Cfg) -> str:
@@ -189,5 +191,5 @@ def privileged_note(cfg: Cfg) -> str:
     rewarded = "progress and success" if rewards_of(cfg).progress else "success"
     return (
         f"rewarded by the suite's true {rewarded}, which are privileged, not by a judge; it has no anchor to"
-        " cloned episodes (rl.anchor) and takes whole batches, so it plays some more episodes than asked"
+        " cloned episodes (rl.anchor)"
     )

@@ -21,7 +21,9 @@ class AnswerCache:
         self.folder = folder / "answers"
 
     def key(self, question: Question, model: str, vote: int) -> str:
-        """A hash of the words, every pixel, the model's name (Chat.name) and which vote it is."""
+        """A hash of the words, every pixel, the model's name (Chat.name) and which vote it is. Where it is
+        served is no part of it.
+        """
         found = hashlib.sha256()
         for part in (question.text, model, str(vote)):
             found.update(f"{len(part)}:{part}".encode())

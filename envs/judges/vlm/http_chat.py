@@ -25,6 +25,8 @@ _GREETING_S = 20.0  # for a list of models
 _QUALITY = 95
 _LATER = (408, 409, 425, 429)  # refusals that may end by themselves, as those from 500 on
 _SHOWN = 300  # characters of a server's words that are passed on
+_NO_JSON = (ValueError, OverflowError, RecursionError)  # of texts that are none, are out of range or too deep
+_COUNTABLE = 2.0**53  # from there on floats skip whole numbers
 
 
 class HTTPChat:
@@ -68,7 +70,9 @@ class HTTPChat:
 
     @property
     def name(self) -> str:
-        """See Chat.name. The address is no part of it: a model may move."""
+        """See Chat.name. The address is no part of it: answers stay paid for where a model moves to another
+        port or machine. A server's name must therefore stand for one and the same weights.
+        """
         return json.dumps([self.model, self.max_tokens, self.temperature, self.body], sort_keys=True)
 
     def _secret(self) -> str:
@@ -113,7 +117,7 @@ class HTTPChat:
         try:
             async with self._session(_GREETING_S) as http:
                 async with http.get(f"{self.url}/models", allow_redirects=False) as answer:
-                    status, text = answer.status, await answer.text(errors="replace")
+                    status, text = answer.status, await answer.text("utf-8", errors="replace")
         except (aiohttp.ClientError, asyncio.TimeoutError, OSError) as error:
             raise JudgeError(
                 f"judge.chat.url={self.url}: nobody answers ({self._hidden(_reason(error))}); start the"
@@ -143,7 +147,7 @@ class HTTPChat:
                 where = f"{self.url}/chat/completions"
                 async with http.post(where, json=request, allow_redirects=False) as answer:
                     status, wait = answer.status, _wait(answer.headers.get("Retry-After", ""))
-                    text = await answer.text(errors="replace")
+                    text = await answer.text("utf-8", errors="replace")
         except aiohttp.ClientConnectorError as error:
             raise Unanswered(f"{self.url}: {self._hidden(_reason(error))}", paid=False) from None
         except (aiohttp.ClientError, OSError) as error:
@@ -181,8 +185,8 @@ class HTTPChat:
             found = json.loads(text)
             message = found["choices"][0]["message"]
             content, usage = message.get("content"), found.get("usage") or {}
-            tokens = [int(usage.get(name) or 0) for name in ("prompt_tokens", "completion_tokens")]
-        except (ValueError, KeyError, IndexError, TypeError, AttributeError):
+            tokens = [_count(usage.get(name)) for name in ("prompt_tokens", "completion_tokens")]
+        except (*_NO_JSON, KeyError, IndexError, TypeError, AttributeError):
             raise Unanswered(f"{self.url} answered no chat completion: {self._words(text)}") from None
         # A refusal has no content: an answer that is neither yes nor no.
         return Reply(self._hidden(content) if isinstance(content, str) else "", *tokens)
@@ -201,8 +205,21 @@ def _model_names(text: str) -> list[str]:
     """Names in a server's list of models, [] if it is none."""
     try:
         return [str(entry["id"]) for entry in json.loads(text)["data"]]
-    except (ValueError, KeyError, TypeError):
+    except (*_NO_JSON, KeyError, TypeError):
         return []
+
+
+def _count(tokens: Any) -> int:
+    """Tokens as a server counts them, 0 if it does not.
+
+    Raises:
+        ValueError, TypeError: if that is no number.
+        OverflowError: if it is past counting.
+    """
+    found = float(tokens or 0)
+    if found > _COUNTABLE:
+        raise OverflowError(f"{found} tokens")
+    return max(0, int(found))
 
 
 def _wait(header: str) -> float:
@@ -213,7 +230,7 @@ def _wait(header: str) -> float:
         pass
     try:
         return max(0.0, parsedate_to_datetime(header).timestamp() - time.time())
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         return 0.0
 
 
@@ -222,7 +239,7 @@ def _message(text: str) -> str:
     try:
         found = json.loads(text)["error"]
         return str(found["message"] if isinstance(found, dict) else found)
-    except (ValueError, KeyError, TypeError):
+    except (*_NO_JSON, KeyError, TypeError):
         return text
 
 

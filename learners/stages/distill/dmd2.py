@@ -9,7 +9,7 @@ does not know at which of its steps the student made it: what is matched is the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from typing import Any, cast
 
@@ -25,6 +25,7 @@ from learners.stages.distill.method import Generated, Method, Turn, spread
 from learners.training.fit import FitConfig
 from learners.training.optimisers import Parameters
 
+_FASTER = 10  # times as fast as its critic a student may learn
 _LOWEST, _HIGHEST = 0.02, 0.98  # noise levels drawn, as in DMD: nearer the ends scores say nothing
 
 
@@ -59,6 +60,24 @@ class DMD2(Method):
         critic.codec, self.critic = self.student.codec, critic
         self.critic_updates, self.shift, self.critic_shift = critic_updates, shift, critic_shift
         self._critic_lr, self._betas, self._decay = critic_lr, critic_betas, critic_weight_decay
+
+    @classmethod
+    def faults(cls, section: Mapping[str, Any], fit: Mapping[str, Any], key: str) -> Iterator[str]:
+        """See Method: a student that would run away from its critic, or whose turn never comes."""
+        # what is missing is told when it is built
+        critic, turns = section.get("critic_lr", fit["lr"]), section.get("critic_updates", 0) + 1
+        if critic < fit["lr"] / _FASTER:
+            yield (
+                f"{key}.lr={fit['lr']} is more than {_FASTER} times distill.method.critic_lr={critic}: the"
+                f" critic could not follow what the student makes; say {key}.lr={critic}, or raise"
+                " distill.method.critic_lr"
+            )
+        if fit["steps"] < turns:
+            yield (
+                f"{key}.steps={fit['steps']} end before the student's first turn, for one step in"
+                f" distill.method.critic_updates + 1 = {turns} is its own; say {key}.steps={turns} or more,"
+                " or lower distill.method.critic_updates"
+            )
 
     @property
     def learners(self) -> Sequence[nn.Module]:

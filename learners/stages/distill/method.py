@@ -4,7 +4,7 @@ asked.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,6 +43,9 @@ class Method(nn.Module):
         teacher: denoises in many steps.
         student: of the same architecture and conditioning, with the teacher's weights to begin with.
         config: of the training loop.
+
+    Raises:
+        ValueError: if their autoencoders differ: latents of one would mean nothing to the other.
     """
 
     teacher: Any
@@ -50,10 +53,26 @@ class Method(nn.Module):
 
     def __init__(self, teacher: Stepwise[Any], student: Stepwise[Any], config: FitConfig):
         super().__init__()
+        theirs, own = teacher.codec.state_dict(), student.codec.state_dict()
+        if theirs.keys() != own.keys() or any(not torch.equal(own[name], theirs[name]) for name in own):
+            raise ValueError(
+                "teacher and student have autoencoders of different weights, so that latents of one mean"
+                " nothing to the other; begin the student with the teacher's weights, or an earlier student's"
+            )
         teacher.codec = student.codec  # frozen in both
         self.teacher, self.student = teacher, student
         self.teacher.requires_grad_(False)
         self.steps, self.config = student.sampler.evaluations, config
+
+    @classmethod
+    def faults(cls, section: Mapping[str, Any], fit: Mapping[str, Any], key: str) -> Iterator[str]:
+        """A sentence for each reason why nothing could come of options, before any work.
+
+        Args:
+            section: distill.method.
+            fit: of the training loop, at `key` of the config.
+        """
+        return iter(())
 
     @property
     def learners(self) -> Sequence[nn.Module]:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
 
 from envs.simulators.base import Simulator
 from envs.simulators.stepwise import Stepwise
@@ -17,6 +16,13 @@ from learners.stages.distill.method import Method, Turn
 from learners.stages.simulator import ClipBatches
 from learners.training.fit import fit
 from learners.training.lora import low_rank
+
+# By the keys that say what they are, the parts of engines that offer several.
+_PARTS = {
+    "simulator.actions": "actions",
+    "simulator.prediction": "prediction",
+    "simulator.denoising.prediction": "diffusion.prediction",
+}
 
 
 def train_student(
@@ -70,13 +76,21 @@ def check_pair(teacher: Simulator, student: Simulator) -> None:
         "simulator.pose_map": (teacher.spec.pose_map, student.spec.pose_map),
         "simulator.ray_map": (teacher.spec.ray_map, student.spec.ray_map),
         "simulator.memory_frames": (teacher.memory_frames, student.memory_frames),
-        "simulator.actions": (_actions_of(teacher), _actions_of(student)),
         "simulator._target_": (type(teacher).__name__, type(student).__name__),
+        **{key: (_about(teacher, path), _about(student, path)) for key, path in _PARTS.items()},
     }
     odd = [f"{key}: {a!r} and {b!r}" for key, (a, b) in pairs.items() if a != b]
     if odd:
         raise ValueError(
             f"teacher and student are conditioned differently: {'; '.join(odd)}; make them alike"
+        )
+    one, other = _sizes(teacher), _sizes(student)
+    odd = [name for name in {**one, **other} if one.get(name) != other.get(name)]
+    if odd:
+        raise ValueError(
+            f"teacher and student are networks of different sizes: {odd[0]} is {one.get(odd[0])} and"
+            f" {other.get(odd[0])}; give both the same simulator.net and simulator.codec (gesim:"
+            " simulator.scratch)"
         )
     if not student.sampler.jumps:
         raise ValueError(
@@ -91,10 +105,16 @@ def check_pair(teacher: Simulator, student: Simulator) -> None:
         )
 
 
-def _actions_of(world: Simulator) -> str:
-    """Class and numbers of the action encoder of an engine that offers several; "" of others."""
-    actions = getattr(world, "actions", None)
-    if not isinstance(actions, nn.Module):
-        return ""
-    numbers = {key: value for key, value in vars(actions).items() if type(value) in (int, float, str)}
-    return f"{type(actions).__name__} {numbers}"
+def _about(world: Simulator, path: str) -> str:
+    """Class and numbers of the part of an engine at a dotted path; alike for all that have no such part."""
+    part: Any = world
+    for name in path.split("."):
+        part = getattr(part, name, None)
+    held = getattr(part, "__dict__", {})
+    numbers = {key: value for key, value in held.items() if type(value) in (int, float, str)}
+    return f"{type(part).__name__} {numbers}"
+
+
+def _sizes(world: Simulator) -> dict[str, tuple[int, ...]]:
+    """Shapes of its weights, those of its autoencoder among them, by name."""
+    return {name: tuple(value.shape) for name, value in world.state_dict().items()}

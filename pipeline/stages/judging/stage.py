@@ -52,7 +52,8 @@ def text_world(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     )
     calibrated = calibrate_ending(model, store, store.split("calibration"), section["stride"])
     save_weights(model, folder)
-    return {**stats, "ending_threshold": float(model.threshold), "ending_calibrated": calibrated}
+    ending = {"ending_threshold": float(model.threshold), "ending_calibrated": calibrated}
+    return {**stats, **ending, "ending_max_frames": model.max_frames}
 
 
 @stage(reads=(*WORLD, "judge_fit.{phase}", "rl.starts", "rl.horizon", "microbatches"), place=Place.LEARNERS)

@@ -60,11 +60,11 @@ def refuse(status: int, said: str = "come again", **headers: str) -> Fault:
     return fault
 
 
-def say(text: str) -> Fault:
+def say(text: str, **headers: str) -> Fault:
     """A fault that answers 200 with something else than a completion."""
 
     async def fault(request: web.Request) -> web.StreamResponse:
-        return web.Response(text=text)
+        return web.Response(body=text.encode(), headers=headers)
 
     return fault
 

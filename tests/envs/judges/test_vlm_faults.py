@@ -30,6 +30,13 @@ from tests.envs.judges.vlm_clips import (
 )
 
 
+def counted(tokens: str) -> str:
+    """A completion that says yes, and took so many tokens."""
+    return json.dumps(completion("Answer: Yes", (1, 1))).replace(
+        '"prompt_tokens": 1', f'"prompt_tokens": {tokens}'
+    )
+
+
 @pytest.mark.parametrize(
     "fault",
     [
@@ -41,8 +48,16 @@ from tests.envs.judges.vlm_clips import (
         say('{"choices": []}'),
         say('{"choices": [{"message": null}]}'),
         say('["not", "an", "object"]'),
+        say("[" * 200_000),
+        say(counted("1e999")),
+        say(counted("9" * 400)),
+        say("{}", **{"Content-Type": "application/json; charset=hex"}),
+        refuse(503, **{"Retry-After": "Mon, 01 Jan 99999999999999999999 00:00:00 GMT"}),
     ],
-    ids=["500", "503", "408", "cut", "html", "no choices", "no message", "list"],
+    ids=[
+        *("500", "503", "408", "cut", "html", "no choices", "no message", "list", "too deep"),
+        *("endless tokens", "too many tokens", "no charset", "no date"),
+    ],
 )
 def test_a_question_that_came_to_nothing_is_asked_again(make: Make, server: ChatServer, fault: Any) -> None:
     server.faults.extend([fault, fault])
@@ -69,6 +84,13 @@ def test_a_refusal_without_words_is_an_unusable_answer(make: Make, server: ChatS
     judge = make(votes={"count": 1})
     assert score(judge, clip(DONE)).status.tolist() == [Status.ABSTAIN.value]
     assert judge.asker.ledger.counts["unusable"] == 1
+
+
+def test_tokens_below_zero_give_nothing_back(make: Make, server: ChatServer) -> None:
+    server.faults.append(say(counted("-1000")))
+    judge = make(votes={"count": 1})
+    assert score(judge, clip(DONE)).success.item() == 1.0
+    assert judge.asker.ledger.counts["prompt_tokens"] == 0 and judge.asker.ledger.counts["calls"] == 1
 
 
 @pytest.mark.parametrize("say_when", ["seconds", "date"])

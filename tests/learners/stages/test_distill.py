@@ -181,13 +181,25 @@ def test_teacher_and_student_must_belong_together(tiny_store: Stores) -> None:
     with pytest.raises(ValueError, match=r"conditioned differently: simulator\.pose_map: True and False"):
         check_pair(teacher, stepwise_pair("dit_small", replace(spec, pose_map=False))[1])
     forcing, words = stepwise_pair("forcing_small", spec)[0], {"_target_": "envs.conditioning.ActionText"}
-    one = other_than("forcing_small", spec, {"actions": words})
+    one = other_than("forcing_small", spec, {"actions": {**words, "decimals": 0}})
     other = other_than("forcing_small", spec, {"actions": {**words, "decimals": 2}})
     with pytest.raises(ValueError, match=r"simulator\.actions: .*ActionVector .* and .*ActionText "):
         check_pair(forcing, one)
     with pytest.raises(ValueError, match=r"simulator\.actions: .*'decimals': 0.* and .*'decimals': 2"):
         check_pair(one, other)
-    denoising = section_of("simulator", "dit_small")["denoising"]
+    drifting = {"prediction": {**section_of("simulator", "forcing_small")["prediction"], "drift": 0.2}}
+    with pytest.raises(ValueError, match=r"simulator\.prediction: .*'drift': 0\.1.* and .*'drift': 0\.2"):
+        check_pair(forcing, other_than("forcing_small", spec, drifting))
+    own = section_of("simulator", "dit_small")
+    denoising, codec = own["denoising"], own["codec"]
+    velocity = other_than("dit_small", spec, {"denoising": {**denoising, "prediction": "velocity"}})
+    with pytest.raises(ValueError, match=r"simulator\.denoising\.prediction: 'Clean .* and 'Velocity "):
+        check_pair(teacher, velocity)
+    for changes in ({"codec": {**codec, "width": 64}}, {"net": {**own["net"], "layers": 4}}):
+        with pytest.raises(
+            ValueError, match=rf"of different sizes: {next(iter(changes))}\..*the same simulator"
+        ):
+            check_pair(teacher, other_than("dit_small", spec, changes))
     with pytest.raises(ValueError, match=r"distill\.steps=2 are more than the teacher's 1"):
         check_pair(other_than("dit_small", spec, {"denoising": {**denoising, "steps": 1}}), student)
     with pytest.raises(ValueError, match=r"a student samples in distilled steps; set"):
@@ -201,6 +213,18 @@ def other_than(name: str, spec: WorldSpec, changes: dict[str, Any]) -> Simulator
     """An engine of a config with other options."""
     own = {k: v for k, v in section_of("simulator", name).items() if k not in WORLD_OPTIONS}
     return build(own | changes, "simulator", spec=spec)  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_latents_of_another_autoencoder_are_refused(method: str, tiny_store: Stores, tmp_path: Path) -> None:
+    store = tiny_store(BIMANUAL_POSES)
+    teacher, student = stepwise_pair("dit_small", store.spec)
+    assert isinstance(student, Stepwise)
+    with torch.no_grad():
+        next(student.codec.parameters()).add_(1e-3)
+    batches = ClipBatches(student, store, torch.arange(2), CLIPS, FitConfig(1, 2, 1e-3, bf16=False))
+    with pytest.raises(ConfigError, match="teacher and student have autoencoders of different weights"):
+        train_student(teacher, section(f"distiller/{method}"), batches, tmp_path)
 
 
 def test_jumps_are_no_trajectories(tiny_store: Stores, tmp_path: Path) -> None:

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
+from tensordict import TensorDict
 
 from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
 from envs.simulators import memory
+from envs.simulators.base import Simulator
 from envs.simulators.replay import future_of, replay
+from envs.specs import WorldSpec
 from learners.stages.generated import generated_frames
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_POSES
 from tests.learners.models import simulator_of
@@ -60,6 +63,29 @@ def test_frames_may_go_on_from_true_ones_again(tiny_store: Stores) -> None:
     state = simulator.resume(past, torch.full_like(some, 1 + chunk), some)
     frames = simulator.step(state, future_of(simulator, store, short.rows[:, chunk : 2 * chunk]))[0]
     assert torch.equal(frames, short.frames[:, chunk : 2 * chunk])
+
+
+class Listening(Simulator):
+    """Keeps the commands that it is told of all frames up to each chunk, and makes black frames."""
+
+    def __init__(self, spec: WorldSpec):
+        super().__init__(spec, 1 + spec.chunk)
+        self.feature_shape, self.told = (1,), []
+
+    def predict(self, inputs: TensorDict) -> tuple[torch.Tensor, torch.Tensor]:
+        self.told.append(inputs["memory", "commands"].clone())
+        shape = (len(inputs), self.spec.chunk, self.spec.views, 3, *self.spec.size)
+        return torch.zeros(shape, dtype=torch.uint8), torch.zeros(len(inputs), 1)
+
+
+def test_true_frames_stand_with_commands_of_the_same_stride_as_generated_ones(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)  # of which changes are summed between two frames
+    told = []
+    for alone in (None, 1):
+        simulator = Listening(store.spec)
+        replay(simulator, store, torch.tensor([3, 1]), bf16=False, alone=alone, stride=2)
+        told.append(simulator.told[1])
+    assert torch.equal(*told)
 
 
 def test_the_robot_is_where_it_was_recorded_unless_its_states_are_decoded(tiny_store: Stores) -> None:

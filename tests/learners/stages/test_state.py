@@ -13,7 +13,7 @@ from torch import Tensor
 
 from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
-from learners.stages.state import train_state
+from learners.stages.state import _Kept, train_state
 from learners.training.fit import FitConfig
 from tests.embodiments import ARM_JOINTS, EMBODIMENTS
 from tests.learners.models import decoder_of, simulator_of
@@ -55,6 +55,17 @@ def test_features_are_computed_once_unless_they_are_too_large(
     options = FitConfig(steps=3, batch=32, lr=1e-3, bf16=False)
     train_state(decoder_of("unet_small", simulator), simulator, store, every, options, tmp_path / "anew")
     assert sum(shown) == 1 + 3 * 32
+
+
+@pytest.mark.parametrize(("features", "at_hand"), [(4, True), (100_000, False)])
+def test_few_rows_of_kept_clips_are_picked_without_a_thread(features: int, at_hand: bool) -> None:
+    history = TensorDict({"states": torch.rand(10, 3)}, [10])
+    clips = TensorDict({"shown": torch.rand(10, features), "history": history}, [10])
+    kept = _Kept(clips, 8)
+    picked = kept(0, torch.Generator().manual_seed(0))
+    same = clips[torch.randint(10, (8,), generator=torch.Generator().manual_seed(0))]
+    assert kept.at_hand is at_hand and picked.batch_size == same.batch_size
+    assert bool((picked == same).all())
 
 
 def test_only_transformers_take_adapters(tiny_store: Stores, tmp_path: Path) -> None:

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
 from envs.embodiment import Embodiment
+from envs.episodes import LeRobotWriter
 from envs.episodes.clips import ClipStore
-from learners.stages.text_world import SuccessfulClips, calibrate_ending, train_text_world
+from learners.stages.text_world import SuccessfulClips, calibrate_ending, longest_of, train_text_world
 from learners.training.fit import FitConfig
-from tests.embodiments import ARM_DELTAS
+from tests.embodiments import ARM_DELTAS, world_spec
 from tests.envs.simulators.clips import moving_square
 from tests.envs.simulators.test_text_world import TEXTS, lean, world
-from tests.moving_square import INSTRUCTION
+from tests.moving_square import INSTRUCTION, SIZE
+from tests.moving_square import moving_square as square_episode
 
 Stores = Callable[[Embodiment], ClipStore]
 
@@ -100,3 +105,42 @@ def test_data_without_successes_are_refused(tiny_store: Stores, tmp_path: Path) 
     failed = store.select(succeeded=False)
     with pytest.raises(ValueError, match="no episode of the data is labelled a success"):
         train_text_world(world(), store, failed, 1, FitConfig(1, 1, 1e-3), tmp_path)
+
+
+def test_an_instruction_that_would_be_cut_is_refused_before_training_whatever_its_split(
+    tiny_data: Callable[[Embodiment], Path], tmp_path: Path
+) -> None:
+    robot, wordy = ARM_DELTAS.at(SIZE), "move the square " + "and move it again " * 20
+    failed = square_episode(ARM_DELTAS, 1, "random")
+    LeRobotWriter(tmp_path / "data", robot).write([replace(failed, instruction=wordy)])
+    store = ClipStore([tiny_data(ARM_DELTAS), tmp_path / "data"], world_spec(robot, SIZE))
+    learned = torch.arange(len(store) - 1)  # without it
+    with pytest.raises(ValueError, match=rf"'move the square .*has {len(wordy)} bytes"):
+        train_text_world(world(), store, learned, 1, FitConfig(1, 1, 1e-3), tmp_path)
+    assert not (tmp_path / "metrics.jsonl").exists()
+
+
+@pytest.mark.parametrize("length", [13, 80])
+def test_trajectories_may_take_as_long_as_recorded_successes_do_and_a_quarter_more(
+    length: int, tmp_path: Path
+) -> None:
+    robot = ARM_DELTAS.at(SIZE)
+    some = [square_episode(ARM_DELTAS, seed, "expert" if seed % 2 else "random", length) for seed in range(6)]
+    late = [
+        np.arange(length) >= length - 3 + seed % 3 if seed % 2 else one.success
+        for seed, one in enumerate(some)
+    ]
+    some = [replace(one, success=success) for one, success in zip(some, late, strict=True)]
+    LeRobotWriter(tmp_path / "data", robot).write(some)
+    store = ClipStore([tmp_path / "data"], world_spec(robot, SIZE))
+    assert longest_of(store, store.select(succeeded=True), 2) == math.ceil((length - 1) * 1.25 / 2)
+    model, short = world(ending={"max_frames": None}), FitConfig(1, 2, 1e-3, bf16=False)
+    assert model.max_frames == model.window  # until it is trained
+    train_text_world(model, store, torch.arange(len(store)), 2, short, tmp_path)
+    lean(model, -5.0)
+    again = world(ending={"max_frames": None})
+    again.load_state_dict(model.state_dict())
+    for made in (model, again):
+        golden = made.imagine(store.frames(store.start[:1]), [INSTRUCTION], torch.arange(1))
+        assert golden.frames.shape[1] == math.ceil((length - 1) * 1.25 / 2) and not golden.finished.any()
+    assert world(ending={"max_frames": 5}).max_frames == 5

@@ -16,13 +16,15 @@ from envs.episodes import LeRobotWriter
 from envs.episodes.clips import ClipStore
 from envs.episodes.splits import write_splits
 from envs.manifest import DamagedArtefact, write_manifest
+from envs.physics.suite import Observation
 from envs.rng import Purpose, episode_seeds
 from pipeline.config import load_config
-from pipeline.evaluation.by_task import evenly, tasks_of_seeds
+from pipeline.evaluation.by_task import evenly, tasks_of_episodes, tasks_of_seeds, tasks_told
 from pipeline.graph.stage import Inputs
 from pipeline.stages.collect import collect, scripted_jobs, split_counts
 from pipeline.stages.given import DATASETS, datasets, demonstrations, imagined_chunks, newest_episodes
 from tests.embodiments import ARM_DELTAS, world_spec
+from tests.envs.physics.sections import Counting
 from tests.moving_square import moving_square
 
 
@@ -141,8 +143,25 @@ def test_recordings_that_stand_task_by_task_are_shared_out_evenly(tmp_path: Path
     assert evenly(cfg, store, everything[:0], 3).tolist() == []
     for order in ("aaaaaaaaa", "abcabcabcabc"):  # the first ones are that already
         assert demonstrations(*told(order)).tolist() == list(range(7))
-    physics = {**cfg, "task": {**cfg["task"], "suite": {"_target_": "any"}}}
-    assert demonstrations(physics, store).tolist() == list(range(7))
+    suite = {"_target_": "tests.envs.physics.sections.Counting", "fault": "", "tasks": ["do b", "do a"]}
+    physics = {**cfg, "task": {**cfg["task"], "suite": suite, "name": "do b"}}
+    assert tasks_of_episodes(physics, store, everything) == [f"do {word}" for word in "aaaaaaaabbbbc"]
+
+
+class Wordy(Counting):
+    """Says of each task something else at every third seed."""
+
+    def observe(self) -> Observation:
+        return replace(super().observe(), instruction=f"{self.task} {self.count % 3:g}")
+
+
+def test_tasks_are_those_that_physics_says_the_recorded_words_of() -> None:
+    suite = Wordy("", tasks=("count", "recount", "uncount"))
+    told = [(0, "uncount 0"), (1, "count 1"), (2, "recount 2"), (3, "uncount 0"), (4, "count 2"), (5, "")]
+    assert tasks_told(suite, ["count", "recount"], told) == [
+        *("uncount", "count", "recount", "uncount", None, None)
+    ]
+    assert tasks_told(suite, ["recount"], told[:3]) == ["uncount", "count", "recount"]
 
 
 @pytest.mark.parametrize(

@@ -88,6 +88,7 @@ def test_it_trains_and_goes_on_from_what_it_left(
         learned[phase] = build_text_world(cfg, folder / "weights.safetensors").state_dict()
         found["warm"] = folder
     assert stats["first"]["successes"] == stats["refresh"]["successes"] > 0
+    assert stats["first"]["ending_max_frames"] == 7  # as the section says
     assert "tokenizer_psnr" in stats["first"] and "tokenizer_psnr" not in stats["refresh"]
     kept = [name for name in learned["first"] if ".codec." in name]
     same = [torch.equal(learned["first"][name], learned["refresh"][name]) for name in kept]

@@ -1,0 +1,19 @@
+"""RL in physics for comparison with the loop: by as many episodes as that deploys."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.config import load_config
+from pipeline.loop import build_loop, deployed_episodes
+from pipeline.study.methods import add_rl_in_physics
+
+
+def test_it_plays_as_many_episodes_as_are_deployed_and_not_whole_iterations(tmp_path: Path) -> None:
+    words = ("experiment=soak", "track=disabled", "explore.levels=[]", "rounds.deploy=[5]", "algorithm=ppo")
+    cfg = load_config(words)
+    graph = build_loop(cfg, tmp_path)
+    made = graph.run(add_rl_in_physics(graph, cfg, "episodes"))["rl-in-physics-equal-episodes"]["result"]
+    asked = deployed_episodes(cfg)
+    assert asked % cfg["rl"]["envs"] == 2
+    assert asked <= made["episodes"] == made["physics_episodes"]["own"] <= asked + 2
