@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from envs.conditioning import PoseMapStyle
 from envs.embodiment import Embodiment, EmbodimentError, Robot
 from envs.episodes.formats.lerobot_robot import agreed_robot, alike_calibrated
 from envs.geometry.kinematics import Kinematics, KinematicsError
 from envs.physics.suite import SuiteError, build_suite, check_task, task_names
+from envs.simulators.base import WORLD_OPTIONS
 from envs.specs import Rewards, WorldSpec
-from envs.targets import TARGET, ConfigError, options, target, to_plain
+from envs.targets import TARGET, ConfigError, build, options, target, to_plain
 
 _suites: dict[str, tuple[Embodiment, tuple[str, ...]]] = {}  # robot and tasks of each section
 
@@ -55,13 +58,14 @@ def _suite(section: Mapping[str, Any]) -> tuple[Embodiment, tuple[str, ...]]:
 
 
 def check_world(cfg: Mapping[str, Any]) -> None:
-    """See that robot, tasks and judge are there as the config names them, which reading the config cannot
-    tell.
+    """See that robot, tasks, variants and judge are there as the config names them, and that simulator and
+    text world can be built so, which reading the config cannot tell.
 
     Raises:
         ConfigError: with a line for each thing that is wrong.
     """
-    robot, wrong = world_spec(cfg).embodiment, []
+    spec = world_spec(cfg)
+    robot, wrong = spec.embodiment, []
     if cfg["task"].get("suite") is not None:
         seen, known = _suite(cfg["task"]["suite"])
         for name in task_names(cfg["task"]["name"]):
@@ -75,6 +79,7 @@ def check_world(cfg: Mapping[str, Any]) -> None:
                 f"task.size={list(cfg['task']['size'])}, but the suite renders {list(map(list, sizes))}; give"
                 " all its cameras that size (a suite with an option for it takes task.suite.size=${..size})"
             )
+        wrong += _variant_faults(cfg["task"], seen, known)
     named = {"": cfg, "policy.": cfg["policy"], "judge.": cfg["judge"]}
     for key, section in named.items():
         # what other packages' classes mean by the word is theirs
@@ -88,13 +93,66 @@ def check_world(cfg: Mapping[str, Any]) -> None:
         judge.check(cfg["judge"])
     except ConfigError as error:
         wrong.append(str(error))
+    else:
+        if "text_world" in cfg["judge"]:
+            wrong += _refusals(cfg["judge"]["text_world"], "judge.text_world", spec)
     if not cfg["finetune"]["data"]:  # else it is the robot of those data that counts
+        own = {name: value for name, value in cfg["simulator"].items() if name not in WORLD_OPTIONS}
+        wrong += _refusals(own, "simulator", spec)
         try:
             check_state_expert(cfg)
         except ConfigError as error:
             wrong.append(str(error))
     if wrong:
         raise ConfigError("\n".join(wrong))
+
+
+def _variant_faults(task: Mapping[str, Any], robot: Embodiment, tasks: tuple[str, ...]) -> Iterator[str]:
+    """What is wrong with the variants of a task, whose suite has this robot and these tasks: each has to have
+    both, since what has learned the task acts in them.
+    """
+    for name, changes in task.get("variants", {}).items():
+        try:
+            own, known = _suite({**task["suite"], **changes})
+            for one in task_names(task["name"]):
+                if one in tasks:
+                    check_task(one, known)
+        except ConfigError as error:
+            yield f"task.variants.{name}: {error}"
+            continue
+        here, there = ([(one.name, one.size, one.calibrated) for one in of.cameras] for of in (robot, own))
+        odd = robot.differs(own)
+        if not odd and here != there:
+            odd = f"cameras (name, size, calibrated) are {here}, but here {there}"
+        if odd:
+            yield (
+                f"task.variants.{name} has another robot than task.suite, so what learned the task cannot act"
+                f" in it: {odd}; leave out of it what changes actions or cameras"
+            )
+
+
+def _refusals(section: Mapping[str, Any], key: str, spec: WorldSpec) -> list[str]:
+    """What a class says against its options, [] for nothing: it is built once without memory (torch's meta
+    device), in hundredths of a second whatever its size.
+
+    Only a ValueError counts, which is how options are refused, and none that goes back to a RuntimeError or
+    TypeError: so torch answers where a class asks for the values of tensors that have no memory. Whatever
+    cannot be built without is left to its first stage, and so is a checkpoint, which would be read for this
+    alone.
+    """
+    if section.get("checkpoint"):
+        return []
+    try:
+        with torch.device("meta"):
+            build(section, key, spec=spec)
+    except ValueError as error:
+        reason: BaseException | None = error
+        while reason is not None and not isinstance(reason, (RuntimeError, TypeError)):
+            reason = reason.__cause__ or reason.__context__
+        return [str(error)] if reason is None else []
+    except Exception:  # somebody else's class may raise anything
+        return []
+    return []
 
 
 def check_state_expert(cfg: Mapping[str, Any]) -> None:

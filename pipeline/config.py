@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -49,7 +50,8 @@ def read_config(overrides: Sequence[str]) -> dict[str, Any]:
     except ConfigError:
         raise
     except Exception as error:  # for simulator=null and the like Hydra raises a bare ValueError
-        raise ConfigError(_unknown_key(overrides) or _unreadable(overrides, error)) from error
+        said = _unknown_choice(overrides) or _unknown_key(overrides) or _unreadable(overrides, error)
+        raise ConfigError(said) from error
 
 
 def groups() -> list[str]:
@@ -143,6 +145,23 @@ def _searched(overrides: Sequence[str]) -> list[Path]:
     return [Path(name.removeprefix("file://")) for name in names if name.startswith("file://")]
 
 
+def _unknown_choice(overrides: Sequence[str]) -> str:
+    """What to say of the first override that chooses what its group does not offer, "" if none does."""
+    for word in overrides:
+        key, _, value = word.partition("=")
+        name = bool(re.fullmatch(r"[\w./-]+", value)) and value != "null"
+        if key in groups() and name and not offered(key, value, overrides):
+            return f"{word} is not a choice of configs/{key}{nearest(value, choices(key, overrides))}"
+    return ""
+
+
+def _choosing(name: str, overrides: Sequence[str]) -> list[str]:
+    """Overrides that choose what has a name, or the nearest one, whatever its group."""
+    every = {f"{group}={choice}": choice for group in groups() for choice in choices(group, overrides)}
+    near = difflib.get_close_matches(name, every.values(), 1, 0.75)
+    return [word for word, choice in every.items() if choice in near]
+
+
 def _unknown_key(overrides: Sequence[str]) -> str:
     """What to say of the first override whose key does not exist, "" if all do."""
     chosen = [word for word in overrides if word.split("=")[0] in (*groups(), "hydra.searchpath")]
@@ -157,6 +176,8 @@ def _unknown_key(overrides: Sequence[str]) -> str:
             return f"{word} names no key; say key=value"
         if word in chosen or key.startswith(("+", "~")) or key in paths:
             continue
+        if "=" not in word and (near := _choosing(word, overrides)):
+            return f"{word} is not a key; did you mean {' or '.join(near)}?"
         if elsewhere := _other_choices(key, chosen):
             return f"{key} is no key of the {key.partition('.')[0]} that is chosen, but of {elsewhere}"
         parent = key.rpartition(".")[0]

@@ -31,6 +31,9 @@ from envs.specs import (
     to_chunk,
 )
 
+# It asks for an old numpy, which nothing in it needs; msgpack and websockets, which it needs, are ours.
+INSTALL = "python -m pip install --no-deps openpi-client==0.1.2"
+
 
 class PolicyServerError(RuntimeError):
     """An openpi server cannot be reached, or answered with something else than a chunk of commands."""
@@ -181,8 +184,17 @@ def _address(url: str) -> ParseResult:
 
 
 def _connect(place: ParseResult) -> Any:
-    """openpi's own client; it waits for a server for ever, so whether one listens is asked before."""
-    from openpi_client.websocket_client_policy import WebsocketClientPolicy
+    """openpi's own client; it waits for a server for ever, so whether one listens is asked before.
+
+    Raises:
+        PolicyServerError: if it is not installed, or nobody listens.
+    """
+    try:
+        from openpi_client.websocket_client_policy import WebsocketClientPolicy
+    except ImportError as error:
+        raise PolicyServerError(
+            f"policy=openpi needs openpi's client, which does not import ({error}): {INSTALL}"
+        ) from error
 
     host, port = place.hostname or "", place.port or (443 if place.scheme == "wss" else 80)
     try:

@@ -18,13 +18,13 @@ class ActionText(nn.Module):
 
     Args:
         embodiment: whose actions.
-        decimals: digits after the point.
+        decimals: digits after the point, to which commands are rounded, in their own units.
 
     Attributes:
         size: numbers per frame that `forward` gives.
     """
 
-    def __init__(self, embodiment: Embodiment, decimals: Natural = 0):
+    def __init__(self, embodiment: Embodiment, decimals: Natural):
         super().__init__()
         self.decimals, self.size = decimals, FEATURES
         self.encoder = TextEncoder(1).requires_grad_(False)  # of which only fixed features are read

@@ -100,7 +100,7 @@ class Simulator(Repeated):
         """A config section with so many undistilled steps a chunk.
 
         Raises:
-            ValueError: of an engine that does not denoise in steps.
+            ValueError: of an engine that does not denoise in steps, or not in so many.
         """
         raise ValueError(f"{cls.__name__} does not denoise in steps; choose simulator=dit, forcing or gesim")
 

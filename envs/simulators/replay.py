@@ -15,7 +15,8 @@ from envs.simulators.base import Simulator
 from envs.simulators.features import pooled
 from envs.simulators.state_experts.base import StateDecoder
 
-SIDE_BY_SIDE = 32  # episodes
+SIDE_BY_SIDE = 32  # episodes at most
+_ROOM = 2**32  # bytes of pictures that they may hold, all of it on the simulator's device
 
 
 class Replay(NamedTuple):
@@ -30,6 +31,21 @@ class Replay(NamedTuple):
     valid: Tensor
     states: Tensor
     features: Tensor
+
+    def pictured(self, store: ClipStore) -> Replay:
+        """The same, with those frames alone valid of which a picture was recorded, as the store of the true
+        episodes says; nothing else can be compared.
+        """
+        return self._replace(valid=self.valid & store.arrays["present"][self.rows])
+
+
+def side_by_side(store: ClipStore, frames: int, most: int = SIDE_BY_SIDE) -> int:
+    """How many episodes of so many frames of a store's pictures, with pose maps if it has them, are generated
+    or held at once: `most`, or fewer where they would take more than 4 GiB, and one at least.
+    """
+    spec = store.spec
+    picture = spec.views * 3 * spec.size[0] * spec.size[1] * (2 if spec.pose_map else 1)
+    return max(1, min(most, _ROOM // (frames * picture)))
 
 
 @torch.no_grad()
@@ -53,13 +69,16 @@ def replay(
         stride: recorded frames from one generated frame to the next; T is then so many times smaller.
         draw: number of the sample; each draws noise of its own.
         most: chunks to generate at most; None for whole episodes.
+
+    Raises:
+        EpisodeError: if an episode has no picture at its first frame.
     """
     device, chunk = simulator.device, simulator.spec.chunk
     steps = -(-(int(store.length[episodes].max()) - 1) // (chunk * stride))
     steps = steps if most is None else min(steps, most)
     simulator.eval()
     parts = []
-    for ids in episodes.split(SIDE_BY_SIDE):
+    for ids in episodes.split(side_by_side(store, 1 + steps * chunk)):
         start, last = store.start[ids], store.length[ids][:, None] - 1
         first = store.first(ids)
         # Whoever asks the same simulator twice for the same draw gets the same noise.
@@ -70,6 +89,8 @@ def replay(
             if alone and step and step % alone == 0:
                 known = stride * torch.arange(1 + step * chunk)
                 past = store.at(ids[:, None].expand(-1, len(known)), known)
+                before = start[:, None] + torch.minimum(known, last)
+                past["command"] = store.commands(before, start, stride)
                 length, room = torch.full_like(ids, len(known)), len(known) + chunk * alone
                 state = simulator.resume(past.to(device), length.to(device), seeds, room, stride)
             ahead = stride * (step * chunk + torch.arange(1, chunk + 1)[None])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -162,6 +163,12 @@ def test_long_chunks_are_compressed_as_gesim_does() -> None:
     assert made[:, 0].tolist() == [0.0, 2.5, 6.5, 9.0] and made[:, 1].tolist() == [0.0, 3.0, 6.0, 9.0]
     assert torch.equal(compress(rows, 10, (1,)), rows) and compress(rows, 1, ()).tolist() == [[0.0, 0.0]]
     assert compress(rows, 2, ()).tolist() == [[0.0, 0.0], [9.0, 9.0]]
+
+
+def test_a_missing_client_is_named_with_the_line_to_type(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "openpi_client.websocket_client_policy", None)
+    with pytest.raises(PolicyServerError, match=r"pip install --no-deps openpi-client==0\.1\.2"):
+        ask(world_spec(BIMANUAL_JOINTS), "ws://127.0.0.1:9", "absolute")
 
 
 def test_what_a_policy_server_may_get_wrong() -> None:

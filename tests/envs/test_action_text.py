@@ -12,12 +12,12 @@ from tests.embodiments import ARM_DELTAS
 def test_digits_signs_and_points_are_words() -> None:
     text = ActionText(ARM_DELTAS, decimals=1)
     assert text.describe([-37.04, 0.25, 120.0]) == "minus 3 7 point 0 plus 0 point 2 plus 1 2 0 point 0"
-    assert ActionText(ARM_DELTAS).describe([-0.6]) == "minus 1"
+    assert ActionText(ARM_DELTAS, decimals=0).describe([-0.6]) == "minus 1"
 
 
 def test_it_stands_in_for_the_vector_and_nothing_of_it_learns() -> None:
     commands, now = torch.tensor([[[1.0, -2.0, 3.0, 4.0], [1.0, 2.0, 3.0, 4.0]]]), torch.zeros(1, 4)
-    text, vector = ActionText(ARM_DELTAS), ActionVector(ARM_DELTAS)
+    text, vector = ActionText(ARM_DELTAS, decimals=0), ActionVector(ARM_DELTAS)
     for told in (text, vector):
         assert told(commands, now).shape == (1, 2, told.size)
     rows = text(commands, now)[0]

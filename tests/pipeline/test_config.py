@@ -10,8 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import yaml
 
+from actors.world_config import check_world
+from envs.simulators.base import WORLD_OPTIONS, Simulator
+from envs.specs import WorldSpec
 from envs.targets import TARGET, ConfigError, _within, target
 from pipeline.checks import faults
 from pipeline.cli.words import prepared
@@ -27,7 +31,10 @@ from pipeline.loop import build_loop
         (["simulater=dit"], "simulator"),
         (["simulator.sampling.kind=edm"], r"no key of the simulator that is chosen, but of simulator=gesim"),
         (["seed=1,2"], r"seed=1,2 names several values.*seed=\[1,2\], or run each"),
-        (["simulator=gan"], "gan"),
+        (["simulator=gan"], r"^simulator=gan is not a choice of configs/simulator; there are \['dit', "),
+        (["experiment=metawrld5"], r"^experiment=metawrld5 is not a choice .*; did you mean metaworld5"),
+        (["metaworld"], r"^metaworld is not a key; did you mean task=metaworld\?$"),
+        (["experiment=smoke", "metawrld"], r"^metawrld is not a key; did you mean task=metaworld\?$"),
         (["task.horizon=41"], r"task\.horizon"),
         (["task.mode=sideways"], r"task\.mode"),
         (["collect.mix.expert=0.9"], r"collect\.mix"),
@@ -69,6 +76,10 @@ from pipeline.loop import build_loop
             r"distill\.first\.fit\.lr=0\.0001 is more than 10 times .*say distill\.first\.fit\.lr=2e-06",
         ),
         (["distill.method.critic_lr=0"], r"distill\.method\.critic_lr=0"),
+        (
+            ["simulator=dit", "distill.steps=2", "distill.refresh.fit.steps=4"],
+            r"distill\.refresh\.fit\.steps=4 end before the student's .*say distill\.refresh\.fit\.steps=5",
+        ),
         (["+if_chosen.judge.learned.pionts=3"], r"if_chosen\.judge\.learned\.pionts is no option of"),
         (
             ["+if_chosen.jugde.learned.points=3"],
@@ -128,7 +139,15 @@ WRONG: dict[type, list[Any]] = {
 }
 # other packages' options; where null has a meaning
 FREE = ("simulator.scratch", "policy.policy", "judge.chat.body")
-NULLABLE = ("rl.horizon", "task.suite", "finetune.weights", "judge.chat.key", "algorithm.clip_numbers")
+NULLABLE = (
+    "rl.horizon",
+    "task.suite",
+    "finetune.weights",
+    "judge.chat.key",
+    "algorithm.clip_numbers",
+    "simulator.window",
+    "simulator.horizon",
+)
 
 
 WHOLE = "experiment=quickstart"
@@ -197,6 +216,74 @@ def test_drawn_overrides_are_understood_or_refused(seed: int) -> None:
 def test_what_the_robot_has_not_is_told_before_any_work(word: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         prepared([word])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["task.variants.out_of_domain.scenes=out_of_domian"],
+            r"out_of_domain: task\.suite\.scenes holds 'out_of",
+        ),
+        (["+task.variants.swapped.phrasings=[plane]"], r"swapped: task\.suite\.phrasings holds 'plane'"),
+        (["+task.variants.swapped.actions=joints"], r"swapped has another robot .*: action_names is"),
+        (["+task.variants.swapped.cameras=[head]"], r"swapped has another robot .*: views is"),
+        (["+task.variants.swapped.size=[32,32]"], r"swapped has another robot .*: cameras \(name, size"),
+    ],
+)
+def test_a_variant_that_cannot_be_is_told_before_any_work(words: list[str], said: str) -> None:
+    with pytest.raises(ConfigError, match=rf"^task\.variants\.{said}"):
+        prepared(["task=tabletop", *words])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["simulator=tokens", "simulator.window=4"], r"simulator\.window=4 must be more than task\.chunk=4"),
+        (["simulator=tokens", "simulator.codec.bits=19"], r"codec\.bits=19 must be a multiple of"),
+        (["simulator=tokens", "simulator.codec.bits=64"], r"codec\.bits=64 .* tokens of 32 bits"),
+        (["simulator=forcing", "simulator.horizon=3", "task=metaworld"], r"simulator\.horizon=3 must be at"),
+        (["simulator=gesim"], r"task\.chunk=4 must be 1 \+ a multiple of 4"),
+        (["judge=golden_goal", "judge.text_world.net.heads=5"], r"^judge\.text_world\.net: net\.width=128"),
+        (["judge=golden_goal", "judge.text_world.codec.stride=12"], r"^judge\.text_world .*codec\.stride=12"),
+    ],
+)
+def test_what_simulator_or_text_world_refuses_is_told_before_any_work(words: list[str], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        prepared(words)
+
+
+class Own(Simulator):
+    """An engine of somebody else's, which computes with its first weights."""
+
+    def __init__(self, spec: WorldSpec, memory_frames: int, slip: str):
+        super().__init__(spec, memory_frames)
+        if memory_frames > 4:
+            raise ValueError(f"memory_frames={memory_frames} must be at most 4")
+        weights = torch.ones(3)
+        if slip == "item":  # RuntimeError
+            float(weights.sum())
+        elif slip == "numpy":  # TypeError
+            weights.numpy()
+        elif slip == "turned":
+            try:
+                weights.tolist()
+            except RuntimeError:
+                raise ValueError("weights cannot be read") from None
+        elif slip == "own":
+            raise KeyError(slip)
+
+
+@pytest.mark.parametrize("slip", ["item", "numpy", "turned", "own"])
+def test_engines_that_need_memory_are_not_refused_for_that(slip: str) -> None:
+    cfg = load_config([])
+    around = {key: value for key, value in cfg["simulator"].items() if key in WORLD_OPTIONS}
+    own = {**around, "_target_": f"{__name__}.Own", "memory_frames": 4, "slip": slip}
+    check_world({**cfg, "simulator": own})
+    with pytest.raises(ConfigError, match=r"memory_frames=5 must be at most 4"):
+        check_world({**cfg, "simulator": {**own, "memory_frames": 5}})
+    # its weights would be read for this alone
+    check_world({**cfg, "simulator": {**own, "memory_frames": 5, "checkpoint": "released"}})
 
 
 def leaves(section: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -32,6 +32,7 @@ from envs.specs import WorldSpec
 from envs.targets import OptionsOf, build, options
 
 _ENCODED = 512  # pictures encoded at a time
+_HORIZON = 4  # frames generated at once, of chunks that have as many, unless a config says otherwise
 
 
 class ForcingSimulator(Blockwise):
@@ -39,10 +40,10 @@ class ForcingSimulator(Blockwise):
 
     Args:
         spec: what it shows; sizes must be multiples of 8 * patch.
-        window: frames of a training clip of one chunk, more than a chunk has.
+        window: frames of a training clip of one chunk, more than a chunk has; None: a chunk's and `context`.
         context: newest frames that a block is generated from, c; before there are so many, the first repeats,
             as for a robot that stood still.
-        horizon: frames generated at once, h, at most a chunk's.
+        horizon: frames generated at once, h, at most a chunk's; None: 4 of them, or all of a shorter one.
         net: options of Trunk.
         codec: options of Autoencoder.
         denoising: options of Denoising.
@@ -64,24 +65,26 @@ class ForcingSimulator(Blockwise):
     def __init__(
         self,
         spec: WorldSpec,
-        window: Count,
+        window: Count | None,
         context: Count,
-        horizon: Count,
+        horizon: Count | None,
         net: Annotated[Mapping[str, Any], OptionsOf(Trunk)],
         codec: Annotated[Mapping[str, Any], OptionsOf(Autoencoder)],
         denoising: Annotated[Mapping[str, Any], OptionsOf(Denoising)],
         prediction: Mapping[str, Any],
         actions: Mapping[str, Any],
     ):
+        window = spec.chunk + context if window is None else window
+        horizon = min(_HORIZON, spec.chunk) if horizon is None else horizon
         if window <= spec.chunk:
             raise ValueError(
                 f"simulator.window={window} must be more than task.chunk={spec.chunk}: a chunk goes on from"
-                " at least one frame"
+                " at least one frame; raise it, or leave it null"
             )
         if horizon > spec.chunk:
             raise ValueError(
                 f"simulator.horizon={horizon} must be at most task.chunk={spec.chunk}: a block is generated"
-                " under its actions, and a chunk has no more of them; lower it, or raise task.chunk"
+                " under its actions, and a chunk has no more of them; lower it, or leave it null"
             )
         super().__init__(spec, window - spec.chunk, window - spec.chunk)
         trunk = options(Trunk, net, "simulator.net")

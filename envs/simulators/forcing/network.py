@@ -35,6 +35,9 @@ class Trunk:
         patch: latent rows and columns per token.
         stem: channels of the convolutional stem; 0 is without.
         checkpointing: compute blocks anew in the backward pass instead of keeping what they computed.
+
+    Raises:
+        ValueError: if rotary positions of rows and columns do not fit in a head.
     """
 
     layers: Count
@@ -44,6 +47,10 @@ class Trunk:
     patch: Count
     stem: Natural
     checkpointing: bool
+
+    def __post_init__(self) -> None:
+        if self.head_dim % 4:
+            raise ValueError(f"net.head_dim={self.head_dim} must be a multiple of 4")
 
     @property
     def width(self) -> int:
@@ -204,14 +211,8 @@ class ForcingDiT(nn.Module):
 
 
 def rotary(positions: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Cosines and sines [L, size] of rotary positions [L, axes], which share the channels of a head.
-
-    Raises:
-        ValueError: if they cannot.
-    """
+    """Cosines and sines [L, size] of rotary positions [L, axes], which share the channels of a head."""
     axes = positions.shape[1]
-    if size % (2 * axes):
-        raise ValueError(f"simulator.net.head_dim={size} must be a multiple of {2 * axes}")
     part = size // (2 * axes)
     rates = 100.0 ** -(torch.arange(part, device=positions.device) / part)
     angles = (positions[..., None].float() * rates).flatten(1).repeat(1, 2)

@@ -176,6 +176,7 @@ class GESimulator(LatentWorld):
     @classmethod
     def stepped_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
         """See Simulator.stepped_section."""
+        _check_edm(steps)
         return {**section, "sampling": {"kind": "edm", "steps": steps}}
 
     @classmethod

@@ -19,8 +19,11 @@ from envs.ranges import Count, NonNegative
 from envs.simulators.tokenizers.convolutions import FOLD, decoder, encoder
 from envs.simulators.tokenizers.errors import gradient_difference, picture_error, psnr
 
-_COLLAPSED = 0.02  # perplexity, of the codes that there are, below which a codebook has collapsed
+_COLLAPSED = 0.02  # perplexity, of the codes that could have been seen, below which a codebook has collapsed
 _FEWEST = 1.5  # and in codes, for small ones
+_MOST_BITS = (
+    18  # of a token, as in MAGVIT-2: a table lists all codes, and transformers say how likely each is
+)
 
 
 class LookupFreeQuantiser(nn.Module):
@@ -28,7 +31,7 @@ class LookupFreeQuantiser(nn.Module):
 
     Args:
         bits: numbers of a latent, n.
-        factors: parts the code is split into; a divisor of bits.
+        factors: parts the code is split into, tokens; a divisor of bits that leaves a token at most 18.
 
     Attributes:
         codes: of a factor, 2^(bits / factors).
@@ -45,6 +48,12 @@ class LookupFreeQuantiser(nn.Module):
         if bits % factors:
             raise ValueError(f"codec.bits={bits} must be a multiple of codec.factors={factors}")
         self.bits, self.factors, self.each = bits, factors, bits // factors
+        if self.each > _MOST_BITS:
+            raise ValueError(
+                f"codec.bits={bits} in codec.factors={factors} are tokens of {self.each} bits, and a table of"
+                f" all 2^{self.each} codes is too large; raise codec.factors, or lower codec.bits, so that a"
+                f" token has at most {_MOST_BITS} bits"
+            )
         self.codes = 2**self.each
         self.register_buffer("powers", 2 ** torch.arange(self.each), persistent=False)
         self.register_buffer("table", bit_signs(self.each), persistent=False)
@@ -110,7 +119,8 @@ class LookupFreeTokenizer(nn.Module):
             and codes shall be many.
 
     Raises:
-        ValueError: if the bits cannot be split, or the stride is no power of two from 4 on.
+        ValueError: if the bits cannot be split, or a token has too many, or the stride is no power of two
+            from 4 on.
     """
 
     def __init__(
@@ -166,19 +176,20 @@ class LookupFreeTokenizer(nn.Module):
 
     @torch.no_grad()
     def figures(self, frames: Tensor) -> dict[str, float]:
-        """PSNR in dB, share of the codes used and perplexity on stills."""
+        """PSNR in dB on stills; of their tokens the number, share of the codes used and perplexity."""
         tokens = self.encode(frames)
         found = {"psnr": psnr(self.decode(tokens), frames), **self._use(tokens)}
         return {name: float(value) for name, value in found.items()}
 
     def warning(self, figures: Mapping[str, float]) -> str:
         """What to do where figures of `loss` or `figures` say that the codebook has collapsed, else ""."""
-        floor = max(_FEWEST, _COLLAPSED * self.quantiser.codes)
+        floor = max(_FEWEST, _COLLAPSED * min(self.quantiser.codes, figures["codebook_tokens"]))
         if figures["perplexity"] >= floor:
             return ""
         return (
             f"the codebook has collapsed: of {self.quantiser.codes} codes a factor, as if"
-            f" {figures['perplexity']:.2f} were in use (least {floor:.2f}); raise the codec's entropy,"
+            f" {figures['perplexity']:.2f} were in use in {figures['codebook_tokens']:.0f} tokens (least"
+            f" {floor:.2f}); raise the codec's entropy,"
             " lower its bits (simulator.codec, of a text world judge.text_world.codec) or the rate of its"
             " training (tokenizer_fit.lr, text_world_fit.tokenizer.lr), or see whether all pictures are alike"
         )
@@ -191,4 +202,5 @@ class LookupFreeTokenizer(nn.Module):
 
     def _use(self, tokens: Tensor) -> dict[str, Tensor]:
         share, perplexity = self.quantiser.use(tokens)
-        return {"codebook_use": share, "perplexity": perplexity}
+        count = torch.tensor(float(tokens.numel() // self.factors))  # of each factor
+        return {"codebook_use": share, "perplexity": perplexity, "codebook_tokens": count}

@@ -30,6 +30,7 @@ from envs.specs import WorldSpec
 from envs.targets import OptionsOf
 
 _KEY = "simulator"
+_REMEMBERED = 8  # frames before a chunk, unless a config says otherwise
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,8 @@ class TokensSimulator(Simulator):
 
     Args:
         spec: what it shows; sizes must be multiples of codec.stride.
-        window: frames that a frame sees, itself included; more than a chunk. Memory is all but a chunk of
-            them.
+        window: frames that a frame sees, itself included; more than a chunk, None: 8 more. Memory is all but
+            a chunk of them.
         codec, net, conditioning, decoding, training: see TokenVideo.
 
     Features also tell whether the task is done, by recorded success: a head that learns beside the tokens
@@ -70,17 +71,18 @@ class TokensSimulator(Simulator):
     def __init__(
         self,
         spec: WorldSpec,
-        window: Count,
+        window: Count | None,
         codec: Annotated[Mapping[str, Any], OptionsOf(LookupFreeTokenizer)],
         net: Annotated[Mapping[str, Any], OptionsOf(Trunk)],
         conditioning: Mapping[str, Any],
         decoding: Mapping[str, Any],
         training: Annotated[Mapping[str, Any], OptionsOf(TokenTraining)],
     ):
+        window = spec.chunk + _REMEMBERED if window is None else window
         if window <= spec.chunk:
             raise ValueError(
                 f"{_KEY}.window={window} must be more than task.chunk={spec.chunk}: a chunk's frames and at"
-                " least one before them"
+                " least one before them; raise it, or leave it null"
             )
         super().__init__(spec, window - spec.chunk, window - spec.chunk)
         self.video = TokenVideo(spec, window, codec, net, conditioning, decoding, training, _KEY)

@@ -49,11 +49,12 @@ class Ending:
 
     Args:
         threshold: of done, above which the task is; calibration sets it later (stages/text_world.py).
-        max_frames: imagined, at most.
+        max_frames: imagined, at most; None: by the time that recorded successes take (stages/text_world.py),
+            and until it is trained as many as its window holds.
     """
 
     threshold: Share
-    max_frames: Count
+    max_frames: Count | None
 
 
 class TextWorld(nn.Module):
@@ -74,6 +75,7 @@ class TextWorld(nn.Module):
 
     hidden = ("blocks",)
     threshold: Tensor
+    longest: Tensor  # int64, of golden trajectories where ending.max_frames is None; saved with the weights
 
     def __init__(
         self,
@@ -92,6 +94,7 @@ class TextWorld(nn.Module):
             raise ValueError(f"{_KEY}.window={window} must be at least 2: a frame and one before it")
         self.window, self.ending = window, options(Ending, ending, f"{_KEY}.ending")
         self.register_buffer("threshold", torch.tensor(self.ending.threshold))
+        self.register_buffer("longest", torch.tensor(window))
         self.video = TokenVideo(spec, window, codec, net, conditioning, decoding, training, _KEY)
         encoder: WordEncoder = build(words, f"{_KEY}.words")
         self.reader = WordReader(encoder, self.video.trunk.width, self.video.cond_tokens)
@@ -100,6 +103,11 @@ class TextWorld(nn.Module):
     def codec(self) -> LookupFreeTokenizer:
         """The tokenizer, which is trained apart."""
         return self.video.codec
+
+    @property
+    def max_frames(self) -> int:
+        """Frames after which a golden trajectory ends, whatever it shows; see Ending."""
+        return self.ending.max_frames or int(self.longest)
 
     def check(self, instructions: Sequence[str]) -> None:
         """Refuse instructions that would be cut.
@@ -134,7 +142,7 @@ class TextWorld(nn.Module):
         cond, known = self.reader(instruction), self.video.net.memory()
         self.video.net.observe(self.video.encode(first[:, None].to(device)), cond, None, known)
         draws = Draws([noise_generator(row + _STREAM, 0) for row in seed.tolist()], device)
-        ended = torch.zeros(len(first), dtype=torch.bool, device=device)
+        ended, limit = torch.zeros(len(first), dtype=torch.bool, device=device), self.max_frames
         tokens: list[Tensor] = []
         done: list[Tensor] = []
         while True:
@@ -146,12 +154,12 @@ class TextWorld(nn.Module):
             tokens.append(new)
             done.append(done_now)
             ended = ended | (done_now > self.threshold)
-            if len(tokens) == self.ending.max_frames or ended.all():
+            if len(tokens) == limit or ended.all():
                 break
         every = torch.stack(done, 1)
         over = every > self.threshold
         goal = torch.where(ended, over.long().argmax(1), over.shape[1] - 1)
-        frames = to_bytes(self.video.decode(torch.stack(tokens, 1)))
+        frames = torch.cat([to_bytes(self.video.decode(new[:, None])) for new in tokens], 1)
         return GoldenTrajectory(*(part.to(first.device) for part in (frames, every, goal, ended)))
 
     @torch.no_grad()

@@ -84,7 +84,8 @@ class T5Words:
             ) from error
         self.tokens = max_tokens
         self._cut: Any = AutoTokenizer.from_pretrained(folder, local_files_only=True)
-        model = T5EncoderModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)
+        with torch.device("cpu"):  # also where a model is built without memory: it is no part of its weights
+            model = T5EncoderModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)
         self._model: Any = model.eval().requires_grad_(False)
         self.size = int(model.config.d_model)
 

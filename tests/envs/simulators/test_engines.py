@@ -81,6 +81,18 @@ def build_engine(name: str, spec: WorldSpec) -> tuple[Simulator, StateDecoder]:
     return simulator.eval(), decoder.eval()
 
 
+@pytest.mark.parametrize("chunk", [1, 2, 3, 4, 8, 16, 30])
+@pytest.mark.parametrize(
+    "name",
+    [n for n in offered("simulator") if n not in SERVED and not n.startswith("gesim") and FULL not in n],
+)
+def test_engines_fit_a_task_of_any_chunk_as_they_are_configured(name: str, chunk: int) -> None:
+    own = {key: value for key, value in section_of(name).items() if key not in WORLD_OPTIONS}
+    with torch.device("meta"):
+        world: Simulator = build(own, "simulator", spec=world_spec(BIMANUAL_POSES, chunk=chunk))
+    assert world.spec.chunk == chunk and world.memory_frames >= 1
+
+
 @pytest.fixture(scope="module", params=SERVES, ids="-".join)
 def engine(request: pytest.FixtureRequest) -> Iterator[tuple[Simulator, StateDecoder]]:
     name, robot = request.param

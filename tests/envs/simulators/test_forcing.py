@@ -263,6 +263,16 @@ def test_what_stands_still_is_as_sharp_as_the_last_frame() -> None:
     assert (frames.int() - first["frames"][:, None].int()).abs().max() <= 1
 
 
+@pytest.mark.parametrize(("chunk", "horizon"), [(1, 1), (2, 2), (4, 4), (8, 4), (30, 4)])
+def test_window_and_horizon_follow_from_the_chunk(chunk: int, horizon: int) -> None:
+    world = make(chunk)
+    assert (world.context, world.horizon, world.memory_frames) == (4, horizon, 4)
+    clips = clip(world.spec, 1, world.memory_frames)
+    state = world.reset(first_of(world.spec, clips), torch.tensor([1]))
+    assert world.step(state, future_of(world.spec, clips))[0].shape[1] == chunk
+    assert bool(world.loss(clips, torch.Generator().manual_seed(0))[0].isfinite())
+
+
 def test_what_does_not_fit_is_named() -> None:
     section = {key: value for key, value in section_of("forcing_small").items() if key != "_target_"}
     own = {name: section[name] for name in ("context", "horizon", "net", "codec", "denoising")}
@@ -273,6 +283,10 @@ def test_what_does_not_fit_is_named() -> None:
         ForcingSimulator(world_spec(BIMANUAL_POSES, (24, 32)), window=8, **own)
     with pytest.raises(ValueError, match=r"simulator\.horizon=5 must be at most task\.chunk=4"):
         ForcingSimulator(world_spec(BIMANUAL_POSES), window=8, **{**own, "horizon": 5})
+    with pytest.raises(ConfigError, match=r"simulator\.net: net\.head_dim=6 must be a multiple of 4"):
+        ForcingSimulator(
+            world_spec(BIMANUAL_POSES), window=8, **{**own, "net": {**own["net"], "head_dim": 6}}
+        )
     wrong = {**own, "prediction": {"_target_": "envs.simulators.forcing.prediction.X"}}
     with pytest.raises(ConfigError, match=r"simulator\.prediction\._target_"):
         ForcingSimulator(world_spec(BIMANUAL_POSES), window=8, **wrong)

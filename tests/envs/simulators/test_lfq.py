@@ -78,7 +78,8 @@ def test_gradients_pass_the_signs_and_reach_every_weight() -> None:
     codec = tokenizer()
     value, figures = codec.loss(pictures(4))
     value.backward()
-    assert bool(value.isfinite()) and {"psnr", "codebook_use", "perplexity"} == figures.keys()
+    assert bool(value.isfinite())
+    assert {"psnr", "codebook_use", "perplexity", "codebook_tokens"} == figures.keys()
     assert not [name for name, p in codec.named_parameters() if p.grad is None or not p.grad.any()]
 
 
@@ -91,7 +92,13 @@ def test_stills_are_encoded_alone_and_decoded_to_their_size() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"), [({"factors": 3}, r"codec\.bits=8"), ({"stride": 12}, r"codec\.stride=12")]
+    ("change", "said"),
+    [
+        ({"factors": 3}, r"codec\.bits=8"),
+        ({"stride": 12}, r"codec\.stride=12"),
+        # 34 GB of signs otherwise
+        ({"bits": 64}, r"codec\.bits=64 in codec\.factors=2 are tokens of 32 bits.*raise codec\.factors"),
+    ],
 )
 def test_options_that_cannot_work_are_named(change: dict[str, int], said: str) -> None:
     with pytest.raises(ValueError, match=said):
@@ -121,18 +128,33 @@ def test_a_collapsed_codebook_gives_one_alarm_that_says_what_to_do(
     assert "simulator.codec" in alarm.message and "collapsed" in alarm.message
     assert capsys.readouterr().out.count("ALARM tokenizer") == 1
     healthy = CodecAlarm(codec, patience=1)
-    healthy.check({"psnr": 20.0, "perplexity": 9.0})
+    healthy.check({"psnr": 20.0, "perplexity": 9.0, "codebook_tokens": 48.0})
     assert not healthy.message and codec.warning(codec.figures(pictures(2)))
 
 
 def test_one_factor_that_has_collapsed_is_a_collapse() -> None:
     codec = tokenizer()
     tokens = torch.randint(codec.quantiser.codes, (4096, codec.quantiser.factors))
-    share, perplexity = codec.quantiser.use(tokens)
-    assert float(share) == 1.0 and not codec.warning({"perplexity": float(perplexity)})
+    found = said_of(codec, tokens)
+    assert found["codebook_use"] == 1.0 and not codec.warning(found)
     tokens[:, 0] = 3
-    share, perplexity = codec.quantiser.use(tokens)
-    assert float(perplexity) == 1.0 and codec.warning({"perplexity": float(perplexity)})
+    found = said_of(codec, tokens)
+    assert found["perplexity"] == 1.0 and codec.warning(found)
+
+
+def test_of_many_codes_no_more_can_be_in_use_than_tokens_were_seen() -> None:
+    codec = tokenizer(bits=14, factors=1)
+    different = torch.randperm(codec.quantiser.codes)[:300, None]
+    found = said_of(codec, different)
+    assert found["codebook_tokens"] == 300 and not codec.warning(found)
+    many = different.repeat(100, 1)  # of these no less than a fiftieth of all codes is expected
+    assert "in use in 30000 tokens (least 327.68)" in codec.warning(said_of(codec, many))
+    assert "(least 6.00)" in codec.warning(said_of(codec, different[:5].repeat(60, 1)))
+
+
+def said_of(codec: LookupFreeTokenizer, tokens: torch.Tensor) -> dict[str, float]:
+    """Figures of tokens [N, factors]."""
+    return {name: float(value) for name, value in codec._use(tokens).items()}
 
 
 @pytest.mark.parametrize("name", ENGINES)

@@ -170,6 +170,8 @@ def test_t5_from_a_folder_tells_word_by_word(tmp_path: Path) -> None:
     assert torch.equal(made.reader(TEXTS[1:2])[0], told[1])
     with pytest.raises(ValueError, match=r"has 10 tokens, more than text_world\.words\.max_tokens=9"):
         made.check(["cube " * 10])
+    with torch.device("meta"):  # as a config is checked, and sizes are counted
+        assert next(world(words=given).parameters()).is_meta
     given["max_tokens"] = 512  # more than clips and rollouts carry: it would learn from half of a text
     with pytest.raises(ValueError, match=rf"has 300 bytes.*carry {TEXT_BYTES}"):
         world(words=given).check(["cube " * 60])

@@ -216,6 +216,17 @@ def test_where_tokens_stay_the_picture_does() -> None:
     assert torch.equal(frames, first["frames"][:, None].expand_as(frames))
 
 
+def test_as_many_frames_are_remembered_whatever_the_chunk() -> None:
+    own = {
+        key: value
+        for key, value in section_of("simulator", "tokens_small").items()
+        if key not in WORLD_OPTIONS
+    }
+    worlds = [build(own, "simulator", spec=world_spec(ARM_DELTAS, chunk=chunk)) for chunk in (1, 4, 16)]
+    assert [world.memory_frames for world in worlds] == [8, 8, 8]
+    assert engine(window=5).memory_frames == 5 - CHUNK
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

@@ -164,7 +164,11 @@ def test_the_best_of_a_place_is_named_by_what_it_is_best_at() -> None:
 def test_what_cannot_be_shown_is_told() -> None:
     with pytest.raises(ConfigError, match="frames=0 should be all, ends, or a number"):
         FramesShown("frames", ["all", 0], 8)
-    assert FramesShown("frames", [4, "ends"], 8).labels({}) == ["every 4th", "first and last"]
+    column = FramesShown("frames", [4, "ends"], 8)
+    assert column.labels({}) == ["every 4th", "first and last"]
+    none = {"tp": 0, "fp": 0, "fn": 0, "tn": 0, "accuracy": None, "dropped": 6, "shown": 2.0}
+    assert column.text(none) == "nothing judged, 6 not judged (2 frames)" and column.merit(none) is None
+    assert column.merit({**none, "tn": 6, "accuracy": 1.0}) == 1.0
 
 
 @pytest.mark.parametrize(("simulator", "shares"), [("unet_small", (0.85, 0.15)), ("dit_small", (0.65, 0.15))])
