@@ -15,6 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from envs.episodes.store import warn_of_cut
 from envs.rng import episode_stream
 from envs.specs import EPISODE, INSTRUCTION_UTF8, TEXT_BYTES, ActionMode, WorldSpec, text_to_bytes
 
@@ -148,6 +149,7 @@ class ChunkedEnv(EnvBase):
         out[EPISODE] = self._seeds.to(self.device, copy=True).unsqueeze(-1)
         if list(instructions) != self.instructions or self._text is None:
             self.instructions = list(instructions)
+            warn_of_cut(self.instructions)
             self._text = text_to_bytes(self.instructions).to(self.device)
         out[INSTRUCTION_UTF8] = self._text.clone()
         return out

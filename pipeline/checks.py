@@ -25,6 +25,7 @@ from envs.targets import (
     value_faults,
 )
 from learners.rl.algorithm import RLConfig
+from learners.stages.distill.method import Method
 from learners.stages.simulator import SimulatorFitConfig
 from learners.training.fit import FitConfig
 from pipeline.acting import acting
@@ -90,7 +91,6 @@ _TARGETS = {
     "ewmbench.frames": (),
     "ewmbench.texts": (),
 }
-_FASTER = 10  # times as fast as its critic a student may learn
 _TOP = {key.partition(".")[0] for key in (*_SECTIONS, *_FITS, *_SIMULATOR_FITS, *_TARGETS, "rl", "launch")}
 
 
@@ -279,16 +279,10 @@ def _learning(cfg: Cfg) -> Iterator[str]:
 
 
 def _distilling(section: Cfg) -> Iterator[str]:
-    """Students that would run away from their critic, if the method has one."""
-    critic = section["method"].get("critic_lr")
-    for phase in ("first", "refresh") if section["steps"] and critic else ():
-        student = section[phase]["fit"]["lr"]
-        if critic < student / _FASTER:
-            yield (
-                f"distill.{phase}.fit.lr={student} is more than {_FASTER} times distill.method.critic_lr="
-                f"{critic}: the critic could not follow what the student makes; say"
-                f" distill.{phase}.fit.lr={critic}, or raise distill.method.critic_lr"
-            )
+    """Students of which nothing could come, as their method says."""
+    said = getattr(target(section["method"], "distill.method"), "faults", Method.faults)
+    for phase in ("first", "refresh") if section["steps"] else ():
+        yield from said(section["method"], section[phase]["fit"], f"distill.{phase}.fit")
 
 
 def _at(cfg: Cfg, path: str) -> Any:

@@ -1,4 +1,4 @@
-"""The loop, fine-tuning and serving on a GPU; algorithms alone: learners/rl/test_algorithms.py."""
+"""The loop, fine-tuning, students and serving on a GPU; algorithms alone: learners/rl/test_algorithms.py."""
 
 from __future__ import annotations
 
@@ -14,8 +14,14 @@ import torch
 
 from actors.serving.sessions import SessionHost
 from envs.embodiment import Embodiment
+from envs.episodes.clips import ClipStore
+from learners.stages.distill.stage import train_student
+from learners.stages.simulator import ClipBatches, SimulatorFitConfig
+from learners.training.fit import FitConfig
 from tests.actors.serving import Running, Stranger, serve_config, tiny_expert, tiny_world
 from tests.embodiments import ARM_JOINTS
+from tests.learners.models import stepwise_pair
+from tests.sections import section
 
 ROOT = Path(__file__).resolve().parent.parent
 pytestmark = [
@@ -54,6 +60,19 @@ def test_finetune(
         path.parent.name.split("-")[0] for path in (tmp_path / "tuned/finetune").glob("*/weights.safetensors")
     }
     assert made == {"simulator", "state"} | ({"tokenizer"} if simulator == "dit_small" else set())
+
+
+@pytest.mark.parametrize("method", ["dmd2", "trajectory"])
+def test_a_student_of_few_steps(
+    method: str, tiny_store: Callable[[Embodiment], ClipStore], tmp_path: Path
+) -> None:
+    store = tiny_store(ARM_JOINTS)
+    clips, options = SimulatorFitConfig(1.0, 1, (1,), 0.0, 0), FitConfig(5, 2, 1e-3, warmup=1)
+    teacher, student = (world.cuda() for world in stepwise_pair("dit_small", store.spec))
+    begun = {name: value.clone() for name, value in student.state_dict().items()}
+    batches = ClipBatches(student, store, torch.arange(4), clips, options)
+    train_student(teacher, section(f"distiller/{method}"), batches, tmp_path)
+    assert any(not torch.equal(value, begun[name]) for name, value in student.state_dict().items())
 
 
 def test_serve() -> None:

@@ -1,7 +1,8 @@
-"""The loop, and serving, where networks lie on another device than physics and recordings do."""
+"""The loop, students and serving, where networks lie on another device than physics and recordings do."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,18 @@ import pytest
 import torch
 
 from actors.serving.sessions import SessionHost
+from envs.embodiment import Embodiment
+from envs.episodes.clips import ClipStore
+from learners.stages.distill.stage import train_student
+from learners.stages.simulator import ClipBatches, SimulatorFitConfig
+from learners.training.fit import FitConfig
 from pipeline.config import load_config
 from pipeline.loop import build_loop
 from tests.actors.serving import Running, Stranger, serve_config, tiny_expert, tiny_world
+from tests.embodiments import ARM_DELTAS
+from tests.learners.models import stepwise_pair
 from tests.second_device import DEVICE, second_device
+from tests.sections import section
 
 
 def test_what_a_gpu_would_refuse_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -40,6 +49,21 @@ def test_serving(monkeypatch: pytest.MonkeyPatch) -> None:
             assert frames.shape == (4, 3, 3, 32, 32) and state is not None and np.isfinite(state).all()
         finally:
             server.stop()
+
+
+def test_a_student_of_few_steps(
+    tiny_store: Callable[[Embodiment], ClipStore], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = tiny_store(ARM_DELTAS)
+    clips, options = SimulatorFitConfig(1.0, 1, (1,), 0.0, 0), FitConfig(2, 2, 1e-3, warmup=1, bf16=False)
+    teacher, student = stepwise_pair("dit_small", store.spec)
+    begun = {name: value.clone() for name, value in student.state_dict().items()}
+    with second_device(monkeypatch):
+        teacher, student = teacher.to(DEVICE), student.to(DEVICE)
+        batches = ClipBatches(student, store, torch.arange(4), clips, options)
+        train_student(teacher, section("distiller/dmd2", critic_updates=1), batches, tmp_path)
+        assert {world.device for world in (teacher, student)} == {DEVICE}
+        assert any(not torch.equal(part.cpu(), begun[name]) for name, part in student.state_dict().items())
 
 
 @pytest.mark.slow

@@ -16,10 +16,25 @@ from envs.conditioning import PoseMapStyle
 from envs.episodes.cache import CachedSet, open_cached
 from envs.episodes.columns import Columns
 from envs.episodes.episode import EpisodeError
+from envs.episodes.formats.lerobot_columns import SEED
+from envs.episodes.formats.lerobot_files import read_info
 from envs.episodes.splits import range_of
 from envs.specs import TEXT_BYTES, WorldSpec, text_to_bytes
 
 log = logging.getLogger(__name__)
+_known_cut: set[str] = set()  # instructions that this process has warned of
+
+
+def warn_of_cut(instructions: Iterable[str]) -> None:
+    """Warn, once in a process, of instructions that text_to_bytes cuts."""
+    cut = {text for text in instructions if len(text.encode()) > TEXT_BYTES} - _known_cut
+    if cut:
+        _known_cut.update(cut)
+        log.warning(
+            "%d instructions, the first of them %.60r..., have more than %d bytes; only so many are read"
+            " by policies, judges and worlds, so texts that differ later are the same to them",
+            *(len(cut), min(cut), TEXT_BYTES),
+        )
 
 
 class EpisodeStore:
@@ -66,12 +81,7 @@ class EpisodeStore:
         ]
         self.instructions = [str(row["instruction"]) for row in self.episodes]
         self.text = text_to_bytes(self.instructions)
-        if cut := sorted({text for text in self.instructions if len(text.encode()) > TEXT_BYTES}):
-            log.warning(
-                "%d instructions, the first of them %.60r..., have more than %d bytes; only so many are read"
-                " by policies, judges and worlds, so texts that differ later are the same to them",
-                *(len(cut), cut[0], TEXT_BYTES),
-            )
+        warn_of_cut(self.instructions)
         self.length = torch.tensor([row["length"] for row in self.episodes])
         self.start = self.length.cumsum(0) - self.length
         self.arrays = Columns(
@@ -184,6 +194,19 @@ class EpisodeStore:
         last = self.length[episodes][:, None] - 1
         return self.start[episodes][:, None] + torch.minimum(ahead, last), ahead <= last
 
+    def seeded(self, episodes: Tensor) -> Tensor:
+        """Whether the seed of each of `episodes` [E] was recorded, bool [E]; that of others is their number,
+        from which nothing was laid out.
+        """
+        known = [SEED in read_info(part.folder)["features"] for part in self.parts]
+        owners = [self.episodes[number]["dataset"] for number in episodes.tolist()]
+        return torch.tensor([known[owner] for owner in owners], dtype=torch.bool)
+
+    def pictures(self, episodes: Tensor) -> Tensor:
+        """Of how many frames of each of `episodes` [E] there is a picture, int64 [E]."""
+        counted = torch.cat((torch.zeros(1, dtype=torch.int64), self.arrays["present"].long().cumsum(0)))
+        return counted[self.start[episodes] + self.length[episodes]] - counted[self.start[episodes]]
+
     def success(self, episodes: Tensor, rows: Tensor) -> Tensor:
         """Whether the task is done in frames `rows` [B, ...] of `episodes` [B], float32 [B, ...]; NaN where
         nobody labelled the episode.
@@ -195,7 +218,20 @@ class EpisodeStore:
 
     # -- what simulators take
     def first(self, episodes: Tensor) -> TensorDict:
-        """The first frames of episodes [E] with all that Simulator.reset takes."""
+        """The first frames of episodes [E] with all that Simulator.reset takes.
+
+        Raises:
+            EpisodeError: if there is no picture of one of them; names the data set.
+        """
+        dark = episodes[~self.arrays["present"][self.start[episodes]]].tolist()
+        if dark:
+            owners = [row["dataset"] for row in self.episodes]
+            owner = owners[dark[0]]
+            raise EpisodeError(
+                f"{self.parts[owner].folder}: {len(dark)} episodes, the first of them number"
+                f" {dark[0] - owners.index(owner)}, have no picture at their first frame, from which video is"
+                " generated; cut them to begin at a frame that has one, or leave them out of the data"
+            )
         return self.at(episodes, torch.zeros_like(episodes))
 
     def at(self, episodes: Tensor, frame: Tensor) -> TensorDict:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import json
 import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
-from envs.targets import ConfigError
+from envs.targets import ConfigError, target
 from pipeline.cli.words import without_given
-from pipeline.config import load_config
+from pipeline.config import load_config, read_config
 
 # Where a third of the episodes fail, a judge can be wrong both ways, and there are long rollouts.
 JUDGED = (
@@ -17,7 +20,7 @@ JUDGED = (
 # The smallest world on which the figures of few steps mean anything: minutes of one core.
 DISTIL = (
     *("experiment=smoke", "simulator=dit_small", "name=distil", "task.horizon=64", "task.size=[32,32]"),
-    *("task.suite.cameras=[head]", "simulator.denoising.steps=15", "distill.steps=4"),
+    *("task.suite.cameras=[head]", "distill.steps=4"),
     "tokenizer_fit={steps: 250, batch: 16, lr: 3e-3}",
     "simulator_fit.first={single_chunk_fraction: 0.9, fit: {steps: 400, batch: 16, lr: 3e-3}}",
     *("distill.first.fit.steps=500", "state_fit.first.fit={steps: 120, batch: 16, lr: 4e-3}"),
@@ -47,6 +50,8 @@ BENCHES: dict[str, tuple[str, tuple[str, ...]]] = {
     "overfit": ("pipeline.benches.training", ("simulator=dit_small", "task=lerobot")),
     "pretrained": ("pipeline.benches.training", ("experiment=smoke", "simulator=dit_small")),
 }
+# Undistilled steps a chunk of the simulator that a benchmark begins with, unless the command line says more.
+STEPS = {"distil": 15}
 # Options of benchmarks that are no part of a config, and what they are unless the command line says more.
 OWN: dict[str, dict[str, float]] = {"serving": {"seconds": 180.0}}
 
@@ -59,8 +64,8 @@ def run_bench(words: list[str]) -> None:
     """
     if not words or words[0] not in BENCHES:
         raise ConfigError(f"say which: worldloop bench {'|'.join(BENCHES)}")
-    module, base = BENCHES[words[0]]
-    own, rest = dict(OWN.get(words[0], {})), []
+    name = words[0]
+    own, rest = dict(OWN.get(name, {})), []
     for word in words[1:]:
         key, _, value = word.partition("=")
         if key not in own:
@@ -72,5 +77,39 @@ def run_bench(words: list[str]) -> None:
             own[key] = 0.0
         if not 0 < own[key] < math.inf:
             raise ConfigError(f"{word}: say a number above 0")
-    cfg = load_config([*without_given(base, rest), *rest])
-    getattr(importlib.import_module(module), words[0])(cfg, **own)
+    cfg = config_of(name, rest)
+    getattr(importlib.import_module(BENCHES[name][0]), name)(cfg, **own)
+
+
+def config_of(name: str, words: Sequence[str]) -> dict[str, Any]:
+    """The config of a benchmark under the overrides of a command line.
+
+    Raises:
+        ConfigError: see load_config; or if a simulator that should denoise in steps does not.
+    """
+    given = [*without_given(BENCHES[name][1], words), *words]
+    return load_config([*stepped(given, STEPS[name]), *given] if name in STEPS else given)
+
+
+def stepped(words: Sequence[str], steps: int) -> list[str]:
+    """Overrides by which the simulator that `words` choose takes so many undistilled steps a chunk; the
+    engine knows which keys say so.
+
+    Raises:
+        ConfigError: if it does not denoise in steps.
+    """
+    section = read_config(words)["simulator"]
+    try:
+        made = target(section, "simulator").stepped_section(section, steps)  # type: ignore[attr-defined]
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    return list(_changes(section, made, "simulator"))
+
+
+def _changes(old: Mapping[str, Any], new: Mapping[str, Any], path: str) -> Iterator[str]:
+    """Overrides that make a section of another."""
+    for key, value in new.items():
+        if isinstance(value, Mapping) and isinstance(old.get(key), Mapping):
+            yield from _changes(old[key], value, f"{path}.{key}")
+        elif value != old.get(key):
+            yield f"{path}.{key}={json.dumps(value)}"

@@ -64,7 +64,7 @@ def distil(cfg: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """
     prepare_process(cfg["seed"], cfg["threads"])
     root = root_of(cfg)
-    graph, rows = build_table(cfg, root / "distil")
+    graph, rows, left = build_table(cfg, root / "distil")
     graph.run(list(rows.values()))
     found = {title: graph.result(name) for title, name in rows.items()}
     write_text(root / "distil.json", json.dumps(found, indent=1))
@@ -72,7 +72,7 @@ def distil(cfg: dict[str, Any]) -> dict[str, dict[str, Any]]:
     print(f"| | {' | '.join(_FIGURES).format(frames=frames)} |\n|{' --- |' * (1 + len(_FIGURES))}")
     for title, figures in found.items():
         print(f"| {title} | {' | '.join(form.format(**figures) for form in _FIGURES.values())} |")
-    print("\n".join(reached(found)))
+    print("\n".join([*(f"{title}: left out, {why}" for title, why in left.items()), *reached(found)]))
     return found
 
 
@@ -105,8 +105,9 @@ def reached(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return lines
 
 
-def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, str]]:
-    """The stages, and the names of those that measure, by the titles of their rows.
+def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, str], dict[str, str]]:
+    """The stages, the names of those that measure, by the titles of their rows, and by those of rows that are
+    left out why the engine cannot take so many steps.
 
     A student learns to take any number of steps up to distill.steps, so there is one of each method, with as
     many updates. "not distilled" has the weights of the teacher jump as students do: a jump that nobody has
@@ -124,7 +125,7 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
     data = [graph.add("collect", collect.collect)]
     warm = graph.add("tokenizer", world.tokenizer, {"data": data}) if "codec" in cfg["simulator"] else ""
     teacher = graph.add("simulator", world.simulator, {"data": data, "warm": warm}, phase="first")
-    rows = {}
+    rows, left = dict[str, str](), dict[str, str]()
     judge_class: Any = target(cfg["judge"], "judge")
     golden = (
         graph.add("text_world", judging.text_world, {"data": data}, phase="first")
@@ -148,7 +149,11 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
         rows[title] = own.add(f"measure-{name}", measure, roles, evaluations=evaluations)
 
     for steps in TEACHER:
-        section = engine.stepped_section(cfg["simulator"], steps)  # type: ignore[attr-defined]
+        try:
+            section = engine.stepped_section(cfg["simulator"], steps)  # type: ignore[attr-defined]
+        except ValueError as error:
+            left[f"teacher, {steps}"] = str(error)
+            continue
         measured(f"teacher, {steps}", f"teacher-{steps}", teacher, section, 0)
     few = {
         steps: acting({**cfg, "distill": {**cfg["distill"], "steps": steps}})["simulator"]
@@ -163,7 +168,7 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
         student = own.add(f"student-{name}", world.student, roles, phase="first")
         for steps in few:
             measured(f"{name}, {steps}", f"{name}-{steps}", student, few[steps], steps)
-    return graph, rows
+    return graph, rows, left
 
 
 def _methods(section: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -7,10 +7,11 @@ torch.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from envs.targets import ConfigError, nearest
+from envs.targets import ConfigError, nearest, target
 from pipeline.cli.words import Words, prepared, root_of
 
 
@@ -23,6 +24,7 @@ def run(words: Words) -> None:
     from pipeline.track import tracking
 
     graph = build_loop(cfg, root)
+    _check_learns(cfg, graph.nodes)
     check_labels(cfg, graph)
     check_launch(cfg["launch"])
     print(f"{len(graph.nodes)} stages in {root}; each says how long it will take after its first steps")
@@ -79,23 +81,50 @@ def stages(words: Words) -> None:
 def evaluate(words: Words) -> None:
     """success of a policy: worldloop evaluate policy=<stage|folder> [world=physics|imagined]
     [variant=<one of task.variants>] experiment=...; one that needs no weights is a choice of
-    configs/policy: policy=openpi policy.url=ws://...
+    configs/policy: policy=openpi policy.url=ws://... Or all figures of a simulator and its page: worldloop
+    evaluate simulator=<stage|folder> experiment=..., which is fidelity, ewmbench and summary in turn
     """
     from pipeline.config import offered
 
-    own, rest = {"weights": "", "world": "physics", "variant": ""}, []
+    own, rest, simulator = {"weights": "", "world": "physics", "variant": ""}, [], ""
     for word in words:
         key, _, value = word.partition("=")
         if key in ("world", "variant"):
             own[key] = value
+        elif key == "simulator" and not offered("simulator", value, words):
+            simulator = value
         elif key == "policy" and not offered("policy", value, words):
             own["weights"] = value
         else:
             rest.append(word)
+    if simulator:
+        if len(rest) < len(words) - 1:
+            raise ConfigError(
+                f"simulator={simulator} is measured by itself: leave out policy=, world= and variant=;"
+                " `worldloop policy-value` says what it makes of policies, by imagined.simulator"
+            )
+        from pipeline.cli.worlds import evaluate_simulator
+
+        _check_named("simulator", simulator, rest)
+        return evaluate_simulator(simulator, rest)
     cfg, root = prepared(rest)
+    if own["weights"]:
+        _check_named("policy", own["weights"], rest)
     from pipeline.commands.evaluate import evaluate_policy
 
     print(evaluate_policy(cfg, root, **own))
+
+
+def _check_named(group: str, name: str, words: Words) -> None:
+    """Refuse what is neither a stage of the run nor a folder, with the nearest of stages and choices."""
+    from pipeline.config import choices
+    from pipeline.loop import build_loop
+
+    cfg, root = prepared(words)
+    stages = build_loop(cfg, root).nodes
+    if name not in stages and not Path(name).exists():
+        near = nearest(name, [*stages, *choices(group, words)])
+        raise ConfigError(f"{group}={name} is no stage, folder or choice of configs/{group}{near}")
 
 
 def trust(words: Words) -> None:
@@ -147,6 +176,9 @@ def study(words: Words) -> None:
     from pipeline.study.run import run_study
 
     device_of(made.cfg)
+    for row in made.rows:
+        wanted = [node for nodes in row.nodes.values() for node in nodes]
+        _check_learns(row.cfg, row.made.graph.needs(wanted))
     if made.cfg["study"]["minutes"] != 0:  # else the table is written as it stands
         check_launch(made.cfg["launch"])
     prepare_process(made.cfg["seed"], made.cfg["threads"])
@@ -197,6 +229,21 @@ def stage_named(name: str, stages: Sequence[str]) -> str:
     return name
 
 
+def _check_learns(cfg: Mapping[str, Any], wanted: Iterable[str]) -> None:
+    """See that the policy can learn, if stages are wanted in which it does, before anything is recorded.
+
+    Raises:
+        ConfigError: if it can be evaluated alone.
+    """
+    kind = target(cfg["policy"], "policy")
+    able = any(hasattr(kind, name) for name in ("get_dist", "imitation_loss"))
+    if isinstance(kind, type) and not able and "imitation" in wanted:
+        raise ConfigError(
+            f"policy._target_={cfg['policy']['_target_']} cannot learn, as it has no get_dist; `worldloop"
+            " evaluate` says how good it is, and what shall learn is another choice of configs/policy"
+        )
+
+
 def _run_until(name: str, words: Words) -> Path:
     """Run a stage and what it needs; returns its folder."""
     cfg, root = prepared(words)
@@ -207,6 +254,7 @@ def _run_until(name: str, words: Words) -> Path:
 
     graph = build_loop(cfg, root)
     name = stage_named(name, list(graph.nodes))
+    _check_learns(cfg, graph.needs(name))
     check_labels(cfg, graph, name)
     check_launch(cfg["launch"])
     with owning(root, f"stage {name}"), tracking(cfg, root) as tracker:

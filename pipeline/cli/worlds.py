@@ -61,6 +61,18 @@ def summary(words: Words) -> None:
     print(f"{root}/summary.html")
 
 
+def evaluate_simulator(name: str, words: Words) -> None:
+    """All that is measured of a simulator without policies, and its page.
+
+    Args:
+        name: a stage of the run or a folder with weights, as imagined.simulator.
+        words: what else was said.
+    """
+    words = [*words, f"imagined.simulator={name}"]
+    for measure in (fidelity, ewmbench, summary):
+        measure(words)
+
+
 def sweep(words: Words) -> None:
     """move one number of the action at a time and draw what is imagined: worldloop sweep experiment=...
     [sweep.episode=0] [sweep.levels=[-2,2]]
@@ -97,8 +109,11 @@ def rewards(words: Words) -> None:
     cfg, root = prepared(rest)
     from pipeline.commands.worlds.rewards import Plan, compare_rewards
     from pipeline.graph.owner import owning
+    from pipeline.loop import has_physics
     from pipeline.track import tracking
 
+    if not has_physics(cfg) and not any(word.startswith("rewards=") for word in words):
+        names.remove("rule")  # which asks physics
     others = [word for word in rest if not word.lstrip("+~").startswith(("judge=", "judge."))]
     # What judge.<option> says is said of the run's own judge; two choices may share a class.
     chosen = read_config([word for word in rest if not word.lstrip("+~").startswith("judge.")])["judge"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,10 @@ from actors.world_config import build_kinematics, embodiment_of, pose_style, wor
 from envs.embodiment import Embodiment
 from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.initial_states import InitialStates
-from envs.physics.suite import Observation, build_suite, task_names, task_of
+from envs.physics.suite import Observation, TaskSuite, build_suite, task_names, task_of
 from envs.targets import ConfigError
 from pipeline.acting import acting
+from pipeline.evaluation.by_task import tasks_told
 from pipeline.loop import build_loop, has_physics
 
 Cfg = Mapping[str, Any]
@@ -42,7 +44,8 @@ def build_game(cfg: Cfg, world: Mapping[str, Path], actions: Path | None = None)
         actions: a LeRobot data set of this robot whose actions can be played, None for none.
 
     Raises:
-        ConfigError: if there is neither physics nor a learned world, or the actions are another robot's.
+        ConfigError: if there is neither physics nor a learned world, or the actions are another robot's, or
+            of episodes that this physics does not know.
     """
     if not has_physics(cfg) and not world:
         raise ConfigError(
@@ -50,11 +53,11 @@ def build_game(cfg: Cfg, world: Mapping[str, Path], actions: Path | None = None)
             " yet: first `worldloop run` with the same options, or choose a task with a suite"
         )
     names, robot = task_names(cfg["task"]["name"]), embodiment_of(cfg)
-    recorded = _recorded(actions, robot, names) if actions is not None else []
-    if not has_physics(cfg):
+    suite = build_suite(cfg["task"]["suite"]) if has_physics(cfg) else None
+    recorded = _recorded(actions, robot, names, suite) if actions is not None else []
+    if suite is None:
         starts = InitialStates.of(open_clips(cfg, cfg["task"]["data"]))
         return Game(robot, names, None, _imagination(cfg, world, starts), None, recorded)
-    suite = build_suite(cfg["task"]["suite"])
     tasks = tuple(dict.fromkeys((*names, *suite.tasks)))
     if not world:
         return Game(robot, tasks, suite, None, None, recorded)
@@ -75,17 +78,29 @@ def _imagination(cfg: Cfg, world: Mapping[str, Path], starts: InitialStates) -> 
     return ImaginedSide(build_world(cfg, simulator, decoder, build_judge(cfg, world["judge"]), starts, 1))
 
 
-def _recorded(folder: Path, robot: Embodiment, names: Sequence[str]) -> list[Recorded]:
-    """The recorded actions of a data set, by episode; `names` are the tasks that its run played by turns."""
+def _recorded(
+    folder: Path, robot: Embodiment, names: Sequence[str], suite: TaskSuite | None
+) -> list[Recorded]:
+    """The recorded actions of a data set, by episode; `names` are the tasks that are played by turns."""
     data = LeRobotDataset(folder)
     wanted, found = (
         (one.robot, one.action_names, one.action_kind, one.delta, one.fps) for one in (robot, data.embodiment)
     )
     if wanted != found:
         raise ConfigError(f"actions={folder} are of {found}, but this task's robot is {wanted}")
-    out = []
+    out, told = [], []
     for number, episode in enumerate(data):
         outcome = {True: "success", False: "failure", None: ""}[episode.succeeded]
-        title = f"{number}: seed {episode.seed} {episode.source} {outcome}".strip()
+        title = f"{number}: {episode.instruction}, seed {episode.seed} {episode.source} {outcome}".strip()
         out.append(Recorded(title, task_of(names, episode.seed), episode.seed, episode.commands[1:]))
-    return out
+        told.append((episode.seed, episode.instruction))
+    if suite is None:
+        return out
+    tasks = tasks_told(suite, names, told)
+    if None in tasks:
+        seed, words = told[tasks.index(None)]
+        raise ConfigError(
+            f"actions={folder}: the episode of seed {seed} was told {words!r}, which this suite says of none"
+            " of its tasks there; say the options task=... that it was recorded with"
+        )
+    return [replace(one, task=task) for one, task in zip(out, tasks, strict=True) if task]

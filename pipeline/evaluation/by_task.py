@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from envs.episodes.clips import ClipStore
-from envs.physics.suite import build_suite, scene_of, task_names, task_of
+from envs.physics.suite import TaskSuite, build_suite, scene_of, task_names, task_of
 from envs.targets import ConfigError, nearest
 
 T = TypeVar("T")
@@ -27,20 +27,53 @@ def variant_of(cfg: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     Raises:
         ConfigError: for a variant that the task does not have.
     """
-    known = {"": {}, **(cfg["task"].get("variants") or {})}
-    if name not in known:
+    known = cfg["task"].get("variants", {})
+    if name and not known:
+        raise ConfigError(f"variant={name}: this task has no variants; leave it out, or add task.variants")
+    if name and name not in known:
         raise ConfigError(f"variant={name} is not one of task.variants{nearest(name, known)}")
-    return dict(known[name])
+    return dict(known[name]) if name else {}
+
+
+def tasks_told(
+    suite: TaskSuite, names: Sequence[str], episodes: Iterable[tuple[int, str]]
+) -> list[str | None]:
+    """The task of each episode, of its seed and its instruction: the one of `names` whose turn it is by the
+    seed, or where the suite says something else there, as of recordings of another task.name, one of its
+    tasks that it says so of; None if it says so of none.
+
+    A task that has said an instruction once is not asked for it again; the suite is left in mid-episode.
+    """
+    found: dict[str, list[str]] = {}  # tasks by what was told
+    out: list[str | None] = []
+    for seed, told in episodes:
+        turn, known = task_of(names, seed), found.get(told)
+        if known is None or (known and turn not in known):
+            found[told] = known = known or []
+            for task in dict.fromkeys((turn, *known, *names, *suite.tasks)):
+                if task not in known:
+                    suite.reset(task, seed)
+                    if suite.observe().instruction == told:
+                        known.append(task)
+                if task in known:
+                    break
+        out.append(turn if turn in known else next(iter(known), None))
+    return out
 
 
 def tasks_of_episodes(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor) -> list[str]:
-    """The task of each of a store's episodes int64 [N]: of those that physics laid out, by the seed; of other
-    recordings, what the robot was told (which LeRobot calls the task).
+    """The task of each of a store's episodes int64 [N]: of those that this physics laid out, see tasks_told;
+    of other recordings, what the robot was told (which LeRobot calls the task).
     """
     rows = [store.episodes[number] for number in episodes.tolist()]
+    tasks = [row["instruction"] for row in rows]
     if cfg["task"].get("suite"):
-        return tasks_of_seeds(cfg, (row["seed"] for row in rows))
-    return [row["instruction"] for row in rows]
+        seeded = store.seeded(episodes).tolist()
+        suite, names = build_suite(cfg["task"]["suite"]), task_names(cfg["task"]["name"])
+        told = [(row["seed"], row["instruction"]) for row, known in zip(rows, seeded, strict=True) if known]
+        laid_out = iter(tasks_told(suite, names, told))
+        tasks = [(known and next(laid_out)) or task for known, task in zip(seeded, tasks, strict=True)]
+    return tasks
 
 
 def evenly(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor, count: int) -> Tensor:
@@ -87,10 +120,12 @@ def scenes_of_seeds(
 
 
 def scenes_of_episodes(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor) -> list[str]:
-    """The scene of each of a store's episodes int64 [N]; "" of recordings without physics."""
+    """The scene of each of a store's episodes int64 [N]; "" of those that physics did not lay out."""
+    none = [""] * len(episodes)
     if not cfg["task"].get("suite"):
-        return [""] * len(episodes)
-    return scenes_of_seeds(cfg, (store.episodes[number]["seed"] for number in episodes.tolist()))
+        return none
+    laid_out = scenes_of_seeds(cfg, (store.episodes[number]["seed"] for number in episodes.tolist()))
+    return _where(store.seeded(episodes), laid_out, none)
 
 
 def by_scene(
@@ -108,3 +143,8 @@ def by_scene(
         {"task": task, "scene": scene, **summarise(*(value[mine[task, scene]] for value in values))}
         for task, scene in cells
     ]
+
+
+def _where(known: Tensor, names: Sequence[str], others: Sequence[str]) -> list[str]:
+    """Names where they are known, bool [N], and others elsewhere."""
+    return [name if of else other for of, name, other in zip(known.tolist(), names, others, strict=True)]

@@ -72,9 +72,10 @@ def _error(key: str, digits: int) -> Callable[[Result], str]:
 
 
 def _verdicts(video: str) -> Callable[[Result], str]:
-    return lambda r: "; ".join(
-        f"{group} {100 * tables[video]['accuracy']:.1f}" for group, tables in r["judge"].items()
-    )
+    def accuracy(table: Result) -> str:
+        return "-" if table["accuracy"] is None else f"{100 * table['accuracy']:.1f}"
+
+    return lambda r: "; ".join(f"{group} {accuracy(tables[video])}" for group, tables in r["judge"].items())
 
 
 _ROWS: tuple[tuple[str, Callable[[Result], str]], ...] = (

@@ -10,11 +10,12 @@ from torch import Tensor
 
 from envs.episodes.clips import ClipStore
 from envs.simulators.base import Simulator
-from envs.simulators.replay import Replay, replay
+from envs.simulators.replay import SIDE_BY_SIDE, Replay, replay, side_by_side
 from pipeline.evaluation.objects.error import object_error
 from pipeline.evaluation.quantiles import quantiles
 
 _LAST = 4  # frames at the end of an episode
+_CHUNKS = 10  # of an episode at most, by which speed is measured
 
 
 def groups(store: ClipStore, episodes: Tensor) -> dict[str, Tensor]:
@@ -35,13 +36,14 @@ def rollout_error(store: ClipStore, episodes: Tensor, made: Replay) -> dict[str,
     """Error of generated episodes against the true ones under the same actions.
 
     Returns:
-        episodes; PSNR of the first chunk's worth of frames and of the last in dB, over all views; `state`,
-        the absolute error of the decoded states in units of each number's spread over the data (median, 90th
-        percentile); and the object's error where physics recorded its place (see object_error.py).
+        episodes; PSNR of the first chunk's worth of frames and of the last in dB, over all views, as far as
+        pictures were recorded; `state`, the absolute error of the decoded states in units of each number's
+        spread over the data (median, 90th percentile); and the object's error where physics recorded its
+        place (see objects/error.py).
     """
-    truth = store.frames(made.rows)
+    truth, shown = store.frames(made.rows), made.pictured(store)
     count = made.valid.shape[1]
-    last = made.valid.long().cumsum(1).argmax(1)
+    last = shown.valid.long().cumsum(1).argmax(1)
     at = torch.arange(count)[None]
     early, late = at < store.spec.chunk, at >= last[:, None] - _LAST + 1
     error = torch.stack(
@@ -57,18 +59,26 @@ def rollout_error(store: ClipStore, episodes: Tensor, made: Replay) -> dict[str,
     off = ((made.states - states[made.rows]).abs() / spread)[..., moving]
     return {
         "episodes": len(episodes),
-        "psnr_first_frames": float(psnr[made.valid & early].mean()),
-        "psnr_last_frames": float(psnr[made.valid & late].mean()),
+        "psnr_first_frames": float(psnr[shown.valid & early].mean()),
+        "psnr_last_frames": float(psnr[shown.valid & late].mean()),
         "state": quantiles(off[made.valid].flatten()),
-        **object_error(store, episodes, made, truth),
+        **object_error(store, episodes, shown, truth),
     }
 
 
 def speed(simulator: Simulator, store: ClipStore, batch: int, chunks: int, bf16: bool) -> float:
-    """Generated frames per second (all views together count as one) at a batch size, SIDE_BY_SIDE at most."""
+    """Generated frames per second (all views together count as one) at a batch size, SIDE_BY_SIDE at most:
+    over the first chunks of the longest episodes, and fewer of them where so many do not fit side by side.
+
+    Args:
+        chunks: to generate, about, in passes of ten at most.
+    """
     episodes = store.length.argsort(descending=True)[torch.arange(batch) % len(store)]
-    replay(simulator, store, episodes[:1], bf16=bf16)
+    together, most = min(batch, SIDE_BY_SIDE), _CHUNKS
+    while most > 1 and side_by_side(store, 1 + most * store.spec.chunk) < together:
+        most -= 1
+    replay(simulator, store, episodes[:1], bf16=bf16, most=1)  # the first call is slower than all others
     began, frames = time.perf_counter(), 0
-    for _ in range(max(1, chunks // 10)):
-        frames += replay(simulator, store, episodes, bf16=bf16).frames.shape[:2].numel()
+    for _ in range(max(1, chunks // _CHUNKS)):
+        frames += replay(simulator, store, episodes, bf16=bf16, most=most).frames.shape[:2].numel()
     return frames / (time.perf_counter() - began)

@@ -51,7 +51,8 @@ def mcnemar(before: Tensor, after: Tensor) -> dict[str, Any]:
 
 
 def confusion(predicted: Tensor, truth: Tensor) -> dict[str, Any]:
-    """{"tp", "fp", "fn", "tn", "accuracy"} of predictions and truth bool [N]."""
+    """{"tp", "fp", "fn", "tn", "accuracy"} of predictions and truth bool [N]; accuracy is None of none."""
     tp, fp = int((predicted & truth).sum()), int((predicted & ~truth).sum())
     fn, tn = int((~predicted & truth).sum()), int((~predicted & ~truth).sum())
-    return {"tp": tp, "fp": fp, "fn": fn, "tn": tn, "accuracy": round((tp + tn) / max(1, len(truth)), 4)}
+    accuracy = round((tp + tn) / len(truth), 4) if len(truth) else None
+    return {"tp": tp, "fp": fp, "fn": fn, "tn": tn, "accuracy": accuracy}

@@ -63,7 +63,7 @@ class FramesShown(Column):
 
     def merit(self, cell: Cell) -> float | None:
         """See Column.merit."""
-        return float(cell["accuracy"])
+        return None if cell["accuracy"] is None else float(cell["accuracy"])
 
 
 def _label(frames: str) -> str:

@@ -27,7 +27,7 @@ from pipeline.evaluation.ewmbench.measure import Instruments
 from pipeline.evaluation.ewmbench.page import build_page, summary_text
 from pipeline.evaluation.ewmbench.records import Record, Records
 from pipeline.evaluation.ewmbench.result import Scoring, alike, by_task, overall
-from pipeline.evaluation.ewmbench.samples import Samples
+from pipeline.evaluation.ewmbench.samples import Samples, without_picture
 from pipeline.evaluation.ewmbench.semantics import Reader
 from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.grippers.ruler import GripperRuler, gripper_ruler, known_ends, looked_through
@@ -36,7 +36,7 @@ from pipeline.graph.code_version import code_of
 from pipeline.stages.judging.cost import COST, Spending
 
 _MODULE = "pipeline.evaluation.ewmbench.samples"
-_SHORTEST = 4  # frames of an episode: the first is given, and accelerations need three
+_SHORTEST = 4  # pictures of an episode: the first is given, and accelerations need three
 NO_MODEL = (
     "No semantics (BLEU, steps, logic): no vision-language model is configured; say judge=vlm or"
     " judge=vlm_local, as docs/own_judge.md tells."
@@ -102,9 +102,9 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
     notes: list[str] = []
     store = subject.store()
     held = subject.held_out(store)
-    held = held[store.length[held] >= _SHORTEST]
+    held = held[store.pictures(held) >= _SHORTEST]
     if not len(held):
-        raise ConfigError(f"no held-out episode has {_SHORTEST} frames or more; name others by imagined.data")
+        raise ConfigError(f"no held-out episode has {_SHORTEST} pictures; name others by imagined.data")
     ruler: GripperRuler | None = None
     try:
         ruler = gripper_ruler(cfg, store, subject.data, root)
@@ -152,6 +152,7 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
         for number, task in zip(chosen.episodes.tolist(), tasks, strict=True)
     ]
     notes += [NO_MODEL] * (reader is None) + [PARITY] * section["strict_parity"]
+    notes += without_picture(store, chosen.episodes)
     if reader is not None and (lost := sum(not one.whole for one in _records(true, made))):
         notes.append(f"Of {lost} videos the model answered not everything; what is missing counts nowhere.")
     if section["samples"] > 1 and alike([made[row["episode"]] for row in rows]):

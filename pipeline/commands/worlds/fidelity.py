@@ -26,6 +26,7 @@ from pipeline.evaluation.fidelity.masks import part_labels
 from pipeline.evaluation.fidelity.open_loop import OpenLoop
 from pipeline.evaluation.fidelity.page import build_page, summary_text
 from pipeline.evaluation.fidelity.strides import by_stride, common_stride
+from pipeline.evaluation.fidelity.verdicts import verdict_tables
 from pipeline.evaluation.measurement import evenly, groups, speed
 from pipeline.graph.code_version import code_of
 from pipeline.graph.kept import Kept
@@ -55,7 +56,10 @@ def fidelity(cfg: Cfg, root: Path) -> str:
         subject.simulator(other)
     store = subject.store()
     held = subject.held_out(store)
-    episodes = evenly(held[store.length[held] > 1], section["episodes"])
+    held = held[store.length[held] > 1]
+    if not len(held):
+        raise ConfigError("no held-out episode has 2 frames or more; name others by imagined.data")
+    episodes = evenly(held, section["episodes"])
     strides = _checked_strides(section["strides"], store, episodes)
     simulator = subject.simulator()
     labels = part_labels(cfg, store, episodes, section["masks"])
@@ -64,7 +68,7 @@ def fidelity(cfg: Cfg, root: Path) -> str:
     loop = OpenLoop(
         *(store, episodes, cfg["simulator"]["bf16"], labels, extractors, section["clip"], hands),
         kept=kept,
-        identity=subject.generated(_MODULE),
+        identity={**subject.generated(_MODULE), "by": code_of(_MODULE, _extractor_sections(section))},
     )
     place = {int(number): n for n, number in enumerate(episodes)}
     mine = {
@@ -126,6 +130,10 @@ def build_extractors(section: Mapping[str, Any]) -> list[Extractor]:
     return out
 
 
+def _extractor_sections(section: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: section[key] for key in ("frames_extractor", "clips_extractor")}
+
+
 def _masks(section: Mapping[str, Any], labels: Tensor | None) -> dict[str, Any]:
     """Where masks came from, and of how many episodes there are any."""
     if labels is None:
@@ -150,25 +158,26 @@ def _checked_strides(strides: Sequence[int], store: ClipStore, episodes: Tensor)
 
 
 def _with_judge(subject: Subject, loop: OpenLoop) -> OpenLoop:
-    """The same, with the subject's judge asked, if it has one."""
-    if not subject.weights["judge"].is_file():
+    """The same, with the subject's judge asked, if it can be."""
+    if not subject.has_judge():
         return loop
-    identity = {**loop.identity, "judge": subject.identity("judge")}
+    code = code_of(verdict_tables.__module__, subject.cfg["judge"])
+    identity = {**loop.identity, "judge": subject.identity("judge"), "judged by": code}
     return replace(loop, judge=subject.judge(), identity=identity)
 
 
-def _long(cfg: Cfg, root: Path, subject: Subject, store: ClipStore, loop: OpenLoop) -> dict[str, Any] | None:
+def _long(cfg: Cfg, root: Path, subject: Subject, store: ClipStore, loop: OpenLoop) -> dict[str, Any]:
     section, simulator = cfg["fidelity"]["long"], subject.simulator()
     if has_physics(cfg):
-        longer = long_episodes(cfg, root / "fidelity-long")
-        if longer is None:
-            return None
-        store, episodes = longer, torch.arange(len(longer))
+        store = long_episodes(cfg, root / "fidelity-long")
+        episodes = torch.arange(len(store))
     else:
         episodes = longest(store, subject.held_out(store), section["episodes"])
     assert loop.kept is not None
     code = code_of(drift.__module__, cfg["simulator"])
     about = {**loop.identity, "long": dict(section), "episodes": episodes.tolist(), "code": code}
+    if has_physics(cfg):  # which records them, whatever data are looked at
+        about["physics"] = cfg["task"]
     bf16, distance = cfg["simulator"]["bf16"], loop.distance
     out = loop.kept.figures("long", about, lambda: drift(simulator, store, episodes, bf16, distance))
     return {"wanted": section["frames"], **out}

@@ -17,10 +17,11 @@ from pipeline.stages import collect, world
 from pipeline.stages.given import open_store
 from pipeline.track import Tracker
 
-# How actions are encoded, and by which class.
+# How actions are encoded: sections simulator.actions. Velocities are real numbers; told in whole pixels,
+# squares would be 2 pixels off after 50 steps, whatever a world makes of the text.
 REPRESENTATIONS = {
-    "numbers": "envs.conditioning.ActionVector",
-    "digits": "envs.conditioning.ActionText",
+    "numbers": {TARGET: "envs.conditioning.ActionVector"},
+    "digits": {TARGET: "envs.conditioning.ActionText", "decimals": 2},
 }
 STEPS = (1, 5, 10, 25, 50)
 
@@ -28,7 +29,7 @@ STEPS = (1, 5, 10, 25, 50)
 def variant(cfg: Mapping[str, Any], squares: int, representation: str) -> dict[str, Any]:
     """The config of a world of so many squares whose actions are encoded as REPRESENTATIONS names it."""
     suite, task = {**cfg["task"]["suite"], "squares": squares}, cfg["task"]
-    simulator = {**cfg["simulator"], "actions": {TARGET: REPRESENTATIONS[representation]}}
+    simulator = {**cfg["simulator"], "actions": REPRESENTATIONS[representation]}
     return {**cfg, "task": {**task, "suite": suite}, "simulator": simulator}
 
 

@@ -96,7 +96,8 @@ def _cells(found: Mapping[str, Any]) -> list[Any]:
     """Cells of the table behind the name of the choice of frames."""
     counts = [found[name] for name in ("tp", "fp", "fn", "tn")]
     lost = [found[name] for name in ("abstained", "errors")]
-    return [f"{found['shown']:.1f}", *counts, f"{100 * found['accuracy']:.1f}%", *lost]
+    right = "-" if found["accuracy"] is None else f"{100 * found['accuracy']:.1f}%"
+    return [f"{found['shown']:.1f}", *counts, right, *lost]
 
 
 _HEAD = ("frames", "shown", "TP", "FP", "FN", "TN", "accuracy", "abstained", "errors")

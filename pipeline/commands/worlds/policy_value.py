@@ -18,7 +18,7 @@ from torch import Tensor
 from envs.files import write_text
 from envs.targets import ConfigError
 from pipeline.commands.worlds.subject import WEIGHTS, Subject, weights_at
-from pipeline.evaluation.value.agreement import Cell, agreement
+from pipeline.evaluation.value.agreement import ALL, Cell, agreement, overall
 from pipeline.evaluation.value.candidates import Candidate, action_spread, candidates
 from pipeline.evaluation.value.estimate import Comparison, starts_of, task_of
 from pipeline.evaluation.value.page import build_page, table_text
@@ -71,6 +71,7 @@ def policy_value(cfg: Mapping[str, Any], root: Path) -> str:
         "starts": {task: len(episodes) for task, episodes in starts.items()},
         "repeats": section["repeats"],
         "cells": [cell.row() for cell in cells],
+        "overall": [cell.row() for cell in overall(cells)],
         "agreement": agreement(cells),
         "notes": notes(section, starts, everybody, cells),
     }
@@ -129,7 +130,10 @@ def notes(
             "All repeats came out alike: neither this simulator nor these policies draw anything, so standard"
             " errors of 0 say nothing."
         )
-    few = {task: len(some) for task, some in starts.items() if len(some) < section["starts"]}
+    counts = {task: len(some) for task, some in starts.items()}
+    if cells[0].true is None:  # words alone tell tasks apart, and all together are bounded
+        counts = {ALL: sum(counts.values())}
+    few = {task: count for task, count in counts.items() if count < section["starts"]}
     if few:
         out.append(f"Fewer held-out starts than policy_value.starts={section['starts']}: {few}.")
     return out

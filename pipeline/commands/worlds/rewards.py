@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,12 +69,15 @@ def compare_rewards(cfg: Cfg, root: Path, plan: Plan, tracker: Tracker | None = 
         The table as Markdown.
 
     Raises:
-        ConfigError: for variants that the task does not have, and data of which nobody knows success.
+        ConfigError: for variants that the task does not have, and data of which nobody knows success, or
+            true progress if the rule is among the rewards; before anything is fitted.
     """
     unknown = sorted(set(plan.variants) - set(cfg["task"].get("variants", {})))
     if unknown:
         raise ConfigError(f"variants={unknown}: task.variants are {sorted(cfg['task'].get('variants', {}))}")
     base = build_loop(cfg, root)
+    base.run(base.nodes[JUDGE].inputs["data"], tracker)
+    seen = _seen(cfg, base, plan)
     base.run(base.nodes[JUDGE].inputs["simulator"], tracker)
     judges = dict(_judges(cfg, root, plan, tracker))
     weights = base.inputs(JUDGE).weights("simulator")
@@ -90,7 +94,7 @@ def compare_rewards(cfg: Cfg, root: Path, plan: Plan, tracker: Tracker | None = 
 
     domains = {
         domain.name: _domain(cfg, judges, simulator, domain, replayed(domain), plan.drawn)
-        for domain in _domains(cfg, base, plan, tracker)
+        for domain in chain([seen], _unseen(cfg, base, plan, tracker))
     }
     about = {"name": cfg["name"], "simulator": cfg["simulator"]["_target_"].rpartition(".")[2]}
     result = {**about, "domains": domains}
@@ -122,14 +126,24 @@ class Domain(NamedTuple):
     stages: list[str]
 
 
-def _domains(cfg: Cfg, base: Graph, plan: Plan, tracker: Tracker | None) -> Iterator[Domain]:
-    """What was held out of the run's data, and each variant."""
+def _seen(cfg: Cfg, base: Graph, plan: Plan) -> Domain:
+    """What was held out of the run's data.
+
+    Raises:
+        ConfigError: if these do not say what the rewards are compared with.
+    """
     store = open_store(cfg, base.inputs(JUDGE))
     held = labelled(store, store.split("held_out"))
     if not len(held):
         raise ConfigError("no held-out episode of the data says whether it succeeded (next.success)")
     spread = torch.linspace(0, len(held) - 1, min(plan.episodes, len(held))).round().long()
-    yield Domain(SEEN, store, held[spread], [path.name for path in base.inputs(JUDGE).folders("data")])
+    if RULE in plan.configs and truth_of(store, held[spread]).source != BY_PHYSICS:
+        raise ConfigError("rewards=[rule] asks physics, and these recordings have none; leave it out")
+    return Domain(SEEN, store, held[spread], [path.name for path in base.inputs(JUDGE).folders("data")])
+
+
+def _unseen(cfg: Cfg, base: Graph, plan: Plan, tracker: Tracker | None) -> Iterator[Domain]:
+    """Each variant."""
     for name in plan.variants:
         node = base.add(f"variant-{name}", variant_episodes, variant=name, episodes=plan.episodes)
         base.run(node, tracker)
@@ -151,8 +165,6 @@ def _domain(
     rows, curves = {}, {}
     for name, judge in judges.items():
         if name == RULE:
-            if truth.source != BY_PHYSICS:
-                raise ConfigError("rewards=[rule] asks physics, and these recordings have none; leave it out")
             videos = {"recorded": by_rule(truth)}
         else:
             views = judge_both(judge, simulator, store, episodes, made, bf16)

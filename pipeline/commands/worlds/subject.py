@@ -20,7 +20,7 @@ from envs.targets import ConfigError
 from pipeline.graph.code_version import code_of
 from pipeline.graph.graph import Graph
 from pipeline.loop import build_loop, has_physics
-from pipeline.outside import KINEMATICS, files_at, fingerprint
+from pipeline.outside import KINEMATICS, files_at, fingerprint, judge_files
 from pipeline.stages.given import datasets, learns
 
 Cfg = Mapping[str, Any]
@@ -124,6 +124,10 @@ class Subject:
         """The judge."""
         return _with_weights(build_judge(self.cfg), self.weights["judge"]).eval()
 
+    def has_judge(self) -> bool:
+        """Whether its judge can be asked: it has learned, or learns nothing, such as a client of a server."""
+        return self.weights["judge"].is_file() or not learns(build_judge(self.cfg))
+
     def about(self) -> dict[str, Any]:
         """What is looked at, for people: name, classes of simulator and judge, the weights' files, and their
         marks, by which a file that was written anew is another.
@@ -137,11 +141,14 @@ class Subject:
         }
 
     def identity(self, *roles: str) -> dict[str, Any]:
-        """What tells this world from others, as far as some of its parts go: sections and weights."""
+        """What tells this world from others, as far as some of its parts go: sections, weights, and the files
+        that decide what a judge says.
+        """
         sections = {"simulator": "simulator", "state": "simulator", "judge": "judge"}
         return {
             "sections": {name: self.cfg[name] for name in sorted({sections[role] for role in roles})},
             "weights": {role: mark_of(self.weights[role]) for role in roles},
+            **(judge_files(self.cfg) if "judge" in roles else {}),
         }
 
 

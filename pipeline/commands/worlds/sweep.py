@@ -24,7 +24,7 @@ from envs.episodes.clips import ClipStore
 from envs.episodes.filming import side_by_side, titled
 from envs.files import write_atomically, write_text
 from envs.initial_states import InitialStates
-from envs.specs import CHUNK, COMMAND, WorldSpec, to_chunk
+from envs.specs import CHUNK, COMMAND, WorldSpec, at_rest, to_chunk
 from envs.targets import ConfigError
 from pipeline.commands.worlds.subject import Subject
 from pipeline.evaluation.value.candidates import action_spread
@@ -80,12 +80,14 @@ def usual_travel(store: ClipStore, cfg: Mapping[str, Any]) -> Tensor:
 
 def commanded(spec: WorldSpec, start: Tensor, travel: Tensor, steps: int) -> Tensor:
     """Commands float32 [B, steps, A] by which numbers go from where they are, `start` [B, A], by `travel`
-    [B, A] in a straight line; of a robot that takes deltas, that delta again and again.
+    [B, A] in a straight line. Of a robot that acts by changes only grippers do; the other numbers are that
+    change again and again.
     """
-    if spec.embodiment.delta:
-        return travel[:, None].expand(-1, steps, -1)
-    share = torch.arange(1, steps + 1) / steps
-    return start[:, None] + share[None, :, None] * travel[:, None]
+    robot = spec.embodiment
+    share = (torch.arange(1, steps + 1) / steps)[:, None].repeat(1, robot.action_dim)
+    if robot.delta:
+        share[:, [k for k in range(robot.action_dim) if k not in robot.grippers]] = 1.0
+    return at_rest(start, robot)[:, None] + share * travel[:, None]
 
 
 @torch.no_grad()

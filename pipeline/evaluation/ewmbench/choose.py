@@ -54,6 +54,7 @@ def in_pictures(store: ClipStore, ruler: GripperRuler, episodes: Tensor) -> Path
     paths = []
     for n in range(len(episodes)):
         rows = store.rows(episodes[n : n + 1])
+        rows = rows[store.arrays["present"][rows]]
         found = [
             ruler.detector.detect(store.frames(some)[:, list(ruler.views)], views) for some in rows.split(64)
         ]

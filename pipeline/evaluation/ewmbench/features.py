@@ -17,16 +17,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 from torch import Tensor
 from torch.nn import functional
 
 from envs.judges.perceptual import PerceptualDistance
+from envs.manifest import digest_of
 from envs.targets import ConfigError
 from pipeline.evaluation.fidelity.extractors import Extractor
 
 _AT_ONCE = 64  # pictures
 _SHOWN = 60  # letters of a text in a message
-_HEAD = 1 << 20  # bytes of each file of weights that tell it from others
 
 
 class PatchExtractor(ABC):
@@ -220,7 +221,7 @@ def pretrained(path: str, kinds: Sequence[str], title: str) -> tuple[Any, Any]:
                 f" {list(kinds)}; give its folder, or choose another extractor"
             )
         network: Any = AutoModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)
-    except (OSError, ValueError, RuntimeError, KeyError) as error:
+    except (OSError, ValueError, RuntimeError, KeyError, SafetensorError) as error:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"path={path}: transformers cannot load {title} from it: {error}") from error
@@ -228,12 +229,12 @@ def pretrained(path: str, kinds: Sequence[str], title: str) -> tuple[Any, Any]:
 
 
 def fingerprint(path: str) -> str:
-    """What tells the weights of a folder from others, eight characters."""
-    found = hashlib.sha256((Path(path) / "config.json").read_bytes())
-    for file in sorted(Path(path).glob("*.safetensors")):
-        with file.open("rb") as stream:
-            found.update(f"{file.name}:{file.stat().st_size}".encode() + stream.read(_HEAD))
-    return found.hexdigest()[:8]
+    """What tells the weights of a folder from others, eight characters; all of them are read, as one block
+    that was tuned may lie anywhere.
+    """
+    files = [Path(path) / "config.json", *sorted(Path(path).glob("*.safetensors"))]
+    marks = [f"{file.name}:{digest_of(file)}" for file in files]
+    return hashlib.sha256(" ".join(marks).encode()).hexdigest()[:8]
 
 
 def words_of(text: str) -> list[str]:

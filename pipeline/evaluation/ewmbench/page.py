@@ -29,7 +29,7 @@ def build_page(result: Mapping[str, Any], films: Mapping[int, Path]) -> str:
     """One self-contained HTML page of ewmbench.json.
 
     Args:
-        films: the video of the best sample of some episodes, by number.
+        films: the video of the sample that stands for an episode, of some, by number.
     """
     shown = [row for row in result["rows"] if row["episode"] in films and films[row["episode"]].is_file()]
     videos = [
@@ -73,10 +73,16 @@ def summary_text(result: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def chosen_text(result: Mapping[str, Any]) -> str:
+    """Which of its samples stands for an episode: without trajectories none is known to be the best."""
+    if result["samples"] == 1:
+        return "generated"
+    return f"{'first' if result['overall']['generated']['sa'] is None else 'best'} of {result['samples']}"
+
+
 def _rows(result: Mapping[str, Any]) -> dict[str, list[str]]:
     """Cells by the name of the row."""
-    count, whole = result["samples"], result["overall"]
-    best = f"best of {count}" if count > 1 else "generated"
+    count, whole, best = result["samples"], result["overall"], chosen_text(result)
     rows = {best: _cells(whole["generated"])}
     if count > 1:
         rows[f"mean of {count}"] = _cells(whole["mean"])

@@ -12,13 +12,21 @@ from torch import Tensor
 
 from envs.episodes.clips import ClipStore
 from envs.simulators.base import Simulator
-from envs.simulators.replay import replay
+from envs.simulators.replay import replay, side_by_side
 from pipeline.evaluation.ewmbench.drawing import film_tracks
 from pipeline.evaluation.ewmbench.measure import Instruments
 from pipeline.evaluation.ewmbench.records import Record, Records
 
-_SIDE_BY_SIDE = 16  # episodes whose frames are held at once
+_SIDE_BY_SIDE = 16  # episodes at most, whose frames are held at once
 _MEASURED = 4  # videos that a vision-language model is asked about at once
+
+
+def without_picture(store: ClipStore, episodes: Tensor) -> list[str]:
+    """A note of how many frames of episodes int64 [N] are left out, for there is no picture of them; [] if
+    there is one of each.
+    """
+    dark = int((store.length[episodes] - store.pictures(episodes)).sum())
+    return [f"{dark} frames are left out, for no picture was recorded of them."] if dark else []
 
 
 @dataclass
@@ -76,8 +84,8 @@ class Samples:
                 out[number] = record
         done(len(out))
         missing = torch.tensor([n for n in episodes.tolist() if n not in out], dtype=torch.int64)
-        for some in missing.split(_SIDE_BY_SIDE) if len(missing) else ():
-            played = replay(self.simulator, self.store, some, bf16=self.bf16, draw=draw)
+        for some in missing.split(self._at_once(missing)) if len(missing) else ():
+            played = replay(self.simulator, self.store, some, bf16=self.bf16, draw=draw).pictured(self.store)
             for places in torch.arange(len(some)).split(_MEASURED):
                 numbers = some[places].tolist()
                 recorded = [self._video(number) for number in numbers]
@@ -106,6 +114,10 @@ class Samples:
         row = self.store.episodes[number]
         return {"episode": number, "draw": draw, "length": row["length"], "instruction": row["instruction"]}
 
+    def _at_once(self, episodes: Tensor) -> int:
+        return side_by_side(self.store, int(self.store.length[episodes].max()), _SIDE_BY_SIDE)
+
     def _video(self, number: int) -> Tensor:
-        """The recorded frames uint8 [T, V, 3, H, W] of an episode."""
-        return self.store.frames(self.store.rows(torch.tensor([number])))
+        """The recorded frames uint8 [T, V, 3, H, W] of an episode, of which there is a picture."""
+        rows = self.store.rows(torch.tensor([number]))
+        return self.store.frames(rows[self.store.arrays["present"][rows]])

@@ -93,7 +93,7 @@ class _TorchScript(Extractor):
             with torch.no_grad():
                 found = self._network(torch.zeros(self.probe), **self.options)
             shape = tuple(found.shape)
-        except (RuntimeError, TypeError, AttributeError) as error:
+        except (RuntimeError, TypeError, AttributeError, torch.jit.Error) as error:
             first = str(error).strip().splitlines()[0]
             raise ConfigError(
                 f"weights={weights} are no {self.title} in TorchScript ({first}); give the file in which this"

@@ -23,20 +23,23 @@ from envs.judges.perceptual import PerceptualDistance
 from envs.manifest import read_manifest, write_manifest
 from envs.rng import Purpose, episode_seeds
 from envs.simulators.base import Simulator
-from envs.simulators.replay import replay
+from envs.simulators.replay import replay, side_by_side
 from pipeline.evaluation.fidelity.frames import by_frame, frame_errors, psnr
 
-_TRIES = 4  # scripted episodes for each that is wanted; some succeed by chance, and end
-_END = 0.1  # share of the frames that are the end
+_TRIES = 4  # scripted episodes for each that is wanted; physics gives some up
+_END = 0.1  # share of an episode's frames that are its end
 _OFFSET = 500_000  # of their seeds among those of evaluation
 
 
-def long_episodes(cfg: Mapping[str, Any], folder: Path) -> ClipStore | None:
-    """Scripted episodes of fidelity.long.frames, recorded once; None if all ended before.
+def long_episodes(cfg: Mapping[str, Any], folder: Path) -> ClipStore:
+    """Scripted episodes of fidelity.long.frames, recorded once; they go on where the task succeeds by chance.
 
     Args:
         cfg: the resolved config, with physics.
         folder: where they are kept.
+
+    Raises:
+        PoolError: if physics gives up too many.
     """
     section, chunk = cfg["fidelity"]["long"], cfg["task"]["chunk"]
     horizon = -(-section["frames"] // chunk) * chunk
@@ -51,13 +54,11 @@ def long_episodes(cfg: Mapping[str, Any], folder: Path) -> ClipStore | None:
         try:
             for begin in range(0, len(seeds), wanted):
                 jobs = [(seed, section["noise_level"]) for seed in seeds[begin : begin + wanted]]
-                kept += [track for track in pool.script(jobs, chunk) if len(track) == horizon + 1]
+                kept += pool.script(jobs, None)
                 if len(kept) >= wanted:
                     break
         finally:
             pool.close()
-        if not kept:
-            return None
         episodes = [Episode.from_track(track, "long", robot) for track in kept[:wanted]]
         LeRobotWriter(folder / "dataset", robot).write(episodes)
         write_manifest(folder, {"stage": "fidelity-long", "result": mine})
@@ -77,43 +78,67 @@ def drift(
     bf16: bool,
     distance: PerceptualDistance,
 ) -> dict[str, Any]:
-    """Error against frame number of long rollouts, and whether they collapse.
+    """Error against frame number of long rollouts, and whether they collapse; frames of which no picture was
+    recorded are left out.
 
     Returns:
         episodes and frames; by_frame, errors [T]; still and unrelated, the PSNR [T] of the first frame held
         and of the same moment of another episode (None of one episode), which say how much an error is;
         sharpness [T], the mean gradient of generated over that of true frames: below 1 is blur, above it
-        noise; end, PSNR and sharpness over the last tenth; collapsed, whether in that tenth the error is
-        that of an unrelated picture or more, or the sharpness less than half or more than twice the truth's;
-        None where the sharpness does not say so and no other episode is as long.
+        noise; end, PSNR and sharpness over the last tenth of each episode, None where no picture was
+        recorded; collapsed, whether in that tenth the error is that of an unrelated picture or more, or the
+        sharpness less than half or more than twice the truth's; None where the sharpness does not say so and
+        no other episode is as long.
     """
-    made = replay(simulator, store, episodes, bf16=bf16)
-    true = store.frames(made.rows)
-    errors, valid = frame_errors(made.frames, true, distance), made.valid
-    still = store.frames(store.start[episodes])[:, None].expand_as(true)
-    sharp = _gradient(made.frames) / _gradient(true).clamp(min=1e-6)
-    last = max(1, round(_END * valid.shape[1]))
-    ends = valid.clone()
-    ends[:, :-last] = False
-    others = {"still": _mse(still, true)}
-    if len(episodes) > 1:
-        others["unrelated"] = _mse(true.roll(1, 0), true)
-        both = valid & valid.roll(1, 0)
+    rows, valid = store.whole(episodes)
+    valid &= store.arrays["present"][rows]
+    errors = _rolled_out(simulator, store, episodes, bf16, distance)
+    sharp, still, unrelated = (errors.pop(name) for name in ("sharp", "still", "unrelated"))
+    both = valid & valid.roll(1, 0) if len(episodes) > 1 else torch.zeros_like(valid)
+    number = valid.long().cumsum(1)
+    ends = valid & (number > number[:, -1:] - (_END * number[:, -1:]).round().clamp(min=1))
     out: dict[str, Any] = {
         "episodes": len(episodes),
-        "frames": int(valid.sum(1).max()),
+        "frames": rows.shape[1],
         "by_frame": by_frame(errors, valid),
         "sharpness": _line(sharp, valid),
-        "still": _line(psnr(others["still"]), valid),
-        "unrelated": _line(psnr(others["unrelated"]), both) if "unrelated" in others else None,
+        "still": _line(psnr(still), valid),
+        "unrelated": _line(psnr(unrelated), both) if len(episodes) > 1 else None,
+        "end": {"psnr": _mean(psnr(errors["mse"])[ends]), "sharpness": _mean(sharp[ends])},
+        "collapsed": None,
     }
-    error, sharpness = float(errors["mse"].mean(-1)[ends].mean()), float(sharp[ends].mean())
-    out["end"] = {"psnr": float(psnr(errors["mse"])[ends].mean()), "sharpness": sharpness}
-    out["collapsed"] = True if not 0.5 <= sharpness <= 2.0 else None
-    if not out["collapsed"] and "unrelated" in others and bool((both & ends).any()):
+    error, sharpness = _mean(errors["mse"].mean(-1)[ends]), out["end"]["sharpness"]
+    if sharpness is not None and not 0.5 <= sharpness <= 2.0:
+        out["collapsed"] = True
+    elif error is not None and bool((both & ends).any()):
         # Episodes begin alike, and may end alike.
-        bar = max(float(others["unrelated"][some].mean()) for some in (both, both & ends))
-        out["collapsed"] = error >= bar
+        out["collapsed"] = error >= max(float(unrelated[some].mean()) for some in (both, both & ends))
+    return out
+
+
+def _rolled_out(
+    simulator: Simulator, store: ClipStore, episodes: Tensor, bf16: bool, distance: PerceptualDistance
+) -> dict[str, Tensor]:
+    """Of N episodes, generated as many at once as have room: frames.frame_errors, and [N, T] each sharp, the
+    gradient of generated over that of true frames, and the MSE of still, the first frame held, and of
+    unrelated, the episode before; 0 where an episode is over.
+    """
+    rows, _ = store.whole(episodes)
+    out: dict[str, Tensor] = {}
+    for some in torch.arange(len(episodes)).split(side_by_side(store, 1 + rows.shape[1])):
+        made = replay(simulator, store, episodes[some], bf16=bf16).frames[:, : rows.shape[1]]
+        count = made.shape[1]
+        true, other = (store.frames(of[some, :count]) for of in (rows, rows.roll(1, 0)))
+        first = store.frames(store.start[episodes[some]])[:, None]
+        found = {
+            **frame_errors(made, true, distance),
+            "sharp": _gradient(made) / _gradient(true).clamp(min=1e-6),
+            "still": _mse(first.expand_as(true), true),
+            "unrelated": _mse(other, true),
+        }
+        for name, values in found.items():
+            whole = out.setdefault(name, values.new_zeros(*rows.shape, *values.shape[2:]))
+            whole[some, :count] = values
     return out
 
 
@@ -136,6 +161,8 @@ def _gradient(frames: Tensor) -> Tensor:
 
 def _line(values: Tensor, valid: Tensor) -> list[float | None]:
     """Means [T] over episodes of values [N, T]."""
-    return [
-        float(values[valid[:, t], t].mean()) if valid[:, t].any() else None for t in range(valid.shape[1])
-    ]
+    return [_mean(values[valid[:, t], t]) for t in range(valid.shape[1])]
+
+
+def _mean(values: Tensor) -> float | None:
+    return float(values.mean()) if len(values) else None

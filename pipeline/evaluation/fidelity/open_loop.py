@@ -16,7 +16,7 @@ from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge
 from envs.judges.perceptual import PerceptualDistance
 from envs.simulators.base import Simulator
-from envs.simulators.replay import replay
+from envs.simulators.replay import replay, side_by_side
 from pipeline.evaluation.fidelity.end_effector import EndEffectorRuler, end_effector_summary
 from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.fidelity.frames import by_frame, frame_errors, summary
@@ -25,7 +25,7 @@ from pipeline.evaluation.fidelity.verdicts import judged
 from pipeline.evaluation.objects.error import object_offsets, object_summary
 from pipeline.graph.kept import Kept, Tensors
 
-_SIDE_BY_SIDE = 16  # episodes, whose frames are held at once
+_SIDE_BY_SIDE = 16  # episodes at most, whose frames are held at once
 _AT_ONCE = {False: 256, True: 32}  # pictures, or clips, that an extractor is shown
 _SIDES = ("made", "true")
 
@@ -69,9 +69,7 @@ class OpenLoop:
         """
         out = Measured()
         sides = [(Moments(e), Moments(e)) for e in self.extractors]
-        parts = range(0, len(self.episodes), _SIDE_BY_SIDE)
-        for begin in tqdm(parts, desc="rolled out", unit="batch", dynamic_ncols=True, leave=False):
-            some = slice(begin, begin + _SIDE_BY_SIDE)
+        for some in tqdm(self._batches(), desc="rolled out", unit="batch", dynamic_ncols=True, leave=False):
             part = self._part(simulator, some, about or {})
             out.add(_named(part, "error"), part["valid"])
             out.seconds += float(part["seconds"])
@@ -111,14 +109,20 @@ class OpenLoop:
     def _held(self, shown: Callable[[Tensor], Tensor]) -> Measured:
         """Errors of what is shown for ever of first frames uint8 [N, 1, V, 3, H, W]."""
         out = Measured()
-        for begin in range(0, len(self.episodes), _SIDE_BY_SIDE):
-            some = slice(begin, begin + _SIDE_BY_SIDE)
+        for some in self._batches():
             rows, valid = self.store.whole(self.episodes[some])
-            first = shown(self.store.frames(self.store.start[self.episodes[some]])[:, None])
+            first = shown(self.store.first(self.episodes[some])["frames"][:, None])
             frames = first.expand(-1, rows.shape[1], -1, -1, -1, -1)
             marks = None if self.labels is None else _fitted(self.labels[some], rows.shape[1])
-            out.add(frame_errors(frames, self.store.frames(rows), self.distance, marks), valid)
+            errors = frame_errors(frames, self.store.frames(rows), self.distance, marks)
+            out.add(_known(errors, self.store.arrays["present"][rows]), valid)
         return out
+
+    def _batches(self) -> list[slice]:
+        """Which episodes are measured together; the same whatever measures them."""
+        longest = int(self.store.length[self.episodes].max())
+        size = side_by_side(self.store, longest, _SIDE_BY_SIDE)
+        return [slice(begin, begin + size) for begin in range(0, len(self.episodes), size)]
 
     def _part(self, simulator: Simulator, some: slice, about: Mapping[str, Any]) -> Tensors:
         """What is measured of some episodes, now or at some earlier time."""
@@ -145,19 +149,19 @@ class OpenLoop:
         episodes, began = self.episodes[some], time.perf_counter()
         made = replay(simulator, self.store, episodes, bf16=self.bf16, stride=self.stride)
         out = {"valid": made.valid, "seconds": torch.tensor(time.perf_counter() - began)}
-        true, marks = self.store.frames(made.rows), None
+        shown, true, marks = made.pictured(self.store), self.store.frames(made.rows), None
         if self.labels is not None:
             marks = _fitted(self.labels[some, self.stride - 1 :: self.stride], made.rows.shape[1])
-        errors = frame_errors(made.frames, true, self.distance, marks)
+        errors = _known(frame_errors(made.frames, true, self.distance, marks), shown.valid)
         out |= {f"error/{name}": values for name, values in errors.items()}
         for number, extractor in enumerate(self.extractors):
             for side, video in zip(_SIDES, (made.frames, true), strict=True):
-                if samples := _samples(video, made.valid, extractor.clips, self.clip):
+                if samples := _samples(video, shown.valid, extractor.clips, self.clip):
                     out[f"{side}/{number}"] = torch.cat([extractor(few) for few in samples])
-        found = object_offsets(self.store, episodes, made, true)
+        found = object_offsets(self.store, episodes, shown, true)
         out |= {f"object/{name}": values for name, values in found.items()}
         if isinstance(self.hands, EndEffectorRuler):
-            hands = self.hands.measure(self.store, episodes, made, true)
+            hands = self.hands.measure(self.store, episodes, shown, true)
             out |= {f"hand/{name}": values for name, values in hands.items()}
         if self.judge is not None:
             said = judged(self.judge, self.store, episodes, made, true)
@@ -169,7 +173,7 @@ class Measured:
     """Errors of all frames of episodes that were rolled out part by part.
 
     Attributes:
-        errors: float32 [N, T, V] by name, see frames.frame_errors.
+        errors: float32 [N, T, V] by name, see frames.frame_errors; NaN too where no picture was recorded.
         valid: bool [N, T].
         seconds: of wall time in which everything was generated.
         frechet: see frechet.frechet, one for each extractor that had samples enough.
@@ -209,6 +213,8 @@ class Measured:
     def result(self, views: Sequence[str], groups: Mapping[str, Tensor]) -> dict[str, Any]:
         """In numbers: overall, by_frame, views (overall of each), groups (overall of some episodes, positions
         int64 by name), frechet, and the errors of objects and end effectors where physics knows them.
+        without_picture counts the frames that are left out because none was recorded of them; locator_cm and
+        locator_px are what object_cm would be of recorded video, and object_unknown says why it is unknown.
         """
         one = {
             view: {name: values[..., k : k + 1] for name, values in self.errors.items()}
@@ -217,6 +223,7 @@ class Measured:
         objects = object_summary(self.objects)
         return {
             "episodes": len(self.valid),
+            "without_picture": int(self.errors["mse"][self.valid].isnan().all(-1).sum()),
             "overall": self.overall,
             "by_frame": self.by_frame,
             "views": {view: summary(errors, self.valid) for view, errors in one.items()},
@@ -227,6 +234,9 @@ class Measured:
             "frechet": self.frechet,
             "object_cm": _median(objects.get("object_cm")),
             "object_lost": objects.get("object_lost"),
+            "object_unknown": objects.get("object_unknown"),
+            "locator_cm": _median(objects.get("locator_cm")),
+            "locator_px": _median(objects.get("locator_px")),
             "end_effector": self.end_effector,
         }
 
@@ -241,6 +251,11 @@ def _samples(video: Tensor, valid: Tensor, clips: bool, length: int) -> list[Ten
     whole = video[:, : count * length].unflatten(1, (count, length)).transpose(2, 3)  # [N, c, V, L, ...]
     there = valid[:, : count * length].unflatten(1, (count, length)).all(2)
     return [some for some in whole[there].flatten(0, 1).split(_AT_ONCE[clips]) if len(some)]
+
+
+def _known(errors: Mapping[str, Tensor], shown: Tensor) -> dict[str, Tensor]:
+    """Errors [N, T, V] with NaN in the frames that no recorded picture shows, bool [N, T]."""
+    return {name: torch.where(shown[..., None], values, torch.nan) for name, values in errors.items()}
 
 
 def _named(part: Tensors, kind: str) -> Tensors:

@@ -44,6 +44,7 @@ def build_page(result: Mapping[str, Any]) -> str:
             strides=_strides(result["strides"]) if result["strides"] else None,
             grid=_grid(result["grid"]) if result["grid"] else None,
             collapse=collapse_text(result["long"]),
+            left_out=pictures_text(result),
             object_error=object_text(result),
             end_effector=end_effector_text(result["end_effector"]),
         )
@@ -65,6 +66,8 @@ def summary_text(result: Mapping[str, Any]) -> str:
     lines.append("")
     for one in result["frechet"]:
         lines.append(f"Frechet distance {one['value']:.4g} of {one['samples']} samples by {one['extractor']}")
+    if result["without_picture"]:
+        lines.append(pictures_text(result))
     lines.append(object_text(result))
     lines.append(end_effector_text(result["end_effector"]))
     lines.append(collapse_text(result["long"]))
@@ -87,23 +90,36 @@ def texts(row: Mapping[str, Any]) -> list[str]:
 def object_text(result: Mapping[str, Any]) -> str:
     """Where the first object was found, in a sentence."""
     cm, lost = result["object_cm"], result["object_lost"]
+    if result["object_unknown"] is not None:
+        return f"How far off the first object lies is unknown: {result['object_unknown']}."
     if lost is None:
         return (
             "The first object is not measured: nobody recorded where it is, or no still camera is calibrated."
         )
+    floor = result["locator_cm"]
+    own = f"in recorded video the same locator errs {result['locator_px']:.1f} pixels"
+    own += "" if floor is None else f" or {floor:.2f} cm"
     if cm is None:
-        return "The first object is lost: it is found in no generated frame."
+        return f"The first object is lost: it is found in no generated frame; {own}."
     return (
         f"The first object lies {cm:.2f} cm off (median over the frames in which it is found) and is lost in"
-        f" {100 * lost:.1f}% of those that truly show it."
+        f" {100 * lost:.1f}% of those that truly show it; {own}."
     )
+
+
+def pictures_text(result: Mapping[str, Any]) -> str:
+    """How many frames are left out, in a sentence; "" if none is."""
+    dark = result["without_picture"]
+    return f"{dark} frames are left out, for no picture was recorded of them." if dark else ""
 
 
 def collapse_text(long: Mapping[str, Any] | None) -> str:
     """What came of long rollouts, in a sentence."""
     if long is None:
-        return "No long rollouts were made."
+        return "No long rollouts were made (fidelity.long.frames=0)"
     end = long["end"]
+    if end["sharpness"] is None:
+        return "Of long rollouts nothing is known: no picture was recorded but the first"
     outcome = {
         True: "the video has collapsed",
         False: "no collapse",
@@ -153,11 +169,16 @@ def _points(values: Sequence[float | None]) -> tuple[list[float], list[float]]:
 def _strides(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Headings, rows of texts, and what must be known to compare them."""
     common = common_stride([row["stride"] for row in rows])
+    judged = any(row["verdicts"] for row in rows)
     return {
         "headings": [*HEADINGS, *(title for _, title, _ in FIGURES), *VERDICTS],
         "rows": [stride_cells(row, texts(row)) for row in rows],
-        "note": f"Errors are those of frames {common}, {2 * common}, ..., which all strides show. Verdicts"
-        " are the judge's, against recorded success; it sees the frames that are shown",
+        "note": f"Errors are those of frames {common}, {2 * common}, ..., which all strides show. "
+        + (
+            "Verdicts are the judge's, against recorded success; it sees the frames that are shown"
+            if judged
+            else "No verdicts: the judge has learned nothing yet; train it, or name imagined.judge"
+        ),
     }
 
 

@@ -129,10 +129,7 @@ def train_detector(
         return load(detector, folder / WEIGHTS).eval()
     store, config = sights.store, options_of(FitConfig, section["fit"], "ewmbench.detector.fit")
     episodes = learned_from(store)
-    owner = torch.repeat_interleave(episodes, store.length[episodes])
-    rows = store.rows(episodes)
-    shown = store.arrays["present"][rows]
-    rows, owner = rows[shown], owner[shown]
+    rows, owner = _shown(store, episodes)
 
     def batch(step: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
         pick, other = torch.randint(len(rows), (2, config.part), generator=generator)
@@ -200,7 +197,7 @@ def varied(pictures: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def detector_error(detector: GripperDetector, sights: Sights, episodes: Tensor) -> dict[str, Any]:
-    """Its own error on recorded frames of episodes int64 [N] that it has not learned from, by camera.
+    """Its own error on the recorded pictures of episodes int64 [N] that it has not learned from, by camera.
 
     Returns:
         For each camera, by name: px (median and 90th percentile of the distance to the projected end
@@ -208,7 +205,7 @@ def detector_error(detector: GripperDetector, sights: Sights, episodes: Tensor) 
         nowhere), imagined (share of those outside that it finds; None where none is outside) and frames.
     """
     store = sights.store
-    rows, owner = store.rows(episodes), torch.repeat_interleave(episodes, store.length[episodes])
+    rows, owner = _shown(store, episodes)
     some = torch.linspace(0, len(rows) - 1, min(_MEASURED, len(rows))).round().long()
     rows, owner = rows[some], owner[some]
     parts = [
@@ -228,6 +225,13 @@ def detector_error(detector: GripperDetector, sights: Sights, episodes: Tensor) 
             "frames": len(rows),
         }
     return out
+
+
+def _shown(store: ClipStore, episodes: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows int64 [n] of the frames of episodes int64 [N] of which there is a picture, and their episodes."""
+    rows, owner = store.rows(episodes), torch.repeat_interleave(episodes, store.length[episodes])
+    shown = store.arrays["present"][rows]
+    return rows[shown], owner[shown]
 
 
 def learned_from(store: ClipStore) -> Tensor:

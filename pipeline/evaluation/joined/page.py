@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.evaluation.ewmbench.page import COLUMNS
+from pipeline.evaluation.ewmbench.page import COLUMNS, chosen_text
 from pipeline.evaluation.fidelity.end_effector import end_effector_text
 from pipeline.evaluation.fidelity.page import FIGURES as FIDELITY
 from pipeline.evaluation.fidelity.page import collapse_text
@@ -74,7 +74,11 @@ def _video(found: Found) -> Iterator[Row]:
     for one in found["frechet"]:
         yield Row(f"Frechet distance, {one['extractor']}, {one['samples']} samples ↓", f"{one['value']:.4g}")
     cm, lost, hands = found["object_cm"], found["object_lost"], found["end_effector"]
-    yield Row("object off where it is found, cm ↓", MISSING if cm is None else f"{cm:.2f}")
+    floor = found.get("locator_cm")  # results of former versions hold none
+    yield Row(
+        "object off where it is found, cm ↓",
+        *(MISSING if cm is None else f"{cm:.2f}", "" if floor is None else f"{floor:.2f}"),
+    )
     yield Row("object lost ↓", MISSING if lost is None else f"{lost:.1%}")
     made, own = (hands.get(f"{name}_cm") for name in ("generated", "recorded"))
     yield Row("end effector off, cm ↓", *(f"{one['median']:.2f}" if one else MISSING for one in (made, own)))
@@ -85,6 +89,8 @@ def _video(found: Found) -> Iterator[Row]:
 def _video_notes(found: Found) -> Iterator[str]:
     yield f"{found['episodes']} held-out episodes, {' x '.join(map(str, found['size']))} pixels; NLPD is"
     yield f"{found['perceptual']}. {collapse_text(found['long'])}. {end_effector_text(found['end_effector'])}"
+    if why := found.get("object_unknown"):
+        yield f"How far off the first object lies is unknown: {why}."
 
 
 def _scenes(found: Found) -> Iterator[Row]:
@@ -99,7 +105,8 @@ def _scenes(found: Found) -> Iterator[Row]:
 
 def _scene_notes(found: Found) -> Iterator[str]:
     kind = "strict parity with the public code; " if found["strict_parity"] else ""
-    yield f"{len(found['rows'])} held-out episodes, best of {found['samples']} samples; {kind}features by"
+    samples = f"{chosen_text(found)} samples" if found["samples"] > 1 else "one sample of each"
+    yield f"{len(found['rows'])} held-out episodes, {samples}; {kind}features by"
     yield f"{'; '.join(found['extractors'].values())}."
     yield from found["notes"]
 

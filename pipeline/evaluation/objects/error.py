@@ -14,11 +14,14 @@ from envs.episodes.clips import ClipStore
 from envs.episodes.privileged import read_privileged
 from envs.geometry.cameras import project
 from envs.simulators.replay import Replay
-from pipeline.evaluation.objects.locator import locate
+from pipeline.evaluation.objects.locator import follow
 from pipeline.evaluation.objects.rays import on_plane
 from pipeline.evaluation.quantiles import quantiles
 
 POSES = "object_poses"  # privileged: [O, n], for every object x, y, z in metres and what else a suite knows
+_NAMES = (("pixels", "cm"), ("locator_px", "locator_cm"))  # of errors in generated and in true video
+_BAR = 1 / 16  # of the picture's shorter side: an error of more in true video is a failure of the locator
+_FAILS = 0.1  # share of failures above which it measures nothing
 
 
 def object_error(store: ClipStore, episodes: Tensor, made: Replay, truth: Tensor) -> dict[str, Any]:
@@ -35,9 +38,10 @@ def object_offsets(store: ClipStore, episodes: Tensor, made: Replay, truth: Tens
         truth: uint8 [N, T, V, 3, H, W], the true frames beside made.frames.
 
     Returns:
-        pixels and cm in generated and locator_px in true video, float32; lost, not found in generated video,
-        and at_end, the episode's last frame, bool; {} where this cannot be measured: without calibration,
-        without the column, or where it has no row of positions per object.
+        pixels and cm in generated, locator_px and locator_cm in true video, float32; lost, not found in
+        generated video, failed, found too far off in true video, and at_end, the episode's last frame, bool.
+        Centimetres are those in the plane of the object's true height. {} where this cannot be measured:
+        without calibration, without the column, or where it has no row of positions per object.
     """
     view = store.spec.embodiment.main_view
     if not store.spec.embodiment.calibrated or store.spec.embodiment.cameras[view].wrist is not None:
@@ -45,25 +49,24 @@ def object_offsets(store: ClipStore, episodes: Tensor, made: Replay, truth: Tens
     poses = read_privileged(store, POSES)
     if poses is None or poses.ndim != 3 or poses.shape[-1] < 3:
         return {}
-    places = poses[:, 0, :3]
     start = store.start[episodes]
+    places = poses[torch.cat((start[:, None], made.rows), 1), 0, :3]  # [N, 1 + T, 3]
     first = store.frames(start)[:, view]
     intrinsic, c2w = store.intrinsic[episodes][:, view], store.arrays["c2w"][start][:, view]
-    found, lost = locate(made.frames[:, :, view], first, places[start], intrinsic, c2w)
-    seen, hidden = locate(truth[:, :, view], first, places[start], intrinsic, c2w)
-    true, _ = project(places[made.rows], intrinsic, c2w)
-    height = places[start][:, None, None, 2].expand(-1, found.shape[1], 1)
-    metres = (on_plane(found, height, intrinsic, c2w) - places[made.rows])[..., :2].norm(dim=-1)
-    ends = torch.zeros_like(made.valid)
-    ends[torch.arange(len(ends)), made.valid.long().cumsum(1).argmax(1)] = True
-    use = made.valid & ~hidden  # where the locator fails on true video it says nothing of generated video
-    every = {
-        "pixels": (found - true).norm(dim=-1),
-        "cm": metres * 100,
-        "locator_px": (seen - true).norm(dim=-1),
-        "lost": lost,
-        "at_end": ends,
-    }
+    true, _ = project(places, intrinsic, c2w)
+    every: dict[str, Tensor] = {}
+    hidden = {}
+    for (pixels, metric), video in zip(_NAMES, (made.frames, truth), strict=True):
+        found, hidden[pixels] = follow(video[:, :, view], first, true)
+        places_found = on_plane(found, places[:, 1:, 2:], intrinsic, c2w)
+        every[pixels] = (found - true[:, 1:]).norm(dim=-1)
+        every[metric] = 100 * (places_found - places[:, 1:])[..., :2].norm(dim=-1)
+    every["lost"] = hidden["pixels"]
+    every["failed"] = every["locator_px"] > _BAR * min(store.spec.size)
+    every["at_end"] = torch.zeros_like(made.valid)
+    every["at_end"][torch.arange(len(start)), made.valid.long().cumsum(1).argmax(1)] = True
+    # where the locator finds nothing in true video it says nothing of generated video
+    use = made.valid & ~hidden["locator_px"]
     return {name: values[use] for name, values in every.items()}
 
 
@@ -72,18 +75,30 @@ def object_summary(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Any]:
 
     Returns:
         object_px and object_cm (median, 90th percentile over the frames in which it was found), their
-        object_cm_at_end, object_lost (share of the frames that truly show it), and locator_px, the locator's
-        own error on true video; {} where nothing was measured.
+        object_cm_at_end, object_lost (share of the frames that truly show it), and locator_px and
+        locator_cm, the locator's own error on true video. Where the locator fails there: object_unknown,
+        saying so, in place of all that it says of generated video. {} where nothing can be measured.
     """
-    known = [part for part in parts if part and len(part["lost"])]
+    known = [part for part in parts if part]
     if not known:
         return {}
     whole = {name: torch.cat([part[name] for part in known]) for name in known[0]}
+    if not len(whole["lost"]):
+        return {"object_unknown": "the locator, which goes by its colour, finds it in no recorded frame"}
+    own = {name: quantiles(whole[name]) for name in _NAMES[1]}
+    failed = float(whole["failed"].float().mean())
+    if failed > _FAILS:
+        why = (
+            f"the locator, which goes by its colour, errs by {own['locator_px']['median']:.1f} pixels (90%"
+            f" within {own['locator_px']['p90']:.1f}) in recorded video, and in {100 * failed:.0f}% of its"
+            f" frames by more than {100 * _BAR:.2g}% of the picture's side"
+        )
+        return {"object_unknown": why, **own}
     there = ~whole["lost"]
     return {
         "object_px": quantiles(whole["pixels"][there]),
         "object_cm": quantiles(whole["cm"][there]),
         "object_cm_at_end": quantiles(whole["cm"][there & whole["at_end"]]),
         "object_lost": float(whole["lost"].float().mean()),
-        "locator_px": quantiles(whole["locator_px"]),
+        **own,
     }

@@ -21,9 +21,12 @@ def rays(pixels: Tensor, intrinsic: Tensor, c2w: Tensor) -> tuple[Tensor, Tensor
 
 
 def on_plane(pixels: Tensor, height: Tensor | float, intrinsic: Tensor, c2w: Tensor) -> Tensor:
-    """World points [..., T, 3] where the rays of pixels [..., T, 2] meet the plane z = height (metres)."""
+    """World points [..., T, 3] where the rays of pixels [..., T, 2] meet the plane z = height (metres); NaN
+    where that lies behind the camera.
+    """
     origin, direction = rays(pixels, intrinsic.unsqueeze(-3), c2w.unsqueeze(-3))
-    return origin + (height - origin[..., 2:]) / direction[..., 2:] * direction
+    away = (height - origin[..., 2:]) / direction[..., 2:]
+    return torch.where(away > 0, origin + away * direction, torch.nan)
 
 
 def triangulate(origin: Tensor, direction: Tensor) -> Tensor:

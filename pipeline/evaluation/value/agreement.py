@@ -15,11 +15,13 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.stats import pearsonr, spearmanr
 from torch import Tensor
 
 from pipeline.evaluation.statistics import confusion, rate_entry
 
+ALL = "all"  # in place of a task: all of them together
 _COUNTS = ("tp", "fp", "fn", "tn")
 
 
@@ -109,16 +111,36 @@ class Cell:
         }
 
 
+def overall(cells: Sequence[Cell]) -> list[Cell]:
+    """Each policy on the starts of all its cells together, of which every one counts the same."""
+    mine: dict[str, list[Cell]] = {}
+    for cell in cells:
+        mine.setdefault(cell.policy, []).append(cell)
+    return [_pooled(policy, some) for policy, some in mine.items()]
+
+
+def _pooled(policy: str, cells: Sequence[Cell]) -> Cell:
+    known = [cell.true for cell in cells if cell.true is not None]
+    return Cell(
+        policy,
+        ALL,
+        cells[0].inside,
+        torch.cat([cell.imagined for cell in cells], 1),
+        torch.cat([cell.judged for cell in cells], 1),
+        torch.cat(known) if len(known) == len(cells) else None,
+    )
+
+
 def agreement(cells: Sequence[Cell]) -> dict[str, Any]:
     """How far estimated and true values agree on the starts that were judged, over all cells and by task.
 
     Returns:
         policies, cells; pearson and spearman over cells, None where one side does not vary; mmrv, the mean
         over tasks; order {"kept", "pairs"} of the pairs of policies of one task whose true values differ, and
-        kept, whether all pairs keep their order; micro {"tp", "fp", "fn", "tn", "accuracy"} of all episodes
-        and macro, the mean over cells of the shares of each; difference, the mean of |estimated - true|; bias
-        by "in" and "out" of distribution (see `bias`); tasks, the same of each if there are several. {} if no
-        cell knows its true value, or none of those could be judged.
+        kept, whether all pairs keep their order, None without pairs; micro {"tp", "fp", "fn", "tn",
+        "accuracy"} of all episodes and macro, the mean over cells of the shares of each; difference, the mean
+        of |estimated - true|; bias by "in" and "out" of distribution (see `bias`); tasks, the same of each if
+        there are several. {} if no cell knows its true value, or none of those could be judged.
     """
     known = [cell for cell in cells if cell.true is not None and cell.rates]
     if not known:
@@ -142,7 +164,7 @@ def _together(cells: Sequence[Cell], tasks: Sequence[Sequence[Cell]]) -> dict[st
         "spearman": correlation(spearmanr, true, estimated),
         "mmrv": float(np.mean([mmrv(*_values(some)) for some in tasks])),
         "order": kept,
-        "kept": kept["kept"] == kept["pairs"],
+        "kept": kept["kept"] == kept["pairs"] if kept["pairs"] else None,
         "micro": micro(tables),
         "macro": macro(tables),
         "difference": float(np.abs(estimated - true).mean()),

@@ -16,8 +16,7 @@ from envs.episodes.clips import ClipStore
 from envs.initial_states import InitialStates
 from envs.manifest import mark_of
 from envs.targets import ConfigError
-from pipeline.evaluation.by_task import tasks_of_episodes
-from pipeline.evaluation.fidelity.masks import ALIKE
+from pipeline.evaluation.by_task import evenly, tasks_of_episodes
 from pipeline.evaluation.value.agreement import Cell
 from pipeline.evaluation.value.candidates import Candidate
 from pipeline.evaluation.value.trials import Imagination, Physics
@@ -27,6 +26,9 @@ from pipeline.outside import fingerprint
 
 Cfg = Mapping[str, Any]
 _SIDE_BY_SIDE = 64  # imagined episodes
+_MOST = 8  # instructions that are told apart, a column each
+_VARIOUS = "various instructions"  # in place of a task, where there are more
+_ALIKE = 12.0  # mean grey levels between a recorded picture and its start rendered anew; encoding costs some
 _NEARER = 0.5  # mean grey levels, more than encoding a picture changes its distance to others
 
 
@@ -140,10 +142,18 @@ class Comparison:
 
 
 def starts_of(cfg: Cfg, store: ClipStore, held: Tensor) -> dict[str, Tensor]:
-    """Numbers int64 [N] of held-out episodes by task, policy_value.starts of each at most."""
-    tasks = tasks_of_episodes(cfg, store, held)
+    """Numbers int64 [N] of held-out episodes by task, policy_value.starts of each at most.
+
+    Where words alone tell tasks apart, people say one thing in many ways: there it is so many of all
+    together, of each instruction as many as of the others, and more than _MOST instructions are one group.
+    """
+    count, tasks = cfg["policy_value"]["starts"], tasks_of_episodes(cfg, store, held)
+    if not cfg["task"].get("suite"):
+        many = len(set(tasks)) > _MOST
+        held = evenly(cfg, store, held, count)
+        tasks = [_VARIOUS] * len(held) if many else tasks_of_episodes(cfg, store, held)
     mine = {task: held[torch.tensor([one == task for one in tasks])] for task in sorted(set(tasks))}
-    return {task: episodes[: cfg["policy_value"]["starts"]] for task, episodes in mine.items()}
+    return {task: episodes[:count] for task, episodes in mine.items()}
 
 
 def check_starts(off: Tensor, episodes: Tensor, seeds: Sequence[int]) -> None:
@@ -156,7 +166,7 @@ def check_starts(off: Tensor, episodes: Tensor, seeds: Sequence[int]) -> None:
         ConfigError: if a recorded first picture is more like another's start than like its own.
     """
     own = off.diagonal()
-    wrong = ((own > ALIKE) | (own > off.amin(1) + _NEARER)).nonzero().flatten().tolist()
+    wrong = ((own > _ALIKE) | (own > off.amin(1) + _NEARER)).nonzero().flatten().tolist()
     if wrong:
         n = wrong[0]
         raise ConfigError(

@@ -11,6 +11,7 @@ from pipeline.evaluation.charts import Point, agreement_chart
 from pipeline.evaluation.judging import cost_text, facts_text
 from pipeline.evaluation.report import templates
 from pipeline.evaluation.statistics import rate
+from pipeline.evaluation.value.agreement import ALL
 
 _SERIES = ("in distribution", "out of distribution")
 # Figures of an agreement: key, heading and form.
@@ -33,11 +34,12 @@ def build_page(result: Mapping[str, Any]) -> str:
         .render(
             result=result,
             verdict=verdict(result),
-            notes=[*result["notes"], *judge_lines(result)],
+            notes=[ranking(result), *result["notes"], *judge_lines(result)],
+            cells=[*result["cells"], *(result["overall"] if len(tasks) > 1 else [])],
             charts=_charts(result["cells"], tasks),
             figures=[title for _, title, _ in FIGURES],
             agreements=[
-                ("all", _figures(found), found),
+                (ALL, _figures(found), found),
                 *((t, _figures(row), row) for t, row in rows.items()),
             ]
             if found
@@ -47,21 +49,36 @@ def build_page(result: Mapping[str, Any]) -> str:
 
 
 def table_text(result: Mapping[str, Any]) -> str:
-    """Markdown: a row for each policy, true and estimated values by task; then what they come to."""
+    """Markdown: a row for each policy, true and estimated values by task, and over all of several; then what
+    they come to.
+    """
     tasks = list(result["starts"])
+    overall = {row["policy"]: row for row in result["overall"]}
     found = {(cell["policy"], cell["task"]): cell for cell in result["cells"]}
+    columns = [*tasks, ALL] if len(tasks) > 1 else tasks
     lines = [
         f"Values of policies in {result['simulator']} by {result['judge']}, in percent: true -> estimated,"
         f" +- standard error over {result['repeats']} repeats",
         "",
-        f"| policy | {' | '.join(tasks)} |",
-        f"| --- |{' --- |' * len(tasks)}",
+        f"| policy | {' | '.join(columns)} |",
+        f"| --- |{' --- |' * len(columns)}",
     ]
-    for policy in dict.fromkeys(cell["policy"] for cell in result["cells"]):
-        cells = [_cell_text(found[policy, task]) for task in tasks]
-        lines.append(f"| {policy} | {' | '.join(cells)} |")
-    lines += ["", verdict(result), *result["notes"], *judge_lines(result)]
+    for policy, whole in overall.items():
+        cells = [found[policy, task] for task in tasks] + ([whole] if len(tasks) > 1 else [])
+        lines.append(f"| {policy} | {' | '.join(_cell_text(cell) for cell in cells)} |")
+    lines += ["", verdict(result), ranking(result), *result["notes"], *judge_lines(result)]
     return "\n".join(lines)
+
+
+def ranking(result: Mapping[str, Any]) -> str:
+    """Policies by their estimated values over all starts, the best first; last who could not be judged."""
+    rows = sorted(
+        result["overall"],
+        key=lambda row: -1.0 if row["estimated"] is None else row["estimated"],
+        reverse=True,
+    )
+    texts = (f"{row['policy']}: {_cell_text(row)}" for row in rows)
+    return f"The best first, by estimated values over all starts, in percent: {'; '.join(texts)}."
 
 
 def judge_lines(result: Mapping[str, Any]) -> list[str]:
@@ -81,11 +98,11 @@ def verdict(result: Mapping[str, Any]) -> str:
     sides = [
         f"{100 * side['mean']:+.1f} points {_SERIES[name == 'out']}" for name, side in found["bias"].items()
     ]
-    ranking = "ranking kept" if found["kept"] else "ranking not kept"
-    return (
-        f"{ranking} ({kept['kept']} of {kept['pairs']} pairs); {agreement};"
-        f" estimated less true {', '.join(sides)}"
-    )
+    if found["kept"] is None:
+        order = "no ranking to keep (true values of a task are all equal)"
+    else:
+        order = f"ranking {'' if found['kept'] else 'not '}kept ({kept['kept']} of {kept['pairs']} pairs)"
+    return f"{order}; {agreement}; estimated less true {', '.join(sides)}"
 
 
 def _titles() -> list[str]:

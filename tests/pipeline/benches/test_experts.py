@@ -19,7 +19,7 @@ SMALL = (
 def test_success_is_counted_by_task_and_variant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     experts(load_config([*SMALL, f"runs={tmp_path}", "~task.variants.swapped"]))
     said = capsys.readouterr().out
-    assert said.count("  push ") == said.count("  pull ") == 6
+    assert said.count("  push ") == said.count("  pull ") == 7
     assert "expert, out_of_domain" in said and "expert, swapped" not in said and "2/2 = 100.0%" in said
     assert not list(tmp_path.rglob("*.mp4"))
 

@@ -85,7 +85,7 @@ def test_a_text_world_is_counted_as_it_computes() -> None:
 
 def test_an_engine_that_asks_for_numbers_is_named() -> None:
     own: dict[str, Any] = section_of("forcing_small")
-    own["actions"] = {"_target_": "envs.conditioning.ActionText"}
+    own["actions"] = {"_target_": "envs.conditioning.ActionText", "decimals": 2}
     with pytest.raises(ConfigError, match=r"ForcingSimulator\) cannot be counted on shapes alone"):
         size_of(own, replace(WorldSpec(ARM, (256, 256), 4), size=(64, 64)))
 

@@ -8,11 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from actors.factory import build_simulator
 from envs.targets import ConfigError
 from pipeline.benches import distil as students
-from pipeline.benches.distil import distil, reached
+from pipeline.benches.bench import config_of
+from pipeline.benches.distil import STUDENT, TEACHER, distil, reached
 from pipeline.benches.strides import strides
 from pipeline.config import load_config
+from tests.learners.models import stepwise_engines
 
 TINY = (
     *("experiment=soak", "task.horizon=8", "policy.width=64", "track=disabled", "threads=1"),
@@ -43,10 +46,28 @@ def test_students_and_teacher_stand_in_one_table(
         assert sum(row[f"judge_{name}"] for name in ("tp", "fp", "fn", "tn")) > 0
     assert said.count("TrajectoryRegression, 1: m") == 1 and "teacher, 2: m" not in said
     assert "not distilled, 1: m" not in said
-    graph, _ = students.build_table(cfg, tmp_path)
+    graph, *_ = students.build_table(cfg, tmp_path)
     made = [graph.nodes[f"student-{name}"].cfg["distill"]["first"]["fit"] for name in few[1:]]
     assert [fit["steps"] for fit in made] == [4, 2]  # two updates of the student, and two of DMD2's critic
     assert distil(cfg) == found and "is finished, reused" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("engine", stepwise_engines())
+def test_every_row_can_be_built_of_every_engine_before_any_work(engine: str, tmp_path: Path) -> None:
+    words = [f"simulator={engine}", "task.chunk=5", "task.horizon=20", "task.suite.cameras=[head,hand_left]"]
+    graph, rows, left = students.build_table(config_of("distil", words), tmp_path)
+    names = ("not distilled", "DMD2", "TrajectoryRegression")
+    titles = [f"teacher, {n}" for n in TEACHER] + [f"{name}, {n}" for name in names for n in STUDENT]
+    assert [title for title in titles if title not in left] == list(rows)
+    assert left.keys() <= {"teacher, 1"}  # of which no step would have a length
+    for title, name in rows.items():
+        sampler = build_simulator(graph.nodes[name].cfg).sampler
+        assert title.endswith(f", {sampler.evaluations}") and sampler.jumps != title.startswith("teacher")
+    teacher = graph.nodes["simulator"].cfg["simulator"]
+    assert build_simulator({**graph.cfg, "simulator": teacher}).sampler.evaluations == 15
+    key = "sampling" if "sampling" in teacher else "denoising"
+    fewer = config_of("distil", [*words, f"simulator.{key}.steps=6"])["simulator"]
+    assert fewer == {**teacher, key: {**teacher[key], "steps": 6}}
 
 
 def test_a_student_meets_all_that_it_should_or_it_is_said_what_it_missed() -> None:
@@ -82,3 +103,5 @@ def test_strides_reach_as_many_times_further(tmp_path: Path, capsys: pytest.Capt
 def test_benches_say_what_they_cannot_do() -> None:
     with pytest.raises(ConfigError, match=r"distill\.steps=0 is without a student"):
         distil(load_config([*TINY, "simulator=dit_small"]))
+    with pytest.raises(ConfigError, match="UNetSimulator does not denoise in steps; choose simulator=dit"):
+        config_of("distil", ["simulator=unet_small"])

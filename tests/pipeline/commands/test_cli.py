@@ -83,6 +83,16 @@ def test_mistakes_name_the_fix() -> None:
             + (f"hydra.searchpath=[file://{ROOT}/examples/configs]",),
             "imitation-",  # whose weights are not there; coarse is the class that they would be of
         ),
+        (
+            ("evaluate", "policy=imitaton", "experiment=smoke"),
+            "choice of configs/policy; did you mean imitation",
+        ),
+        (("evaluate", "variant=swapped", "experiment=smoke"), "variant=swapped: this task has no variants"),
+        (("run", "policy=openpi", "experiment=smoke"), "OpenPIPolicy cannot learn"),
+        (("stage", "rl-1", "policy=openpi", "experiment=smoke"), "OpenPIPolicy cannot learn"),
+        (("study", "policy=openpi", "experiment=smoke", "study.minutes=0"), "OpenPIPolicy cannot learn"),
+        (("tasks", "metaworld"), "did you mean task=metaworld?"),
+        (("tasks", "task=tabletop", "task.suite.scenes=attic"), "task.suite.scenes holds 'attic'"),
         (("bench", "serving", "seconds=soon"), "seconds=soon: say a number above 0"),
     ):
         wrong = worldloop(*words)

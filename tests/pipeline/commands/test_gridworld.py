@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from envs.physics.gridworld import EDGE, Gridworld
-from envs.targets import ConfigError
+from envs.rng import Stream, episode_rng
+from envs.targets import ConfigError, build
 from pipeline.commands.worlds.gridworld import gridworld, variant
 from pipeline.config import load_config
 from pipeline.evaluation.squares import find_squares
@@ -27,6 +28,12 @@ TINY = [
 
 def suite(squares: int = 3, size: tuple[int, int] = (32, 32)) -> Gridworld:
     return Gridworld(squares, size, ["above"], 10, 0.3)
+
+
+def spoken(text: str) -> list[float]:
+    """The numbers that a text says."""
+    words = text.replace("minus", ",-").replace("plus", ",").replace("point", ".").replace(" ", "")
+    return [float(number) for number in words.split(",")[1:]]
 
 
 def test_squares_are_found_to_a_part_of_a_pixel_and_hidden_ones_are_not() -> None:
@@ -63,6 +70,10 @@ def test_the_study_runs_and_goes_on_where_it_was(tmp_path: Path) -> None:
     cfg = load_config(TINY)
     told = variant(cfg, 3, "digits")
     assert told["task"]["suite"]["squares"] == 3 and "ActionText" in told["simulator"]["actions"]["_target_"]
+    drawn = episode_rng(0, Stream.START).uniform(-64, 64, (50, 6))  # two velocities of each of three squares
+    text = build(told["simulator"]["actions"], "simulator.actions", embodiment=suite().embodiment)
+    said = [spoken(text.describe(row)) for row in drawn.tolist()]
+    assert abs(np.sum(said, 0) - np.sum(drawn, 0)).max() < 0.1  # where squares are after 50 steps
     assert "ActionVector" in cfg["simulator"]["actions"]["_target_"]
     out = gridworld(cfg, tmp_path, [1], None)
     rows = json.loads((tmp_path / "gridworld.json").read_text())

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from actors.factory import build_pool
 from envs.episodes import Episode, LeRobotWriter
 from envs.physics.suite import build_suite
+from envs.targets import ConfigError
 from pipeline.commands.play import build_game
 from pipeline.config import load_config
 
@@ -27,3 +30,12 @@ def test_recordings_are_played_in_the_tasks_that_their_run_played(tmp_path: Path
     for number, track in enumerate(tracks):
         game.hand_over("recorded", number)
         assert (game.seed, game.instruction) == (track.seed, track.instruction)
+        assert track.instruction in game.recorded[number].title
+    # the config has come to name another task since
+    later = build_game({**cfg, "task": {**cfg["task"], "name": "count"}}, {}, tmp_path / "set")
+    assert [one.task for one in later.recorded] == [track.instruction for track in tracks]
+    fewer = {**cfg["task"], "suite": {**COUNTING, "tasks": ["count"]}, "name": "count"}
+    with pytest.raises(
+        ConfigError, match=r"episode of seed 0 was told 'uncount', which this suite says of none"
+    ):
+        build_game({**cfg, "task": fewer}, {}, tmp_path / "set")

@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from scipy.stats import pearsonr, spearmanr
 
-from pipeline.evaluation.value.agreement import Cell, agreement, bias, correlation, macro, micro, mmrv, order
+from pipeline.evaluation.value.agreement import (
+    Cell,
+    agreement,
+    bias,
+    correlation,
+    macro,
+    micro,
+    mmrv,
+    order,
+    overall,
+)
+from pipeline.evaluation.value.page import build_page, ranking, table_text, verdict
 
 TRUE = np.array([0.9, 0.5, 0.1])
 
@@ -105,3 +117,53 @@ def test_orders_are_compared_within_tasks_alone() -> None:
     assert found["order"] == {"kept": 2, "pairs": 2} and found["kept"] and found["cells"] == 4
     assert set(found["tasks"]) == {"pull", "push"} and found["tasks"]["pull"]["difference"] == 0.375
     assert bias(np.array([0.2]), np.array([0.2]))["exact"] == 1
+
+
+def result_of(*cells: Cell) -> dict[str, Any]:
+    """What policy-value.json holds of cells."""
+    return {
+        "name": "tiny",
+        "weights": {},
+        "simulator": "S",
+        "judge": "J",
+        "judged_by": {},
+        "judge_cost": {},
+        "repeats": 2,
+        "starts": {one.task: one.imagined.shape[1] for one in cells},
+        "cells": [one.row() for one in cells],
+        "overall": [one.row() for one in overall(cells)],
+        "agreement": agreement(cells),
+        "notes": [],
+    }
+
+
+def test_where_all_true_values_are_equal_there_is_no_ranking_to_keep() -> None:
+    said = result_of(cell("a", "10", "11"), cell("b", "01", "00"))
+    assert said["agreement"]["order"] == {"kept": 0, "pairs": 0} and said["agreement"]["kept"] is None
+    assert verdict(said).startswith("no ranking to keep") and "0 of 0" not in build_page(said)
+    other = result_of(cell("a", "11", "11"), cell("b", "01", "11"))
+    assert verdict(other).startswith("ranking not kept (0 of 1 pairs)")
+
+
+def test_policies_have_a_value_over_all_starts_and_a_ranking_without_truth() -> None:
+    said = result_of(
+        cell("a", None, "1100", "0000"),
+        cell("b", None, "1000", "1100"),
+        cell("a", None, "1", "1", task="pull"),
+        cell("b", None, "1", "1", task="pull"),
+    )
+    rows = {row["policy"]: row for row in said["overall"]}
+    # of five starts 3 and 1, so .4 +- .2, and 2 and 3, so .5 +- .1: every start counts the same
+    assert [rows[name]["estimated"] for name in "ab"] == pytest.approx([0.4, 0.5])
+    assert [rows[name]["standard_error"] for name in "ab"] == pytest.approx([0.2, 0.1])
+    assert rows["a"]["task"] == "all" and rows["a"]["episodes"] == 10 and "true" not in rows["a"]
+    assert ranking(said).endswith("in percent: b: 50 +- 10.0; a: 40 +- 20.0.")
+    text = table_text(said)
+    assert "| policy | push | pull | all |" in text and "| 100 | 40 +- 20.0 |" in text
+    assert ranking(said) in text and "nobody knows" in text
+    page = build_page(said)
+    assert ranking(said) in page and page.count("<td>all</td>") == 2
+    one = result_of(cell("a", "1100", "1100", "1000"), cell("b", None, "1000", "1000"))
+    assert "| policy | push |" in table_text(one) and "a: 50 -> 38 +- 12.5; b: 25." in ranking(one)
+    lost = Cell("c", "push", True, bools("1100")[None], torch.zeros(1, 4, dtype=torch.bool))
+    assert ranking(result_of(lost, cell("d", None, "0000"))).endswith("d: 0; c: nothing judged.")

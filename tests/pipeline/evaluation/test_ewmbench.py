@@ -16,9 +16,9 @@ from envs.rng import constant_generator
 from envs.targets import ConfigError
 from pipeline.evaluation.ewmbench.choose import Paths, choose
 from pipeline.evaluation.ewmbench.coverage import least_overlap, mean_overlap, overlaps, voxels
-from pipeline.evaluation.ewmbench.features import PyramidPatches, WordGrams
+from pipeline.evaluation.ewmbench.features import PyramidPatches, WordGrams, fingerprint
 from pipeline.evaluation.ewmbench.records import Record, Records
-from pipeline.evaluation.ewmbench.result import Scoring
+from pipeline.evaluation.ewmbench.result import Scoring, overall
 from pipeline.evaluation.ewmbench.scene import Scene, diversity, scene_consistency, video_embedding
 from pipeline.evaluation.ewmbench.semantics import (
     VideoReport,
@@ -189,6 +189,19 @@ def test_the_given_first_frame_counts_in_the_public_code_alone() -> None:
     assert public["dyn"] == pytest.approx(wanted / CAPS["dyn"], rel=1e-5)
 
 
+def test_a_still_picture_has_no_scene_of_its_own_in_the_public_code() -> None:
+    # where light is all that patches show, no patch shows a colour, and such features count 0
+    picture = torch.full((4, 3, 64, 64), 128, dtype=torch.uint8)
+    picture[..., 20:30, 20:30] = 255
+    patches = PyramidPatches()(picture)
+    assert scene_consistency(patches, False).score == pytest.approx(1)
+    assert scene_consistency(patches, True).score < 0.5
+    true = record(line(10, 20, 30, 50))
+    rows = [Scoring(SIZE, strict, WordGrams(), ()).episode([true], true, "") for strict in (False, True)]
+    assert [overall([row])["still"]["scene"] for row in rows] == [1.0, None]
+    assert all(row["still"]["hsd"] for row in rows)
+
+
 # -- the set
 def test_voxels_are_passed_without_gaps() -> None:
     path = torch.tensor([[[0.1, 0.1]], [[3.5, 0.1]]])
@@ -252,6 +265,16 @@ def test_patches_tell_a_moving_scene_from_light() -> None:
         for other in (brighter, frames[2])
     )
     assert moved < light - 0.05 and light > 0.95 and "no learned weights" in extract.name
+
+
+def test_weights_that_differ_anywhere_have_another_name(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text("{}")
+    weights = tmp_path / "model.safetensors"
+    names = []
+    for last in (b"0", b"1", b"0"):
+        weights.write_bytes(bytes(3 << 20) + last)
+        names.append(fingerprint(str(tmp_path)))
+    assert names[0] == names[2] != names[1] and len(names[0]) == 8
 
 
 # -- semantics

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional
 
+from envs.episodes import LeRobotWriter
 from envs.episodes.clips import ClipStore
 from envs.judges.perceptual import PerceptualDistance
 from envs.rng import constant_generator
@@ -28,7 +31,8 @@ from pipeline.evaluation.fidelity.masks import read_labels
 from pipeline.evaluation.fidelity.open_loop import OpenLoop
 from pipeline.evaluation.fidelity.page import collapse_text
 from pipeline.evaluation.fidelity.strides import by_stride, stride_cells
-from tests.moving_square import picture
+from tests.embodiments import BIMANUAL_POSES, world_spec
+from tests.moving_square import SIZE, moving_square, picture
 
 
 class Drawing(Simulator):
@@ -166,6 +170,21 @@ class VideoNetwork(nn.Module):
         return x.mean([1, 2, 3, 4])[:, None].expand(len(x), 400)
 
 
+class Particular(nn.Module):
+    """Says itself, within TorchScript, that it takes other pictures."""
+
+    def forward(self, x: Tensor, return_features: bool = False) -> Tensor:
+        assert x.shape[2] == 299, "of 299 pixels"
+        return x
+
+
+class Strict(nn.Module):
+    def forward(self, x: Tensor, return_features: bool = False) -> Tensor:
+        if x.shape[2] != 299:
+            raise ValueError("of 299 pixels")
+        return x
+
+
 def scripted(path: Path, network: nn.Module) -> str:
     torch.jit.script(network).save(str(path))
     return str(path)
@@ -180,6 +199,9 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
         Inception(scripted(tmp_path / "other.pt", Network(1000)))
     with pytest.raises(ConfigError, match="are no I3D"):
         I3D(scripted(tmp_path / "frames.pt", Network(2048)))
+    for network in (Particular(), Strict()):
+        with pytest.raises(ConfigError, match="are no Inception"):
+            Inception(scripted(tmp_path / "particular.pt", network))
     torch.save({"weight": torch.zeros(2)}, tmp_path / "state.pt")
     with pytest.raises(ConfigError, match="are no Inception"):
         Inception(str(tmp_path / "state.pt"))
@@ -244,6 +266,26 @@ def test_collapse_is_seen_and_nothing_else_taken_for_it(store: ClipStore) -> Non
     assert noise["end"]["sharpness"] > 2 and grey["end"]["sharpness"] < 0.1  # type: ignore[index]
 
 
+@pytest.mark.parametrize(
+    ("chunk", "lengths"), [(5, [13, 13, 13]), (25, [41, 41, 41]), (25, [41, 34, 27]), (4, [42, 38, 30])]
+)
+def test_the_end_of_an_episode_is_its_own(chunk: int, lengths: list[int], tmp_path: Path) -> None:
+    """However many frames fill up the last chunk, and however long others are."""
+    robot = BIMANUAL_POSES.at(SIZE)
+    made = [moving_square(robot, seed, "random", length=length) for seed, length in enumerate(lengths)]
+    LeRobotWriter(tmp_path, robot).write(made)
+    store = ClipStore([tmp_path], replace(world_spec(robot, SIZE), chunk=chunk))
+    episodes = torch.arange(len(lengths))
+    right, grey = (
+        drift(Drawing(store.spec, how), store, episodes, False, PerceptualDistance())
+        for how in ("right", "grey")
+    )
+    assert right["collapsed"] is False and grey["collapsed"] is True
+    assert right["end"]["psnr"] > 49 and right["end"]["sharpness"] == pytest.approx(1, abs=0.1)
+    assert right["frames"] == len(right["by_frame"]["psnr"]) == max(lengths) - 1
+    json.dumps(right, allow_nan=False)
+
+
 def test_masks_of_real_video_come_from_a_file(store: ClipStore, tmp_path: Path) -> None:
     length = int(store.length[3])
     good = {str(n): np.zeros((length, 3, 16, 16), np.uint8) for n in (3, 5)}
@@ -257,9 +299,19 @@ def test_masks_of_real_video_come_from_a_file(store: ClipStore, tmp_path: Path) 
     np.savez(tmp_path / "short.npz", **{"3": good["3"][1:]})
     with pytest.raises(ConfigError, match=rf"the episode takes \[{length}, 3, h, w\]"):
         read_labels(tmp_path / "short.npz", store, torch.tensor([3]))
-    (tmp_path / "no.npz").write_text("no")
-    with pytest.raises(ConfigError, match=r"is no \.npz file"):
-        read_labels(tmp_path / "no.npz", store, torch.tensor([3]))
+    whole = (tmp_path / "good.npz").read_bytes()
+    np.save(tmp_path / "array.npy", good["3"])
+    damaged = {
+        "no.npz": b"no",
+        "empty.npz": b"",
+        "short_by_half.npz": whole[: len(whole) // 2],
+        "changed.npz": whole.replace(bytes(64), b"\1" * 64, 1),
+        "array.npz": (tmp_path / "array.npy").read_bytes(),
+    }
+    for name, held in damaged.items():
+        (tmp_path / name).write_bytes(held)
+        with pytest.raises(ConfigError, match=rf"fidelity\.masks=.*{name} is no \.npz file, or damaged"):
+            read_labels(tmp_path / name, store, torch.tensor([3]))
 
 
 def test_options_at_inference_in_all_combinations() -> None:

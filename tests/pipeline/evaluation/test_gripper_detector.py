@@ -222,3 +222,6 @@ def test_extractors_refuse_weights_of_another_architecture(tmp_path: Path) -> No
         texts.similarity(["cup"], ["cup " * 78])
     with pytest.raises(ConfigError, match=r"must be a folder with config\.json"):
         DinoPatches(str(tmp_path / "nowhere"))
+    (tmp_path / "dino/model.safetensors").write_bytes(b"a damaged file")
+    with pytest.raises(ConfigError, match="transformers cannot load DINOv2 from it"):
+        DinoPatches(str(tmp_path / "dino"))

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from pipeline.evaluation.charts import Curve, line_chart
+from pipeline.evaluation.compare import compare
 from pipeline.evaluation.heat import heat_maps
 from pipeline.evaluation.report import build_report
 from pipeline.evaluation.result import verdict
@@ -58,7 +59,16 @@ def result(**changes: Any) -> dict[str, Any]:
         "tasks": {},
         "scenes": [],
         "exploration": None,
-        "rounds": [{"round": 1, "true": entry(40), "imagined": entry(44), "gap": 0.04, "replayed": table}],
+        "rounds": [
+            {
+                "round": 1,
+                "true": entry(40),
+                "imagined": entry(44),
+                "gap": 0.04,
+                "unseen": 80,
+                "replayed": table,
+            }
+        ],
         "episodes_used": 60,
         "episodes_held_out": 10,
         "imagined_episodes_used": [256],
@@ -148,6 +158,7 @@ def test_the_page_is_one_file_with_everything(inputs: Inputs) -> None:
     assert not re.findall(r'(?:src|href)=(?!"data:|"#)', page) and "url(" not in page
     assert "http" not in page.split("<h2 id=config>")[0]
     assert "2 judge" in page and "25.0%" in page and "3.1%" in page and "812" in page
+    assert "held-out starts" in page and "<td>80</td>" in page
 
 
 def test_the_page_tells_alarms_and_what_nobody_knows(inputs: Inputs) -> None:
@@ -157,6 +168,20 @@ def test_the_page_tells_alarms_and_what_nobody_knows(inputs: Inputs) -> None:
     assert "No episode was held out" in page and "nobody knows how often the judge is right" in page
     page = build_report({}, inputs, {**result(), "verdict": "-"})
     assert "Alarms" not in page and "nobody knows" not in page
+
+
+def test_a_judge_that_judged_nothing_is_not_wrong(inputs: Inputs, tmp_path: Path) -> None:
+    nothing = {"tp": 0, "fp": 0, "fn": 0, "tn": 0, "accuracy": None, "dropped": 4}
+    told = result()
+    told["judge"]["expert"]["generated"] = told["rounds"][0]["replayed"] = nothing
+    page = build_report({}, inputs, {**told, "verdict": "-"})
+    assert "<td>0</td><td>-</td><td>4</td>" in page and "0.0%</td><td>4</td>" not in page
+    assert "+4.0</td>\n<td>-</td></tr>" in page
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one/result.json").write_text(json.dumps(told))
+    table = compare([tmp_path / "one"])
+    assert "| verdicts right, %, recorded video | expert 50.0 |" in table
+    assert "| verdicts right, %, generated video | expert - |" in table
 
 
 def test_the_worst_disagreements_come_first_and_pairs_stay_together(inputs: Inputs) -> None:

@@ -139,8 +139,9 @@ def test_the_command_compares_judges_on_recordings(tmp_path: Path) -> None:
     compare_rewards(load_config([*words, *data]), tmp_path / "smoke", Plan(proxy, 4, ()))
     assert replayed.stat().st_mtime_ns == made and len(list(replayed.parent.iterdir())) == 1  # nothing twice
     cfg = load_config([*words, *data])
-    with pytest.raises(ConfigError, match="asks physics"):
-        compare_rewards(cfg, tmp_path / "smoke", Plan({"rule": cfg}, 4, ()))
+    with pytest.raises(ConfigError, match="asks physics"):  # before anything is fitted
+        compare_rewards(cfg, tmp_path / "new", Plan({**proxy, "rule": cfg}, 4, ()))
+    assert [path.name.split("-")[0] for path in (tmp_path / "new/stages").iterdir()] == ["recordings"]
     with pytest.raises(ConfigError, match=r"variants=\['moon'\]"):
         compare_rewards(cfg, tmp_path / "smoke", Plan({"rule": cfg}, 4, ("moon",)))
 
@@ -158,6 +159,19 @@ def test_a_row_is_measured_by_the_judge_that_it_names(
     assert judges["golden_goal"] == load_config(["judge=golden_goal"])["judge"]  # of the same class
     assert judges["golden_goal_full"] == judges["rule"]
     assert judges["rule"] == load_config(["judge=golden_goal_full", "judge.threshold=0.7"])["judge"]
+
+
+def test_without_physics_nobody_asks_it_unless_told_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dataset: Path
+) -> None:
+    plans: list[Plan] = []
+    monkeypatch.setattr(rewards, "compare_rewards", lambda cfg, root, plan, tracker: plans.append(plan))
+    smoke = ["experiment=smoke", "track=disabled", f"runs={tmp_path}"]
+    recorded = [*smoke, "task=lerobot", f"task.data=[{dataset}]", "task.size=[32,32]"]
+    for words in (smoke, recorded, [*recorded, "rewards=[proxy,rule]"]):
+        worlds.rewards(words)
+    learned = ["learned", "proxy", "embedding", "golden_goal"]
+    assert [list(plan.configs) for plan in plans] == [[*learned, "rule"], learned, ["proxy", "rule"]]
 
 
 def test_episodes_of_unseen_scenes(tmp_path: Path) -> None:

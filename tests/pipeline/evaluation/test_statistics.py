@@ -29,6 +29,8 @@ def test_confusion_and_rates() -> None:
     said, truth = torch.tensor([True, True, False, False]), torch.tensor([True, False, True, False])
     assert confusion(said, truth) == {"tp": 1, "fp": 1, "fn": 1, "tn": 1, "accuracy": 0.5}
     assert rate_entry(truth)["successes"] == 2
+    nothing = torch.zeros(0, dtype=torch.bool)  # judged: neither right nor wrong
+    assert confusion(nothing, nothing) == {"tp": 0, "fp": 0, "fn": 0, "tn": 0, "accuracy": None}
 
 
 def test_quantiles_leave_out_what_is_not_finite() -> None:

@@ -8,12 +8,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 import torch
 
 from actors.factory import open_clips
 from envs.embodiment import Embodiment
+from envs.episodes import LeRobotWriter
 from envs.episodes.filming import BAR
+from envs.episodes.splits import write_splits
+from envs.specs import at_rest
 from envs.targets import ConfigError
 from pipeline.commands.worlds.fidelity import fidelity
 from pipeline.commands.worlds.sweep import commanded, sweep
@@ -21,6 +25,7 @@ from pipeline.config import load_config
 from pipeline.evaluation.fidelity.masks import part_labels
 from pipeline.evaluation.joined.page import parts_of
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
+from tests.moving_square import SIZE, moving_square
 from tests.worlds import scripted_set, untrained_world
 
 SOAK = ["experiment=soak", "track=disabled", "launch.workers=1", "cameras=main"]
@@ -89,6 +94,67 @@ def test_fidelity_with_masks_from_physics(tmp_path: Path) -> None:
     assert labels is not None and (labels[0] != 255).any() and (labels[1:] == 255).all()
 
 
+def test_of_episodes_of_one_frame_nothing_can_be_measured(tmp_path: Path) -> None:
+    made = [moving_square(ARM_DELTAS, seed, length=1 if seed else 6) for seed in range(3)]
+    LeRobotWriter(tmp_path / "set", ARM_DELTAS.at(SIZE)).write(made)
+    write_splits(tmp_path / "set", {"train": 1, "held_out": 2, "calibration": 0})
+    words = ["experiment=smoke", "track=disabled", "task=lerobot", f"task.data=[{tmp_path / 'set'}]"]
+    words += ["task.size=[32,32]", "task.chunk=4", "task.horizon=8"]
+    words += untrained_world(load_config(words), tmp_path)
+    with pytest.raises(ConfigError, match=r"no held-out episode has 2 frames .*imagined\.data"):
+        fidelity(load_config(words), tmp_path / "run")
+
+
+def test_a_judge_that_learns_nothing_is_asked_and_one_that_has_not_learned_is_not(
+    tmp_path: Path, tiny_data: Callable[[Embodiment], Path]
+) -> None:
+    words = ["experiment=smoke", "track=disabled", "task=lerobot", f"task.data=[{tiny_data(ARM_DELTAS)}]"]
+    words += ["task.size=[32,32]", "task.chunk=2", "task.horizon=8", "fidelity.strides=[1,2]"]
+    words += ["fidelity.long.frames=0"]
+    words += [
+        word
+        for word in untrained_world(load_config(words), tmp_path)
+        if not word.startswith("imagined.judge")
+    ]
+    learned = fidelity(load_config([*words, "judge=learned"]), tmp_path / "run")
+    assert cv2.imwrite(str(tmp_path / "goal.png"), np.zeros((32, 32, 3), np.uint8))
+    goal = ["judge=goal_image", f"judge.picture={tmp_path / 'goal.png'}"]
+    given = fidelity(load_config([*words, *goal]), tmp_path / "run")
+    assert "No verdicts: the judge has learned nothing yet" in learned and "No verdicts" not in given
+    rows = json.loads((tmp_path / "run/fidelity.json").read_text())["strides"]
+    assert all(row["verdicts"]["generated"] for row in rows)
+
+
+EXTRACTOR = """
+import torch
+from pipeline.evaluation.fidelity.extractors import Extractor
+
+
+class Own(Extractor):
+    name, clips = "our own", False
+
+    def __call__(self, pictures: torch.Tensor) -> torch.Tensor:
+        return {scale} * pictures.float().mean((-2, -1))
+"""
+
+
+def test_extractors_of_one_name_and_different_code_are_told_apart(
+    tmp_path: Path, tiny_data: Callable[[Embodiment], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    words = ["experiment=smoke", "track=disabled", "task=lerobot", f"task.data=[{tiny_data(ARM_DELTAS)}]"]
+    words += ["task.size=[32,32]", "task.chunk=2", "task.horizon=8", "fidelity.long.frames=0"]
+    words += untrained_world(load_config(words), tmp_path)
+    distances = []
+    for scale in (1, 5):
+        (tmp_path / f"own_{scale}.py").write_text(EXTRACTOR.format(scale=scale))
+        fidelity(
+            load_config([*words, f"fidelity.frames_extractor._target_=own_{scale}.Own"]), tmp_path / "run"
+        )
+        distances.append(json.loads((tmp_path / "run/fidelity.json").read_text())["frechet"][0]["value"])
+    assert distances[1] > 5 * distances[0] > 0
+
+
 @pytest.mark.parametrize("robot", [ARM_DELTAS, BIMANUAL_POSES], ids=lambda robot: robot.robot)
 def test_a_contact_sheet_for_each_number_of_any_robot(
     robot: Embodiment, tmp_path: Path, tiny_data: Callable[[Embodiment], Path]
@@ -109,6 +175,11 @@ def test_a_contact_sheet_for_each_number_of_any_robot(
 def test_deltas_are_repeated_and_absolute_numbers_go_there() -> None:
     start, travel = torch.ones(1, 4), torch.tensor([[0.0, 0.4, 0.0, 0.0]])
     assert commanded(world_spec(ARM_DELTAS), start, travel, 4)[0, :, 1].tolist() == pytest.approx([0.4] * 4)
+    grip = torch.tensor([[0.3, 0.0, 0.0, 0.8]])  # the last command: a change, and where the gripper is
+    still = commanded(world_spec(ARM_DELTAS), grip, torch.zeros(1, 4), 4)
+    assert torch.equal(still, at_rest(grip, ARM_DELTAS)[:, None].expand(1, 4, 4))
+    shut = commanded(world_spec(ARM_DELTAS), grip, torch.tensor([[0.0, 0.0, 0.0, -0.4]]), 4)[0]
+    assert shut[:, 3].tolist() == pytest.approx([0.7, 0.6, 0.5, 0.4]) and not shut[:, :3].any()
     poses = torch.zeros(1, 14)
     poses[0, 1] = 0.4
     path = commanded(world_spec(BIMANUAL_POSES), torch.ones(1, 14), poses, 4)

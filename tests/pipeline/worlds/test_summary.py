@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from envs.embodiment import Embodiment
 from envs.targets import ConfigError
+from pipeline.cli.runs import evaluate
 from pipeline.commands.worlds.ewmbench import ewmbench
 from pipeline.commands.worlds.fidelity import fidelity
 from pipeline.commands.worlds.policy_value import policy_value
@@ -47,6 +48,7 @@ def test_what_was_measured_stands_on_one_page(
     assert "worldloop policy-value" not in whole and "| Pearson ↑ | unmeasured |" in whole  # no physics
     assert re.search(r"\| scene ↑ \| 0\.\d+ \| \d\.\d+ \| \d\.\d+ \|", whole)
     page = (root / "summary.html").read_text()
+    assert "1 held-out episodes, one sample of each; features by" in page
     assert page.count("<table>") == 3 and not re.findall(r'(?:src|href)=(?!"#)', page)
     other = json.loads((root / "ewmbench.json").read_text())
     weights = Path(other["weights"]["simulator"])
@@ -58,3 +60,26 @@ def test_what_was_measured_stands_on_one_page(
     (root / "ewmbench.json").write_text(json.dumps(other))
     with pytest.raises(ConfigError, match=r"different weights were measured .*ewmbench: elsewhere"):
         summary(root)
+
+
+def test_a_simulator_is_evaluated_by_one_command(
+    tmp_path: Path, tiny_data: Callable[[Embodiment], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["experiment=smoke", "track=disabled", "task=lerobot", f"task.data=[{tiny_data(ARM_DELTAS)}]"]
+    words += [
+        "task.size=[32,32]",
+        "task.chunk=4",
+        "task.horizon=8",
+        "fidelity.episodes=2",
+        f"runs={tmp_path}",
+    ]
+    words += ["fidelity={episodes: 2, long: {frames: 0}}", "ewmbench={samples: 1, episodes: 1, videos: 0}"]
+    words += untrained_world(load_config(words), tmp_path)[1:]
+    evaluate([*words, f"simulator={tmp_path / 'simulator'}"])
+    said = capsys.readouterr().out
+    assert "fidelity.html" in said and "ewmbench.html" in said and "| PSNR dB" in said
+    assert (tmp_path / "smoke/summary.html").is_file()
+    with pytest.raises(ConfigError, match=r"simulator=simulator-9 is no stage, .* did you mean simulator-"):
+        evaluate([*words, "simulator=simulator-9"])
+    with pytest.raises(ConfigError, match="is measured by itself: leave out policy="):
+        evaluate([*words, "simulator=simulator-1", "policy=imitation"])
