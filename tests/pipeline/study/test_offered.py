@@ -28,6 +28,10 @@ def command(group: str, name: str) -> tuple[str, ...] | None:
 COMMANDS = sorted(
     {words for group in ("study", "experiment") for name in choices(group) if (words := command(group, name))}
 )
+ELSEWHERE = [
+    ("experiment=bench4", "study=data_size", "study.places=[]"),
+    ("experiment=metaworld5", "study=judges"),
+]
 
 
 def test_every_file_says_how_its_study_is_run() -> None:
@@ -35,10 +39,11 @@ def test_every_file_says_how_its_study_is_run() -> None:
     for name in choices("experiment"):
         section = yaml.safe_load((CONFIGS / "experiment" / f"{name}.yaml").read_text())
         chosen = [key for base in section.get("defaults", []) for key in base if key == "override /study"]
-        assert bool(chosen or "study" in section) == (command("experiment", name) is not None), name
+        own = "study" in section or "study" in section.get("if_chosen", {})
+        assert bool(chosen or own) == (command("experiment", name) is not None), name
 
 
-@pytest.mark.parametrize("words", [(), *COMMANDS], ids=" ".join)
+@pytest.mark.parametrize("words", [(), *COMMANDS, *ELSEWHERE], ids=" ".join)
 def test_every_row_can_be_built(words: tuple[str, ...], tmp_path: Path) -> None:
     study = plan_study([*words, f"runs={tmp_path}", "study.seeds=[0]"])
     assert {row.name for row in study.rows} == set(study.cfg["study"]["rows"])
