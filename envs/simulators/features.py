@@ -17,7 +17,7 @@ from envs.precision import mixed_precision
 from envs.simulators import memory
 from envs.simulators.base import Simulator
 from envs.simulators.inputs import build_inputs
-from envs.specs import WorldSpec
+from envs.specs import WorldSpec, at_rest
 
 _AT_ONCE = 50  # chunks per forward pass
 
@@ -42,11 +42,8 @@ def held(spec: WorldSpec, now: TensorDict) -> TensorDict:
         now: TensorDict [B] with the command in force [A] as `command`, and pose_map, c2w of the last frame
             where the spec asks for them. Grippers of robots that act by changes are told where to be.
     """
-    command = now["command"].clone()
-    if spec.embodiment.delta:
-        moves = [k for k in range(spec.action_dim) if k not in spec.embodiment.grippers]
-        command[:, moves] = 0.0
-    names = {"commands": command} | {name: now[name] for name in ("pose_map", "c2w") if name in now.keys()}
+    names = {name: now[name] for name in ("pose_map", "c2w") if name in now.keys()}
+    names["commands"] = at_rest(now["command"], spec.embodiment)
     still = {name: value[:, None].expand(-1, spec.chunk, *value.shape[1:]) for name, value in names.items()}
     return TensorDict(still, now.shape)
 
