@@ -21,9 +21,8 @@ from envs.simulators.tokenizers.errors import gradient_difference, picture_error
 
 _COLLAPSED = 0.02  # perplexity, of the codes that could have been seen, below which a codebook has collapsed
 _FEWEST = 1.5  # and in codes, for small ones
-_MOST_BITS = (
-    18  # of a token, as in MAGVIT-2: a table lists all codes, and transformers say how likely each is
-)
+# Of a token, as in MAGVIT-2: a table lists all codes, and transformers say how likely each is.
+_MOST_BITS = 18
 
 
 class LookupFreeQuantiser(nn.Module):
