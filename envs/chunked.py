@@ -15,9 +15,16 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from envs.episodes.store import warn_of_cut
 from envs.rng import episode_stream
-from envs.specs import EPISODE, INSTRUCTION_UTF8, TEXT_BYTES, ActionMode, WorldSpec, text_to_bytes
+from envs.specs import (
+    EPISODE,
+    INSTRUCTION_UTF8,
+    TEXT_BYTES,
+    ActionMode,
+    WorldSpec,
+    text_to_bytes,
+    warn_of_cut,
+)
 
 
 class ChunkedEnv(EnvBase):

@@ -8,7 +8,8 @@ plug in. B is a batch of episodes, K the actions of a chunk, V cameras, A number
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -18,6 +19,9 @@ from torchrl.data.vla import ACTION_CHUNK_KEY, IMAGE_KEY, INSTRUCTION_KEY, STATE
 
 from envs.embodiment import ActionKind, Embodiment
 from envs.ranges import NonNegative
+
+log = logging.getLogger(__name__)
+_known_cut: set[str] = set()  # instructions that this process has warned of
 
 CHUNK = ACTION_CHUNK_KEY  # ("vla_action", "chunk") float32 [B, K, A]
 LOG_PROB = ("vla_action", "log_probs")  # float32 [B]
@@ -186,6 +190,18 @@ def text_to_bytes(texts: Sequence[str]) -> Tensor:
         raw = text.encode()[:TEXT_BYTES].decode(errors="ignore").encode()
         row[: len(raw)] = torch.tensor(list(raw), dtype=torch.uint8)
     return out
+
+
+def warn_of_cut(instructions: Iterable[str]) -> None:
+    """Warn, once in a process, of instructions that text_to_bytes cuts."""
+    cut = {text for text in instructions if len(text.encode()) > TEXT_BYTES} - _known_cut
+    if cut:
+        _known_cut.update(cut)
+        log.warning(
+            "%d instructions, the first of them %.60r..., have more than %d bytes; only so many are read"
+            " by policies, judges and worlds, so texts that differ later are the same to them",
+            *(len(cut), min(cut), TEXT_BYTES),
+        )
 
 
 def bytes_to_text(rows: Tensor) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,22 +18,7 @@ from envs.episodes.episode import EpisodeError
 from envs.episodes.formats.lerobot_columns import SEED
 from envs.episodes.formats.lerobot_files import read_info
 from envs.episodes.splits import range_of
-from envs.specs import TEXT_BYTES, WorldSpec, text_to_bytes
-
-log = logging.getLogger(__name__)
-_known_cut: set[str] = set()  # instructions that this process has warned of
-
-
-def warn_of_cut(instructions: Iterable[str]) -> None:
-    """Warn, once in a process, of instructions that text_to_bytes cuts."""
-    cut = {text for text in instructions if len(text.encode()) > TEXT_BYTES} - _known_cut
-    if cut:
-        _known_cut.update(cut)
-        log.warning(
-            "%d instructions, the first of them %.60r..., have more than %d bytes; only so many are read"
-            " by policies, judges and worlds, so texts that differ later are the same to them",
-            *(len(cut), min(cut), TEXT_BYTES),
-        )
+from envs.specs import WorldSpec, text_to_bytes, warn_of_cut
 
 
 class EpisodeStore:
