@@ -97,30 +97,29 @@ def evaluate(words: Words) -> None:
             own["weights"] = value
         else:
             rest.append(word)
+    if simulator and len(rest) < len(words) - 1:
+        raise ConfigError(
+            f"simulator={simulator} is measured by itself: leave out policy=, world= and variant=;"
+            " `worldloop policy-value` says what it makes of policies, by imagined.simulator"
+        )
+    cfg, root = prepared(rest)
+    for group, name in (("simulator", simulator), ("policy", own["weights"])):
+        if name:
+            _check_named(group, name, cfg, root, rest)
     if simulator:
-        if len(rest) < len(words) - 1:
-            raise ConfigError(
-                f"simulator={simulator} is measured by itself: leave out policy=, world= and variant=;"
-                " `worldloop policy-value` says what it makes of policies, by imagined.simulator"
-            )
         from pipeline.cli.worlds import evaluate_simulator
 
-        _check_named("simulator", simulator, rest)
         return evaluate_simulator(simulator, rest)
-    cfg, root = prepared(rest)
-    if own["weights"]:
-        _check_named("policy", own["weights"], rest)
     from pipeline.commands.evaluate import evaluate_policy
 
     print(evaluate_policy(cfg, root, **own))
 
 
-def _check_named(group: str, name: str, words: Words) -> None:
+def _check_named(group: str, name: str, cfg: Mapping[str, Any], root: Path, words: Words) -> None:
     """Refuse what is neither a stage of the run nor a folder, with the nearest of stages and choices."""
     from pipeline.config import choices
     from pipeline.loop import build_loop
 
-    cfg, root = prepared(words)
     stages = build_loop(cfg, root).nodes
     if name not in stages and not Path(name).exists():
         near = nearest(name, [*stages, *choices(group, words)])
