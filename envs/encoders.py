@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from envs.specs import WorldSpec
 
-_NATIVE = 64  # pixels of a view's shorter side that the encoder is laid out for; larger ones are halved first
+_NATIVE = 64  # pixels of a view's shorter side that the trunk is laid out for; larger ones are halved first
 _LOOK = 4  # features of each key-point
 _QUERY = 128  # width of the network that turns the conditioning vector into queries
 _WAVES = 4  # frequencies of the positional encoding that queried key-points see, along either side
@@ -39,6 +39,27 @@ class ResidualBlock(nn.Module):
             gain, shift = self.film(cond)[:, :, None, None].chunk(2, 1)
             y = y * (1 + gain) + shift
         return x + self.conv(F.silu(y))
+
+
+class Halving(nn.Module):
+    """Halves maps [B, channels, H, W] before the trunk, and brings what the trunk says back to their size
+    (Lin et al. 2017, feature pyramids), so that key-points lie as finely in large pictures as in small ones.
+    """
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.norm = nn.GroupNorm(8, channels)
+        self.down = nn.Conv2d(channels, channels, 3, stride=2, padding=1)
+        self.fine = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Half as large maps, and what `back` needs of these."""
+        kept = F.silu(self.norm(x))
+        return self.down(kept), kept
+
+    def back(self, small: Tensor, kept: Tensor) -> Tensor:
+        """Maps like x of maps of half its size."""
+        return F.silu(self.fine(kept) + F.interpolate(small, size=kept.shape[-2:], mode="nearest"))
 
 
 class MultiViewEncoder(nn.Module):
@@ -82,10 +103,8 @@ class MultiViewEncoder(nn.Module):
         self.chosen = list(spec.embodiment.views_of(cameras))
         views, deep = len(self.chosen), 2 * width
         self.stem = nn.Conv2d(3 * pictures, width, 5, stride=2, padding=2)
-        self.halve = nn.Sequential()
-        for _ in range(max(0, round(math.log2(min(spec.size) / _NATIVE)))):
-            down = nn.Conv2d(width, width, 3, stride=2, padding=1)
-            self.halve.extend([nn.GroupNorm(8, width), nn.SiLU(), down])
+        times = max(0, round(math.log2(min(spec.size) / _NATIVE)))
+        self.halve = nn.ModuleList(Halving(width) for _ in range(times))
         self.view = nn.Parameter(0.02 * torch.randn(views, width))
         self.norm = nn.GroupNorm(8, width)
         self.down = nn.Conv2d(width, deep, 3, stride=2, padding=1)
@@ -115,12 +134,15 @@ class MultiViewEncoder(nn.Module):
 
     def gaze(self, pictures: Tensor, cond: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """What `forward` returns, and how well every pixel fits what each key-point looks for: logits float32
-        [B, views looked through, points + instruction_keypoints, h, w] at the encoder's finest resolution.
+        [B, views looked through, points + instruction_keypoints, h, w], h and w half of the pictures'.
         """
         pictures = pictures[:, self.chosen]
         batch, views = pictures.shape[:2]
         flat = to_signed(pictures).flatten(0, 1).contiguous(memory_format=torch.channels_last)
-        x = self.halve(self.stem(flat))
+        x, larger = self.stem(flat), []
+        for halving in self.halve:
+            x, kept = halving(x)
+            larger.append((halving, kept))
         x = F.silu(self.norm(x + self.view.repeat(batch, 1)[:, :, None, None]))
         y = self.down(x)
         of_views = None if cond is None else cond.repeat_interleave(views, 0)
@@ -129,6 +151,8 @@ class MultiViewEncoder(nn.Module):
         y = F.silu(self.norm_out(y))
         # Coarse features say what it is, fine ones where exactly.
         x = F.silu(self.fine(x) + F.interpolate(self.lift(y), size=x.shape[-2:], mode="nearest"))
+        for halving, kept in reversed(larger):
+            x = halving.back(x, kept)
         height, width = x.shape[-2:]
         places = x.flatten(2).unflatten(0, (batch, views)).float()  # [B, V, C, H * W]
         found = (self.heat @ places) * self.temperature.exp()  # [B, V, P, H * W]

@@ -2,21 +2,20 @@
 be made of it (learners/stages/distill).
 
 Noisy latents are z = (1 - s) x + s e of data x, noise e and level s in 0..1; z, x and e are float32 [B, ...],
-whatever the engine's latents look like. `Given` is the engine's own: what stays the same at every step.
+whatever the engine's latents look like. What is given to every step alike is of a class of the engine's own.
 """
 
 from __future__ import annotations
 
-from typing import Protocol, TypeVar, runtime_checkable
+import abc
+from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from envs.simulators.base import Simulator
 from envs.simulators.samplers import Distilled, Sampler
-from envs.specs import WorldSpec
-
-Given = TypeVar("Given")
 
 
 def lost_jumps(sampler: Sampler) -> str:
@@ -31,25 +30,25 @@ def lost_jumps(sampler: Sampler) -> str:
     )
 
 
-@runtime_checkable
-class Stepwise(Protocol[Given]):
+class Stepwise(Simulator, abc.ABC):
     """A simulator that can be a teacher, a student, and the critic between them.
 
     Attributes:
         codec: what is trained apart and stays as it is; teacher, student and critic share it.
     """
 
-    spec: WorldSpec
-    memory_frames: int
     codec: torch.nn.Module
 
     @property
+    @abc.abstractmethod
     def sampler(self) -> Sampler:
         """The way from noise to data that `predict` takes."""
 
+    @abc.abstractmethod
     def few_steps(self, steps: int) -> Distilled:
         """The sampler of a student of so many steps."""
 
+    @abc.abstractmethod
     def chunk_of(self, clip: TensorDict, generator: torch.Generator) -> tuple[TensorDict, Tensor]:
         """A chunk of a training clip [B], whose memory shows the engine's own frames of the chunks before.
 
@@ -57,11 +56,14 @@ class Stepwise(Protocol[Given]):
             the inputs of `predict`, and loss weights that broadcast over latents, 0 past an episode's end.
         """
 
-    def prepare(self, inputs: TensorDict) -> Given:
+    @abc.abstractmethod
+    def prepare(self, inputs: TensorDict) -> Any:
         """What all steps share: clean remembered latents, and the conditioning."""
 
-    def noise(self, inputs: TensorDict, given: Given) -> Tensor:
+    @abc.abstractmethod
+    def noise(self, inputs: TensorDict, given: Any) -> Tensor:
         """Standard normal noise like the chunk's latents, by each row's seed and chunk index."""
 
-    def velocity(self, z: Tensor, level: Tensor, given: Given) -> Tensor:
+    @abc.abstractmethod
+    def velocity(self, z: Tensor, level: Tensor, given: Any) -> Tensor:
         """The velocity e - x at z, at noise level [B]."""

@@ -35,6 +35,18 @@ def test_two_pictures_of_a_view_are_seen_as_one() -> None:
     assert encoder(torch.randn(3, spec.views, 6, 32, 32)).shape == (3, encoder.out_features)
 
 
+@pytest.mark.parametrize("side", [32, 64, 128])
+def test_key_points_lie_as_finely_in_large_pictures(side: int) -> None:
+    spec = world_spec(ARM_DELTAS, (side, side))
+    encoder = MultiViewEncoder(spec, points=4, width=8)
+    dot = torch.zeros(1, spec.views, 3, side, side, dtype=torch.uint8)
+    found = encoder.gaze(dot)[1]
+    dot[..., side // 2 :, side // 2 :] = 255
+    assert found.shape[-2:] == (side // 2, side // 2)
+    moved = (encoder.gaze(dot)[1] - found).abs().amax((0, 1, 2))
+    assert moved[-2, -2] > 0
+
+
 def test_some_key_points_are_queried_by_the_conditioning() -> None:
     torch.manual_seed(0)
     spec = world_spec(ARM_DELTAS)

@@ -14,15 +14,15 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from envs.simulators.base import Simulator, noise_generator, to_bytes
+from envs.simulators.base import noise_generator, to_bytes
 from envs.simulators.compiling import begin_step
 from envs.simulators.dit.augment import augment_memory_frames, augment_memory_latents, chosen_clips
 from envs.simulators.dit.diffusion import Diffusion, Given
 from envs.simulators.dit.network import MultiViewDiT
 from envs.simulators.foreground import foreground_weight
 from envs.simulators.inputs import own_frames
-from envs.simulators.samplers import Distilled, Sampler
-from envs.simulators.stepwise import lost_jumps
+from envs.simulators.samplers import Sampler
+from envs.simulators.stepwise import Stepwise, lost_jumps
 from envs.simulators.tokenizers.autoencoder import STRIDE, Codec
 from envs.specs import WorldSpec
 
@@ -30,10 +30,8 @@ _BUSY = 1024  # width; on an H200 blocks of 192 wait for their launches, and of 
 MEMORY_NOISE = 1e-4 / (1 + 1e-4)  # the noise level at which memory stands, as released
 
 
-class LatentWorld(Simulator):
+class LatentWorld(Stepwise):
     """Diffusion-transformer video world; see the module's docstring. A subclass says how it is conditioned.
-
-    It denoises in steps (stepwise.py), so a few-step student can be made of it.
 
     Args:
         spec: what it shows; sizes must be multiples of the autoencoder's stride times the patch.
@@ -48,6 +46,7 @@ class LatentWorld(Simulator):
         ValueError: if the size does not fit.
     """
 
+    codec: Codec
     prompt: Tensor | None
 
     def __init__(
@@ -87,10 +86,6 @@ class LatentWorld(Simulator):
     def actions(self, inputs: TensorDict) -> Tensor | None:
         """Action vectors [B, M + T', action_size] of all latent frames, of a network that reads them."""
         return None
-
-    def few_steps(self, steps: int) -> Distilled:
-        """See Stepwise."""
-        raise NotImplementedError
 
     # -- latents
     def encode_stills(self, frames: Tensor) -> Tensor:

@@ -11,14 +11,14 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.ranges import Count, NonNegative, Share
-from envs.simulators.base import Simulator, noise_generator
+from envs.simulators.base import noise_generator
 from envs.simulators.dit.latent_world import unit
 from envs.simulators.forcing.network import Known
 from envs.simulators.forcing.prediction import Prediction
 from envs.simulators.forcing.schedule import DDIM, Sigmoid
 from envs.simulators.inputs import own_frames
 from envs.simulators.samplers import Distilled, Sampler
-from envs.simulators.stepwise import lost_jumps
+from envs.simulators.stepwise import Stepwise, lost_jumps
 from envs.targets import OptionsOf
 
 
@@ -65,9 +65,8 @@ class Block:
     known: list[Known]
 
 
-class Blockwise(Simulator):
-    """The part of the forcing world that makes blocks; it denoises in steps (stepwise.py). The network and
-    what it is shown are the engine's.
+class Blockwise(Stepwise):
+    """The part of the forcing world that makes blocks; the network and what it is shown are the engine's.
 
     Attributes:
         context, horizon, denoising, schedule, prediction: see ForcingSimulator.

@@ -59,6 +59,7 @@ class ForcingSimulator(Blockwise):
         ConfigError: naming an option that is unknown, missing or out of range.
     """
 
+    codec: Autoencoder
     per_frame_moves = True
     hidden = ("attn", "ff")
 

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 
 from envs.ranges import Count, Decay, NonNegative, Positive
-from envs.simulators.base import Simulator
 from envs.simulators.compiling import compile_parts
 from envs.simulators.stepwise import Stepwise
 from learners.stages.distill.method import Generated, Method, Turn, spread
@@ -44,8 +43,8 @@ class DMD2(Method):
 
     def __init__(
         self,
-        teacher: Stepwise[Any],
-        student: Stepwise[Any],
+        teacher: Stepwise,
+        student: Stepwise,
         config: FitConfig,
         critic_updates: Count,
         shift: Positive,
@@ -54,8 +53,7 @@ class DMD2(Method):
         critic_betas: tuple[Decay, Decay],
         critic_weight_decay: NonNegative,
     ):
-        copied = cast(Simulator, deepcopy(teacher))
-        critic: Any = compile_parts(copied, cast(Simulator, teacher).compiled)
+        critic: Any = compile_parts(deepcopy(teacher), teacher.compiled)
         super().__init__(teacher, student, config)
         critic.codec, self.critic = self.student.codec, critic
         self.critic_updates, self.shift, self.critic_shift = critic_updates, shift, critic_shift

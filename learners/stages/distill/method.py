@@ -51,7 +51,7 @@ class Method(nn.Module):
     teacher: Any
     student: Any
 
-    def __init__(self, teacher: Stepwise[Any], student: Stepwise[Any], config: FitConfig):
+    def __init__(self, teacher: Stepwise, student: Stepwise, config: FitConfig):
         super().__init__()
         theirs, own = teacher.codec.state_dict(), student.codec.state_dict()
         if theirs.keys() != own.keys() or any(not torch.equal(own[name], theirs[name]) for name in own):

@@ -21,7 +21,7 @@ class TrajectoryRegression(Method):
         ValueError: if the teacher jumps itself, so that it has no trajectories.
     """
 
-    def __init__(self, teacher: Stepwise[Any], student: Stepwise[Any], config: FitConfig):
+    def __init__(self, teacher: Stepwise, student: Stepwise, config: FitConfig):
         super().__init__(teacher, student, config)
         if teacher.sampler.jumps:
             raise ValueError(

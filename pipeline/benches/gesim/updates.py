@@ -65,7 +65,7 @@ def _measure(
     teacher, student = (compile_parts(world, how) for world in worlds)
     student.load_state_dict(teacher.state_dict())
     config = FitConfig(5, 1, _RATE)
-    method = DMD2(cast(Stepwise[Any], teacher), cast(Stepwise[Any], student), config, **_CRITIC)
+    method = DMD2(cast(Stepwise, teacher), cast(Stepwise, student), config, **_CRITIC)
     clip = clips(spec, 1).to(device)
     with ExitStack() as adapted:
         for learner in method.learners:

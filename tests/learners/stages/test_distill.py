@@ -41,7 +41,7 @@ PACE = {"dmd2": (900, 3e-3, 0.99), "trajectory": (200, 1e-2, 0.98)}  # steps, le
 CLIPS = SimulatorFitConfig(single_chunk_fraction=1.0, unroll=1, strides=(1,), recent_fraction=0.0, lora=0)
 
 
-class Bell(Simulator):
+class Bell(Stepwise):
     """A world of 32 normal numbers, each of mean 2 and spread 1/2. What it begins with is exact in many
     steps; in one it makes the mean, and nothing else.
     """
@@ -50,7 +50,11 @@ class Bell(Simulator):
         super().__init__(spec, 2)
         self.net = nn.Sequential(nn.Linear(2, 64), nn.SiLU(), nn.Linear(64, 1))
         nn.init.zeros_(self.net[2].weight), nn.init.zeros_(self.net[2].bias)
-        self.codec, self.sampler = nn.Identity(), sampler
+        self.codec, self._sampler = nn.Identity(), sampler
+
+    @property
+    def sampler(self) -> Sampler:
+        return self._sampler
 
     def few_steps(self, steps: int) -> Distilled:
         return Distilled(tuple(shifted_levels(steps, 1.0)[:-1]))
