@@ -12,7 +12,7 @@ from actors.factory import build_physics, build_policy
 from actors.rollouts.evaluate import evaluate
 from envs.rng import Purpose, episode_seeds
 from envs.targets import ConfigError
-from pipeline.evaluation.by_task import by_task, held_out_first, tasks_of_episodes, tasks_of_seeds, variant_of
+from pipeline.evaluation.by_task import by_task, tasks_of_episodes, tasks_of_seeds, unseen_first, variant_of
 from pipeline.evaluation.statistics import rate_entry, rate_line
 from pipeline.graph.graph import Graph
 from pipeline.loop import build_loop
@@ -71,6 +71,6 @@ def _physics(cfg: Cfg, changes: Cfg) -> tuple[Any, list[int], list[str]]:
 def _imagined(cfg: Cfg, graph: Graph) -> tuple[Any, list[int], list[str]]:
     inputs = graph.inputs("evaluate-imagined")
     store = open_store(cfg, inputs)
-    starts = held_out_first(cfg, store, cfg["evaluate"]["imagined"])
+    starts = unseen_first(cfg, store, store.select(), cfg["evaluate"]["imagined"])
     world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(starts)), starts)
     return world, list(range(len(starts))), tasks_of_episodes(cfg, store, starts)

@@ -89,13 +89,15 @@ def evenly(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor, count: in
     return episodes[first.sort().values]
 
 
-def held_out_first(cfg: Mapping[str, Any], store: ClipStore, count: int) -> Tensor:
-    """`count` of a store's episodes int64 [N], shared out over tasks: those that are held out, and others
-    only where these are too few.
+def unseen_first(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor, count: int) -> Tensor:
+    """`count` of a store's `episodes` int64 [N], of each split shared out over tasks: those that are held
+    out, then those that judges alone have not seen, and only then those that everything has learned from.
     """
-    held, every = store.split("held_out"), torch.arange(len(store))
-    chosen = evenly(cfg, store, held, count)
-    return torch.cat((chosen, evenly(cfg, store, every[~torch.isin(every, held)], count - len(chosen))))
+    chosen = episodes[:0]
+    for split in ("held_out", "calibration", "train"):
+        mine = episodes[torch.isin(episodes, store.split(split))]
+        chosen = torch.cat((chosen, evenly(cfg, store, mine, count - len(chosen))))
+    return chosen
 
 
 def by_task(tasks: Sequence[str], summarise: Callable[..., T], *values: Tensor) -> dict[str, T]:

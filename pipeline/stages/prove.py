@@ -14,7 +14,6 @@ from torch import Tensor
 from actors.factory import build_judge, build_physics, build_policy, build_simulator, build_state_decoder
 from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
-from envs.episodes.clips import ClipStore
 from envs.episodes.filming import side_by_side, write_film
 from envs.files import write_atomically, write_text
 from envs.rng import Purpose, episode_seeds
@@ -23,11 +22,10 @@ from pipeline.evaluation import measurement
 from pipeline.evaluation.by_task import (
     by_scene,
     by_task,
-    evenly,
-    held_out_first,
     scenes_of_episodes,
     tasks_of_episodes,
     tasks_of_seeds,
+    unseen_first,
 )
 from pipeline.evaluation.disagreement import compared
 from pipeline.evaluation.judging import episode_success, judge_both, judge_frames, judge_table
@@ -74,17 +72,6 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         write_film(folder / "media/held-out.mp4", paired_frames(store, held, made, 0), store.fps, rest=REST)
         result["replayed"] = judge_table(judge, scores, made.valid, store, held)
     return {**result, "judged_by": judge.facts(), "alarms": too_kind(result)}
-
-
-def unseen_first(cfg: Cfg, store: ClipStore, episodes: Tensor, count: int) -> Tensor:
-    """`count` of a store's `episodes` int64 [N], of each split shared out over tasks: those that are held
-    out, then those that judges alone have not seen, and only then those that everything has learned from.
-    """
-    chosen = episodes[:0]
-    for split in ("held_out", "calibration", "train"):
-        mine = episodes[torch.isin(episodes, store.split(split))]
-        chosen = torch.cat((chosen, evenly(cfg, store, mine, count - len(chosen))))
-    return chosen
 
 
 def too_kind(result: Mapping[str, Any]) -> list[str]:
@@ -157,7 +144,7 @@ def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     prepare_process(cfg["seed"], cfg["threads"])
     store = open_store(cfg, inputs)
-    starts = held_out_first(cfg, store, cfg["evaluate"]["imagined"])
+    starts = unseen_first(cfg, store, store.select(), cfg["evaluate"]["imagined"])
     world = load_world(cfg, inputs, store, min(_SIDE_BY_SIDE, len(starts)), starts)
     tasks, scenes = (of(cfg, store, starts) for of in (tasks_of_episodes, scenes_of_episodes))
     won, known = {}, torch.ones(len(starts), dtype=torch.bool)

@@ -9,8 +9,9 @@ import torch
 
 from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
+from pipeline.evaluation.by_task import unseen_first
 from pipeline.evaluation.statistics import rate_entry
-from pipeline.stages.prove import _gap, too_kind, unseen_first
+from pipeline.stages.prove import _gap, too_kind
 from tests.embodiments import ARM_DELTAS
 
 
