@@ -45,6 +45,9 @@ def test_key_points_lie_as_finely_in_large_pictures(side: int) -> None:
     assert found.shape[-2:] == (side // 2, side // 2)
     moved = (encoder.gaze(dot)[1] - found).abs().amax((0, 1, 2))
     assert moved[-2, -2] > 0
+    torch.manual_seed(0)
+    blocks = encoder.gaze(torch.randn(1, spec.views, 3, side, side))[1].unfold(-2, 2, 2).unfold(-2, 2, 2)
+    assert float(blocks.std((-2, -1)).min()) > 1e-4  # more than coarse maps that are shown larger
 
 
 def test_some_key_points_are_queried_by_the_conditioning() -> None:
