@@ -189,9 +189,16 @@ class Embodiment:
 
     # -- what it allows
     @property
+    def calibrated_views(self) -> tuple[int, ...]:
+        """Positions of the cameras that are calibrated."""
+        return tuple(k for k, camera in enumerate(self.cameras) if camera.calibrated)
+
+    @property
     def calibrated(self) -> bool:
-        """Whether every camera is calibrated: ray maps can be made."""
-        return all(camera.calibrated for camera in self.cameras)
+        """Whether some camera is calibrated: there are camera poses, and ray maps can be made; both are zeros
+        of the other cameras.
+        """
+        return bool(self.calibrated_views)
 
     @property
     def commands_poses(self) -> bool:

@@ -36,8 +36,8 @@ INSTRUCTION_UTF8 = ("observation", "instruction_utf8")
 COMMAND = ("observation", "command")
 # bool [B, 1]: the policy said NaN; nobody may learn from the episode
 INVALID_ACTION = ("policy", "invalid_action")
-INTRINSIC = ("camera", "intrinsic")  # float32 [B, V, 3, 3] pixels; only of calibrated robots
-C2W = ("camera", "c2w")  # float32 [B, V, 4, 4] camera to world, OpenCV convention; only of calibrated robots
+INTRINSIC = ("camera", "intrinsic")  # float32 [B, V, 3, 3] pixels; zeros where a camera is not calibrated
+C2W = ("camera", "c2w")  # float32 [B, V, 4, 4] camera to world, OpenCV convention; zeros alike
 EPISODE = "episode_seed"  # int64 [B, 1]: episodes with equal seeds start from the same frame
 SUCCESS = "success"  # bool [B, 1]
 PROGRESS = "progress"  # float32 [B, 1] in 0..1
@@ -80,9 +80,10 @@ class WorldSpec:
         embodiment: the robot.
         size: (height, width) of every view in pixels, to which pictures are brought on reading.
         chunk: actions, and so frames, per step, K.
-        pose_map: whether commanded grippers are drawn into each view; needs calibrated cameras and known
-            flange poses.
-        ray_map: whether networks are told where each pixel looks; needs calibrated cameras.
+        pose_map: whether commanded grippers are drawn into each calibrated view, of which there must be one;
+            needs known flange poses. The maps of other views stay bare.
+        ray_map: whether networks are told where each pixel of calibrated views looks, of which there must be
+            one; the maps of other views are zeros.
 
     Raises:
         ValueError: if the embodiment does not allow the conditioning.
@@ -97,10 +98,9 @@ class WorldSpec:
     def __post_init__(self) -> None:
         robot = self.embodiment
         if (self.pose_map or self.ray_map) and not robot.calibrated:
-            bare = [camera.name for camera in robot.cameras if not camera.calibrated]
             raise ValueError(
-                f"simulator.pose_map and simulator.ray_map need calibrated cameras, and {bare} of"
-                f" {robot.robot} are not; set both to false"
+                f"simulator.pose_map and simulator.ray_map need a calibrated camera, and none of"
+                f" {list(robot.views)} of {robot.robot} is; set both to false"
             )
         # Joint commands without kinematics pass: recordings and clients may bring the poses along.
         if self.pose_map and not robot.commands_poses and robot.action_kind is not ActionKind.JOINTS:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -12,7 +14,7 @@ from envs.specs import C2W, COMMAND, IMAGE, INSTRUCTION_UTF8, INTRINSIC, STATE, 
 POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 INSTRUCTIONS = ("push the red block to the green one", "open the drawer", "lift the cube")
 
-# 14-D flange poses and grippers of two arms; every camera is calibrated, so pose and ray maps can be drawn.
+# 14-D flange poses and grippers of two arms. Pose and ray maps can be drawn of two of three cameras.
 BIMANUAL_POSES = Embodiment(
     robot="two_arms_poses",
     action_names=tuple(f"{arm}_{name}" for arm in ("left", "right") for name in (*POSE, "gripper")),
@@ -23,7 +25,7 @@ BIMANUAL_POSES = Embodiment(
     cameras=(
         Camera("top", (32, 48), calibrated=True),
         Camera("left_wrist", (32, 48), wrist="left", calibrated=True),
-        Camera("right_wrist", (32, 48), wrist="right", calibrated=True),
+        Camera("right_wrist", (32, 48), wrist="right"),
     ),
     fps=10.0,
 )
@@ -86,7 +88,7 @@ def intrinsics(spec: WorldSpec, *batch: int) -> Tensor:
     """Pinhole intrinsics float32 [*batch, V, 3, 3] in pixels, with a field of view of about 53 degrees."""
     height, width = spec.size
     one = torch.tensor([[float(width), 0.0, width / 2], [0.0, float(width), height / 2], [0.0, 0.0, 1.0]])
-    return one.expand(*batch, spec.views, 3, 3).clone()
+    return one.expand(*batch, spec.views, 3, 3) * _calibrated(spec)
 
 
 def camera_poses(spec: WorldSpec, *batch: int) -> Tensor:
@@ -95,7 +97,20 @@ def camera_poses(spec: WorldSpec, *batch: int) -> Tensor:
     poses[..., 1, 1] = poses[..., 2, 2] = -1.0
     poses[..., 2, 3] = 1.0
     poses[..., 0, 3] = 0.1 * torch.arange(spec.views, dtype=torch.float32)
-    return poses
+    return poses * _calibrated(spec)
+
+
+def recorded_cameras(spec: WorldSpec, *batch: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """`intrinsics` [V, 3, 3] and `camera_poses` [*batch, V, 4, 4] as an Episode or a suite has them: NaN of
+    cameras that are not calibrated.
+    """
+    unknown = torch.where(_calibrated(spec) > 0, 0.0, torch.nan)
+    return (intrinsics(spec) + unknown).numpy(), (camera_poses(spec, *batch) + unknown).numpy()
+
+
+def _calibrated(spec: WorldSpec) -> Tensor:
+    """1 of calibrated cameras, 0 of others, [V, 1, 1]."""
+    return torch.tensor([float(camera.calibrated) for camera in spec.embodiment.cameras])[:, None, None]
 
 
 def observations(spec: WorldSpec, batch: int, seed: int = 0) -> TensorDict:

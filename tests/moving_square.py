@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from envs.embodiment import Embodiment
 from envs.episodes import Episode
-from tests.embodiments import camera_poses, intrinsics, world_spec
+from tests.embodiments import recorded_cameras, world_spec
 
 SIZE = (32, 32)
 SQUARE = 8  # pixels
@@ -36,7 +36,7 @@ def moving_square(
     states = np.zeros((length, robot.state_dim), np.float32)
     states[:, :2] = place
     spec = world_spec(robot, SIZE)
-    known = robot.calibrated
+    intrinsic, c2w = recorded_cameras(spec, length) if robot.calibrated else (None, None)
     return Episode(
         frames=np.stack([picture(at, spec.views) for at in place]),
         commands=commands,
@@ -46,8 +46,8 @@ def moving_square(
         source=source,
         seed=seed,
         success=(place > CORNER).all(1) if labelled else None,
-        intrinsic=intrinsics(spec).numpy() if known else None,
-        c2w=camera_poses(spec, length).numpy() if known else None,
+        intrinsic=intrinsic,
+        c2w=c2w,
         privileged={"object_pose": place.astype(np.float32)},
     )
 

@@ -112,8 +112,8 @@ def start_of(
     }
     if spec.embodiment.calibrated:
         assert observed.intrinsic is not None and observed.c2w is not None
-        first["intrinsic"] = torch.from_numpy(observed.intrinsic).float()
-        first["c2w"] = torch.from_numpy(observed.c2w).float()
+        first["intrinsic"] = torch.from_numpy(observed.intrinsic).float().nan_to_num()
+        first["c2w"] = torch.from_numpy(observed.c2w).float().nan_to_num()
     if spec.pose_map:
         poses = end_effector_poses(spec.embodiment, command[None], kinematics)
         maps = render_pose_map(poses, first["c2w"].unsqueeze(1), first["intrinsic"], spec.size, style)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from actors.serving.access import errors, json_answer, writes
 from actors.serving.page import LivePage
-from actors.serving.session import Session
+from actors.serving.session import Session, of_calibrated
 from actors.serving.sessions import ServeConfig, SessionHost
 from envs.episodes.pictures import resize_frames
 from envs.simulators.remote.protocol import (
@@ -127,15 +127,17 @@ class Server:
     async def set_camera_params(self, request: web.Request) -> web.Response:
         """Intrinsics in pixels of the client's pictures, and cameras at the start if they are known."""
         body = parse(await self._body(request))
-        session, views = self._session(request, body), self.host.spec.views
+        session, robot = self._session(request, body), self.host.robot
+        views = len(robot.cameras)
         if "intrinsic" not in body:
             raise ProtocolError("intrinsic is missing")
         intrinsic = numbers(body["intrinsic"], (views, 3, 3), "intrinsic")
-        if np.abs(np.linalg.det(intrinsic)).min() < 1e-6:
+        known = list(robot.calibrated_views)
+        if known and np.abs(np.linalg.det(intrinsic[known])).min() < 1e-6:
             raise ProtocolError("intrinsic must be invertible")
-        extrinsic = (
-            None if body.get("extrinsic") is None else numbers(body["extrinsic"], (views, 4, 4), "extrinsic")
-        )
+        intrinsic, extrinsic = of_calibrated(intrinsic, robot), None
+        if body.get("extrinsic") is not None:
+            extrinsic = of_calibrated(numbers(body["extrinsic"], (views, 4, 4), "extrinsic"), robot)
         async with session.lock:
             session.intrinsic, session.extrinsic = intrinsic, extrinsic
         return json_answer(200, {"success": True})
@@ -181,7 +183,7 @@ class Server:
         session = self._session(request, meta)
         _, views, count, height, width = shape_in(meta, "traj_shape", f"3,{self.host.spec.views},T,H,W")
         shape_in(meta, "c2w_shape", f"{views},{count},4,4")
-        c2w = floats(poses, (views, count, 4, 4), "c2w").transpose(1, 0, 2, 3)
+        c2w = of_calibrated(floats(poses, (views, count, 4, 4), "c2w"), self.host.robot).transpose(1, 0, 2, 3)
 
         def read() -> NDArray[np.uint8]:
             blocks = unpack(pictures)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.embodiment import ActionKind
+from envs.embodiment import ActionKind, Embodiment
 from envs.episodes.pictures import resize_intrinsics
 from envs.specs import WorldSpec
 
@@ -71,6 +71,12 @@ class Session:
 def needs_cameras(spec: WorldSpec) -> bool:
     """Whether a world is conditioned on cameras, so that a client must send them."""
     return spec.pose_map or spec.ray_map
+
+
+def of_calibrated(cameras: NDArray[np.float32], robot: Embodiment) -> NDArray[np.float32]:
+    """Matrices [V, ...] of a client's cameras, zeros of those that this world takes to be uncalibrated."""
+    known = np.array([camera.calibrated for camera in robot.cameras])
+    return cameras * known.reshape(-1, *[1] * (cameras.ndim - 1)).astype(np.float32)
 
 
 def next_chunk(session: Session, commands: Tensor, spec: WorldSpec) -> TensorDict:

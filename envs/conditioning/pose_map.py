@@ -68,7 +68,8 @@ def render_pose_map(
     Args:
         poses: [..., T, arms, 7] flange poses [x, y, z, roll, pitch, yaw, gripper], metres and radians, world
             frame; gripper 0 open .. 1 closed, values beyond take the colour map's ends.
-        c2w: [..., V, T, 4, 4] camera to world, OpenCV convention.
+        c2w: [..., V, T, 4, 4] camera to world, OpenCV convention; zeros of a camera that is not calibrated,
+            into which nothing is drawn.
         intrinsic: [..., V, 3, 3] in pixels of `size`.
         size: (height, width) in pixels.
         style: how to draw.
@@ -157,8 +158,10 @@ def layout(
     origin = wrist[..., :3, 3] + style.tool_offset * wrist[..., :3, 2]
     tips = origin.unsqueeze(-2) + _AXIS * wrist[..., :3, :3].transpose(-1, -2)  # rows are the axes
     points = torch.cat((origin.unsqueeze(-2), tips), -2).unsqueeze(-5)  # [..., 1, T, arms, 4, 3]
+    known = c2w[..., 3, 3] != 0  # [..., V, T]
+    regular = torch.where(known[..., None, None], c2w.double(), torch.eye(4, dtype=torch.float64))
     # NumPy's float64 inverse and matrix products set the last bit, and truncation to int makes it visible.
-    w2c = torch.linalg.inv(c2w.double()).unsqueeze(-3)  # [..., V, T, 1, 4, 4]
+    w2c = torch.linalg.inv(regular).unsqueeze(-3)  # [..., V, T, 1, 4, 4]
     camera = points @ w2c[..., :3, :3].transpose(-1, -2) + w2c[..., None, :3, 3]
     image = camera @ intrinsic.double()[..., :, None, None, :, :].transpose(-1, -2)
     depth = camera[..., 2]
@@ -166,7 +169,8 @@ def layout(
         (image[..., :2] / image[..., 2:]).nan_to_num(nan=-1e6, posinf=-1e6, neginf=-1e6).clamp(-30000, 30000)
     )
     at = pixels[..., 0, :].trunc()
-    visible = (at[..., 0] >= 0) & (at[..., 0] < width) & (at[..., 1] >= 0) & (at[..., 1] < height)
+    inside = (at[..., 0] >= 0) & (at[..., 0] < width) & (at[..., 1] >= 0) & (at[..., 1] < height)
+    visible = known[..., None] & inside
     if style.cull_behind:
         visible &= depth[..., 0] > 0
     distance = (c2w.double()[..., None, :3, 3] - wrist[..., :3, 3].unsqueeze(-4)).norm(dim=-1)

@@ -10,8 +10,8 @@ def render_ray_map(intrinsic: Tensor, c2w: Tensor, size: tuple[int, int], stride
     """Origin (metres, world) and unit direction of every pixel's ray.
 
     Args:
-        intrinsic: [..., V, 3, 3] in pixels of `size`.
-        c2w: [..., V, T, 4, 4] camera to world, OpenCV convention.
+        intrinsic: [..., V, 3, 3] in pixels of `size`; zeros of a camera that is not calibrated.
+        c2w: [..., V, T, 4, 4] camera to world, OpenCV convention; zeros alike, of which all rays are zeros.
         size: (height, width) in pixels.
         stride: keep every stride-th pixel in both directions.
 
@@ -26,8 +26,10 @@ def render_ray_map(intrinsic: Tensor, c2w: Tensor, size: tuple[int, int], stride
         indexing="ij",
     )
     pixels = torch.stack((u, v, torch.ones_like(u)))  # [3, h, w]
+    known = intrinsic[..., 2:, 2:] != 0
+    regular = torch.where(known, intrinsic.float(), torch.eye(3, device=intrinsic.device))
     # [..., V, 3, h, w]
-    local = torch.einsum("...ij,jhw->...ihw", torch.linalg.inv(intrinsic.float()), pixels)
+    local = torch.einsum("...ij,jhw->...ihw", torch.linalg.inv(regular), pixels)
     local = local / local.norm(dim=-3, keepdim=True)
     direction = torch.einsum("...vtij,...vjhw->...vtihw", c2w[..., :3, :3].float(), local)
     origin = c2w[..., :3, 3, None, None].float().expand_as(direction)

@@ -36,7 +36,7 @@ from envs.manifest import check_part
 from envs.specs import WorldSpec
 
 log = logging.getLogger(__name__)
-_FORM = "6"  # changes when what a cache holds does
+_FORM = "7"  # changes when what a cache holds does
 
 
 @dataclass
@@ -182,12 +182,15 @@ class _Builder:
                 " are calibrated; it is read without",
                 *(folder, lost),
             )
+        self.known = np.array([camera.calibrated for camera in spec.embodiment.cameras])
         robot = spec.embodiment.kinematics
         self.kinematics = Kinematics(robot) if robot is not None and spec.embodiment.calibrated else None
-        if spec.embodiment.calibrated and not self.data.embodiment.calibrated:
+        here, said = self.data.embodiment, spec.embodiment
+        if missing := set(said.calibrated_views) - set(here.calibrated_views):
             raise EpisodeError(
-                f"{folder} has no calibration of every camera, but {spec.embodiment.robot} is said to be"
-                " calibrated; set calibrated=false in the embodiment, or record calibration.c2w"
+                f"{folder} has no calibration of {[said.views[view] for view in sorted(missing)]}, but"
+                f" {said.robot} is said to have; set calibrated=false of these cameras in the embodiment, or"
+                " record calibration.c2w"
             )
 
     def build(self, place: Path, stamp: str) -> None:
@@ -218,7 +221,7 @@ class _Builder:
                 }
             )
             if self.spec.embodiment.calibrated and episode.intrinsic is not None:
-                intrinsics.append(episode.intrinsic.tolist())
+                intrinsics.append(np.where(self.known[:, None, None], episode.intrinsic, 0).tolist())
             row = rows.stop
         frames.flush()
         if maps is not None:
@@ -258,10 +261,12 @@ class _Builder:
 
     def _cameras(self, episode: Episode) -> Tensor:
         """Camera poses [T, V, 4, 4] as in imagination, where nobody can measure them: wrist cameras where the
-        commands lead them; all where they were at first if commands do not say it.
+        commands lead them; all where they were at first if commands do not say it. Zeros of cameras that are
+        not calibrated.
         """
         assert episode.c2w is not None
-        c2w, poses = torch.from_numpy(episode.c2w), self._poses(episode)
+        known = torch.from_numpy(self.known)[:, None, None]
+        c2w, poses = torch.from_numpy(episode.c2w).where(known, 0.0), self._poses(episode)
         if poses is None:
             return c2w[:1].expand_as(c2w)
         return follow_wrists(c2w[0], poses[0], poses, self.spec.embodiment.wrists)

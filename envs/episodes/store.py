@@ -35,8 +35,9 @@ class EpisodeStore:
     Attributes:
         length, start: int64 [E], of each episode.
         arrays: commands float32 [N, A], states float32 [N, S], present bool [N], labelled bool [E]; success
-            bool [N] if any episode is labelled; c2w float32 [N, V, 4, 4] if the robot is calibrated.
-        intrinsic: float32 [E, V, 3, 3] in pixels; only of calibrated robots.
+            bool [N] if any episode is labelled; c2w float32 [N, V, 4, 4] if the robot is calibrated, zeros of
+            cameras that are not.
+        intrinsic: float32 [E, V, 3, 3] in pixels, zeros alike; only of calibrated robots.
         instructions, text: one per episode, and as uint8 [E, TEXT_BYTES].
         episodes: per episode its length, instruction, source, seed, success (None if nobody labelled it) and
             the number of its data set.

@@ -16,7 +16,7 @@ def follow_wrists(c2w: Tensor, start: Tensor, poses: Tensor, wrists: tuple[int |
     stay.
 
     Args:
-        c2w: [..., V, 4, 4] camera poses at the start; NaN of uncalibrated cameras stays NaN.
+        c2w: [..., V, 4, 4] camera poses at the start; zeros of uncalibrated cameras stay zeros.
         start: [..., arms, 7] flange poses at the start.
         poses: [..., T, arms, 7] flange poses to come.
         wrists: per camera the arm it is mounted on, None where it stands still (Embodiment.wrists).

@@ -148,8 +148,8 @@ class PhysicsEnv(ChunkedEnv):
         out[STATE] = stack("state").float()
         out[COMMAND] = stack("command").float()
         if self.spec.embodiment.calibrated:
-            out[INTRINSIC] = stack("intrinsic").float()
-            out[C2W] = stack("c2w").float()
+            out[INTRINSIC] = stack("intrinsic").float().nan_to_num()
+            out[C2W] = stack("c2w").float().nan_to_num()
         out[LOST] = self._lost.clone()
         out[SUCCESS] = stack("success").unsqueeze(-1) & ~self._lost
         out[PROGRESS] = stack("progress").float().unsqueeze(-1)

@@ -38,8 +38,8 @@ class Observation:
         instruction: the task in words.
         success: whether the task's condition has held for `hold` seconds; once true it stays true.
         progress: true progress in 0..1, the rule reward of physics; learned parts never see it.
-        intrinsic: float [V, 3, 3] in pixels, None if no camera is calibrated.
-        c2w: float [V, 4, 4] camera to world, OpenCV convention, None if no camera is calibrated.
+        intrinsic: float [V, 3, 3] in pixels, NaN of a camera that is not calibrated; None if none is.
+        c2w: float [V, 4, 4] camera to world, OpenCV convention; NaN and None alike.
         poses: float [arms, 7], commanded flange poses [x, y, z, roll, pitch, yaw, gripper] in metres and
             radians, where the suite knows them and the action does not say them.
     """

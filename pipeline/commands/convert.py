@@ -157,10 +157,6 @@ def _pose_maps(episode: Episode, style: PoseMapStyle) -> NDArray[np.uint8]:
         poses = end_effector_poses(robot, torch.from_numpy(episode.commands), kinematics)
     else:
         poses = torch.from_numpy(episode.poses)
-    known = [k for k, camera in enumerate(episode.embodiment.cameras) if camera.calibrated]
-    maps = np.full_like(episode.frames, CANVAS)
-    c2w = torch.from_numpy(episode.c2w[:, known]).transpose(0, 1)
-    intrinsic = torch.from_numpy(episode.intrinsic[known])
-    drawn = render_pose_map(poses, c2w, intrinsic, episode.size, style)
-    maps[:, known] = drawn.transpose(0, 1).numpy()
-    return maps
+    c2w = torch.from_numpy(episode.c2w).nan_to_num().transpose(0, 1)
+    intrinsic = torch.from_numpy(episode.intrinsic).nan_to_num()
+    return render_pose_map(poses, c2w, intrinsic, episode.size, style).transpose(0, 1).numpy()

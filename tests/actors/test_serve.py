@@ -91,7 +91,8 @@ def test_pictures_of_another_size_are_resized_and_their_intrinsics_with_them(ser
     (session,) = server.host.sessions.values()
     assert session.state is not None
     expected = torch.tensor([[20.0, 0, 16], [0, 30, 16], [0, 0, 1]])
-    assert torch.allclose(session.state["intrinsic"][0], expected.expand(3, 3, 3))
+    assert torch.allclose(session.state["intrinsic"][0, :2], expected.expand(2, 3, 3))
+    assert not session.state["intrinsic"][0, 2].any()  # that camera is not calibrated
 
 
 def test_joints_go_through_the_kinematics(server: Running, joints: JointCommands) -> None:
@@ -348,6 +349,22 @@ def test_a_failing_model_is_a_500_and_the_session_goes_on(
     assert failed.status_code == 500 and "ZeroDivisionError" in failed.json()["error"]
     monkeypatch.setattr(server.host.simulator, "step", step)
     assert client.step(POSES)[0].shape[0] == 4
+
+
+def test_what_a_client_says_of_a_camera_that_is_not_calibrated_changes_nothing(server: Running) -> None:
+    plain, other = Stranger(server.url, seed=4), Stranger(server.url, seed=4)
+    made = []
+    for client in (plain, other):
+        client.prepare()
+        if client is other:  # the third camera; the first two as `prepare` says them
+            k = [[[60.0, 0, 16], [0, 60, 16], [0, 0, 1]]] * 2 + [np.zeros((3, 3)).tolist()]
+            assert client.post("/set_camera_params", intrinsic=k).status_code == 200
+            c2w = np.tile(np.eye(4, dtype=np.float32), (3, 4, 1, 1))
+            c2w[2, :, :3, 3] = 0.7
+            bare = np.full((3, 3, 4, 32, 32), 50 / 255, np.float32)
+            assert client.send("/set_episode_traj", client.trajectory(bare, c2w)).status_code == 200
+        made.append(client.step(POSES)[0])
+    assert np.array_equal(*made)
 
 
 def test_six_hundred_mutated_bodies(server: Running) -> None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from envs.embodiment import Embodiment, EmbodimentError
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.formats import lerobot_columns as names
-from envs.episodes.formats.lerobot_columns import PRIVILEGED, calibrated
+from envs.episodes.formats.lerobot_columns import PRIVILEGED
 from envs.episodes.formats.lerobot_files import (
     column_array,
     open_parquet,
@@ -241,7 +241,7 @@ class LeRobotDataset:
         if reward is not None:
             known["reward"] = np.concatenate([[0.0], reward[:-1, 0]]).astype(np.float32)
             known["reward"][-1] += reward[-1, 0]
-        cameras = calibrated(robot)
+        cameras = list(robot.calibrated_views)
         if cameras and c2w is not None and intrinsic is not None:
             views = len(robot.cameras)
             known["c2w"] = np.full((length, views, 4, 4), np.nan, np.float32)

@@ -14,7 +14,6 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from envs.embodiment import Embodiment
 from envs.episodes.episode import Episode
 from envs.episodes.formats.lerobot_info import IMAGE_PREFIX, INFO_KEY, to_info
 
@@ -33,7 +32,7 @@ _POSE = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
 
 def columns_of(episode: Episode) -> dict[str, NDArray[Any]]:
     """The columns of an episode's rows, [T] or [T, n]; without pictures and without indices."""
-    length, cameras = len(episode), calibrated(episode.embodiment)
+    length, cameras = len(episode), list(episode.embodiment.calibrated_views)
     columns: dict[str, NDArray[Any]] = {
         # LeRobot's action is the one taken at a frame; the last row repeats, for nothing follows it.
         "action": np.concatenate([episode.commands[1:], episode.commands[-1:]]),
@@ -98,9 +97,9 @@ def features_of(episode: Episode) -> dict[str, dict[str, Any]]:
         "action": list(robot.action_names),
         "observation.state": list(robot.state_names),
         COMMAND: list(robot.action_names),
-        C2W: [f"{robot.views[k]}.{r}{c}" for k in calibrated(robot) for r in range(4) for c in range(4)],
+        C2W: [f"{robot.views[k]}.{r}{c}" for k in robot.calibrated_views for r in range(4) for c in range(4)],
         INTRINSIC: [
-            f"{robot.views[k]}.{r}{c}" for k in calibrated(robot) for r in range(3) for c in range(3)
+            f"{robot.views[k]}.{r}{c}" for k in robot.calibrated_views for r in range(3) for c in range(3)
         ],
         POSES: [f"{arm.name}.{axis}" for arm in robot.arms for axis in _POSE],
     }
@@ -115,11 +114,6 @@ def features_of(episode: Episode) -> dict[str, dict[str, Any]]:
     for name in INDICES:
         features[name] = {"dtype": "int64", "shape": [1], "names": None}
     return features
-
-
-def calibrated(robot: Embodiment) -> list[int]:
-    """Positions of the calibrated cameras."""
-    return [k for k, camera in enumerate(robot.cameras) if camera.calibrated]
 
 
 def _video_feature(size: tuple[int, int], fps: float) -> dict[str, Any]:

@@ -9,7 +9,6 @@ import numpy as np
 
 from envs.embodiment import Embodiment, EmbodimentError
 from envs.episodes.formats import lerobot_columns as names
-from envs.episodes.formats.lerobot_columns import calibrated
 from envs.episodes.formats.lerobot_info import INFO_KEY, from_info
 
 
@@ -70,12 +69,12 @@ def _known_cameras(robot: Embodiment, features: dict[str, Any]) -> Embodiment:
         cameras = tuple(replace(camera, calibrated=False) for camera in robot.cameras)
         return replace(robot, cameras=cameras)
     count = int(np.prod(features[names.C2W]["shape"])) // 16
-    if count == len(calibrated(robot)):
+    if count == len(robot.calibrated_views):
         return robot
     if count == len(robot.cameras):
         cameras = tuple(replace(camera, calibrated=True) for camera in robot.cameras)
         return replace(robot, cameras=cameras)
     raise EmbodimentError(
-        f"{names.C2W} holds poses of {count} cameras, but {len(calibrated(robot))} of {list(robot.views)} are"
-        " calibrated; correct features.action.info.worldloop, or remove the column"
+        f"{names.C2W} holds poses of {count} cameras, but {len(robot.calibrated_views)} of"
+        f" {list(robot.views)} are calibrated; correct features.action.info.worldloop, or remove the column"
     )

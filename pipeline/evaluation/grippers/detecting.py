@@ -58,13 +58,14 @@ class Sights:
             EmbodimentError: if none can.
         """
         robot = store.spec.embodiment
-        if not robot.calibrated:
+        known = tuple(view for view in views if view in robot.calibrated_views)
+        if not known:
             raise EmbodimentError(
-                f"the cameras of {robot.robot} are not all calibrated, so end effectors cannot be projected"
-                " into pictures; record calibration.c2w and calibration.intrinsic (task.suite.calibrated=true"
-                " where a suite can tell them)"
+                f"none of the cameras {[robot.views[view] for view in views]} of {robot.robot} is calibrated,"
+                " so end effectors cannot be projected into pictures; record calibration.c2w and"
+                " calibration.intrinsic (task.suite.calibrated=true where a suite can tell them)"
             )
-        return cls(store, ends, fixed_views(store, views))
+        return cls(store, ends, fixed_views(store, known))
 
     def pixels(self, rows: Tensor, episodes: Tensor) -> Tensor:
         """Where end effectors are, float32 [N, V, arms, 2], in rows int64 [N] of `episodes` [N]; NaN where

@@ -118,6 +118,8 @@ def gripper_ruler(cfg: Mapping[str, Any], store: ClipStore, data: Sequence[Path]
         if not path.is_file():
             raise ConfigError(f"ewmbench.detector.weights={path} is not there")
         detector = build_detector(section, len(fixed), len(arm_names(robot)))
+        if sights is not None and sights.views != fixed:
+            sights = None  # it looks through cameras of which nobody knows where they are
         return GripperRuler(load(detector, path).to(device_of(cfg)).eval(), fixed, sights, path)
     assert sights is not None
     about = {

@@ -44,7 +44,8 @@ def object_offsets(store: ClipStore, episodes: Tensor, made: Replay, truth: Tens
         without calibration, without the column, or where it has no row of positions per object.
     """
     view = store.spec.embodiment.main_view
-    if not store.spec.embodiment.calibrated or store.spec.embodiment.cameras[view].wrist is not None:
+    camera = store.spec.embodiment.cameras[view]
+    if not camera.calibrated or camera.wrist is not None:
         return {}
     poses = read_privileged(store, POSES)
     if poses is None or poses.ndim != 3 or poses.shape[-1] < 3:

@@ -32,8 +32,7 @@ from tests.embodiments import (
     ARM_DELTAS,
     BIMANUAL_JOINTS,
     BIMANUAL_POSES,
-    camera_poses,
-    intrinsics,
+    recorded_cameras,
     world_spec,
 )
 from tests.envs.simulators.test_engines import build_engine
@@ -44,15 +43,13 @@ ACTIONS = np.array([[0.5, 0.0], [0.5, 0.0], [0.0, -1.0]])
 
 def beginning(robot: Embodiment, spec: WorldSpec) -> InitialStates:
     """A start of imagination as a suite of the robot would show it."""
-    calibrated = robot.calibrated
     seen = Observation(
         np.zeros(robot.state_dim),
         np.full(robot.action_dim, 0.1) * (not robot.delta),
         "do it",
         False,
         0.0,
-        intrinsics(spec).numpy() if calibrated else None,
-        camera_poses(spec).numpy() if calibrated else None,
+        *(recorded_cameras(spec) if robot.calibrated else ()),
     )
     pictures = np.full((spec.views, 3, *spec.size), 90, np.uint8)
     return start_of(spec, seen, pictures, PoseMapStyle(), None)

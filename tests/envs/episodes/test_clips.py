@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from envs.conditioning import PoseMapStyle, end_effector_poses, render_pose_map
+from envs.conditioning import CANVAS, PoseMapStyle, end_effector_poses, render_pose_map
 from envs.embodiment import Embodiment
 from envs.episodes import Episode, EpisodeError, LeRobotDataset, LeRobotWriter
 from envs.episodes.angles import check_radians
@@ -116,16 +116,28 @@ def test_selecting_by_source_and_outcome(store: ClipStore) -> None:
 
 
 def test_pose_maps_are_those_of_the_commands(store: ClipStore, episodes: list[Episode]) -> None:
-    """Wrist cameras stand where the commands lead them, as they will in imagination."""
+    """Wrist cameras stand where the commands lead them, as they will in imagination; of the third camera
+    nobody knows where it is.
+    """
     episode, rows = episodes[4], store.rows(torch.tensor([4]))
     assert episode.c2w is not None and episode.intrinsic is not None
     poses = end_effector_poses(BIMANUAL_POSES, torch.from_numpy(episode.commands))
     c2w = follow_wrists(torch.from_numpy(episode.c2w[0]), poses[0], poses, BIMANUAL_POSES.wrists)
-    assert torch.equal(store.arrays["c2w"][rows], c2w)
+    assert torch.equal(store.arrays["c2w"][rows][:, :2], c2w[:, :2]) and c2w[:, 2].isnan().all()
     assert not torch.allclose(c2w[-1, 1], c2w[0, 1]) and torch.equal(c2w[-1, 0], c2w[0, 0])
-    intrinsic = torch.from_numpy(episode.intrinsic)
-    maps = render_pose_map(poses, c2w.transpose(0, 1), intrinsic, SIZE, PoseMapStyle())
-    assert torch.equal(store.pose_maps(rows), maps.transpose(0, 1))
+    assert not store.arrays["c2w"][rows][:, 2].any() and not store.intrinsic[:, 2].any()
+    intrinsic = torch.from_numpy(episode.intrinsic[:2])
+    maps = render_pose_map(poses, c2w[:, :2].transpose(0, 1), intrinsic, SIZE, PoseMapStyle())
+    assert torch.equal(store.pose_maps(rows)[:, :2], maps.transpose(0, 1))
+    assert (store.pose_maps(rows)[:, 2] == CANVAS).all()
+
+
+def test_a_camera_that_data_do_not_place_is_named(tmp_path: Path) -> None:
+    robot = BIMANUAL_POSES.at(SIZE)
+    LeRobotWriter(tmp_path / "set", robot).write([moving_square(robot, 0)])
+    cameras = [replace(camera, calibrated=camera.wrist != "left") for camera in robot.cameras]
+    with pytest.raises(EpisodeError, match=r"no calibration of \['right_wrist'\]"):
+        ClipStore([tmp_path / "set"], world_spec(replace(robot, cameras=tuple(cameras)), SIZE))
 
 
 def test_cameras_on_wrists_stay_where_nobody_knows_where_changes_lead(tmp_path: Path) -> None:

@@ -69,6 +69,15 @@ def test_batch_dimensions_and_any_size() -> None:
     assert bool((one != 50).any())
 
 
+def test_maps_of_a_camera_that_is_not_calibrated_stay_bare_and_change_no_others() -> None:
+    poses, c2w, intrinsic = scene()
+    both = torch.cat((torch.zeros_like(c2w), c2w)), torch.cat((torch.zeros_like(intrinsic), intrinsic))
+    drawn, rays = render_pose_map(poses, *both, (64, 64)), render_ray_map(both[1], both[0], (64, 64))
+    assert (drawn[0] == CANVAS).all() and (drawn[1] != CANVAS).any() and not rays[0].any()
+    assert torch.equal(drawn[1:], render_pose_map(poses, c2w, intrinsic, (64, 64)))
+    assert torch.equal(rays[1:], render_ray_map(intrinsic, c2w, (64, 64)))
+
+
 def test_options_change_what_they_say() -> None:
     poses, c2w, intrinsic = scene(1)
     base = render_pose_map(poses, c2w, intrinsic, (64, 64))

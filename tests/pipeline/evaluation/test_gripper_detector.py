@@ -141,7 +141,7 @@ def test_cameras_that_cannot_see_trajectories_are_refused(
     with pytest.raises(EmbodimentError, match="are all on wrists"):
         Sights.of(store, known_end_effectors(store, 0.15), (1, 2))
     bare = tiny_store(ARM_DELTAS)
-    with pytest.raises(EmbodimentError, match="not all calibrated"):
+    with pytest.raises(EmbodimentError, match=r"none of the cameras \['corner'\]"):
         Sights.of(bare, known_end_effectors(bare, 0.15), (0,))
 
 
