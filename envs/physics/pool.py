@@ -124,8 +124,11 @@ class TaskPool:
         for remote in self._remotes:
             give(remote)
         while busy:
-            for pipe in wait(list(busy), process.PATIENCE) or list(busy):  # none: all that are left hang
+            heard = wait(list(busy), process.PATIENCE)
+            for pipe in heard or list(busy):  # none: all that are left hang
                 assert isinstance(pipe, Connection)
+                if heard and not busy[pipe][0].answered():
+                    continue  # it is alive
                 remote, number = busy.pop(pipe)
                 for one in self._answer(remote, [other for other, _ in busy.values()]):
                     made[number] = one

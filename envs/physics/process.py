@@ -2,8 +2,9 @@
 
 A process that dies takes its episodes with it. They run again, one at a time, bit for bit as before; so an
 episode in which physics crashes again and again is found and given up, and the others go on. A suite that
-raises an error stands wherever that left it, and one that says nothing for PATIENCE may never come back:
-their processes are replaced as well.
+raises an error stands wherever that left it, and one in which nothing happens for PATIENCE may never come
+back: their processes are replaced as well. Workers give signs of life between frames, however long an answer
+takes.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from envs.physics.worker import WorkerSpec
+from envs.physics.worker import ALIVE, WorkerSpec
 from envs.targets import ConfigError
 
 log = logging.getLogger(__name__)
 RETRIES = 3  # replacements of a process that may die in a row at one request
-PATIENCE = 3600.0  # s for an answer, which may be to many slots' chunks or a whole episode of a slow suite
+PATIENCE = 600.0  # s for a sign of life: a frame, or an episode's layout, of a slow suite on a busy machine
 Request = tuple[str, tuple[Any, ...]]  # a method of Worker and its arguments
 
 
@@ -64,6 +65,7 @@ class WorkerProcess:
         self._trouble = ""  # what the last process that was replaced did
         self._episodes: dict[int, _Episode] = {}
         self._request: Request | None = None
+        self._said: tuple[str, Any] | None = None  # an answer that was read and not yet asked for
         self.lost: list[int] = []
         self._start()
 
@@ -94,6 +96,15 @@ class WorkerProcess:
             answers = [self._insist((name, ({slot: work[slot]}, *extra)), seeds[slot], slot) for slot in work]
             return {slot: value for some in answers for slot, value in (some or {}).items()}
         return self._insist(self._request)
+
+    def answered(self) -> bool:
+        """Whether `answer` would find an answer, or a dead process, at once."""
+        try:
+            while self._said is None and self.pipe.poll():
+                self._said = _answer_in(self.pipe.recv())
+        except (EOFError, OSError):
+            return True
+        return self._said is not None
 
     def _insist(self, request: Request, seed: int | None = None, slot: int | None = None) -> Any:
         """What a request gives that is about one episode, or none; None if physics crashes in it anew."""
@@ -158,7 +169,7 @@ class WorkerProcess:
             env={**os.environ, "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)},
         )
         theirs.close()
-        self._fresh = True
+        self._fresh, self._said = True, None
         self._write((self.spec, self.slots))
 
     def _catch_up(self) -> None:
@@ -188,12 +199,15 @@ class WorkerProcess:
             self.pipe.send(message)
 
     def _read(self) -> Any:
+        said, self._said = self._said, None
         try:
-            if not self.pipe.poll(PATIENCE):
-                raise _Died(f"did not answer for {PATIENCE:g} s: a suite that hangs")
-            status, value = self.pipe.recv()
+            while said is None:
+                if not self.pipe.poll(PATIENCE):
+                    raise _Died(f"gave no sign of life for {PATIENCE:g} s: a suite that hangs")
+                said = _answer_in(self.pipe.recv())
         except (EOFError, OSError) as error:
             raise _Died from error
+        status, value = said
         if status == "config":
             raise ConfigError(value)
         if status == "broken":
@@ -201,3 +215,8 @@ class WorkerProcess:
         if status == "error":
             raise _Died(f"raised an error:\n{value}")
         return value
+
+
+def _answer_in(message: tuple[str, Any]) -> tuple[str, Any] | None:
+    """A worker's message if it is an answer, None if it is a sign of life."""
+    return None if message[0] == ALIVE else message

@@ -9,7 +9,9 @@ from __future__ import annotations
 import contextlib
 import signal
 import sys
+import time
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any
@@ -20,6 +22,8 @@ from numpy.typing import NDArray
 from envs.physics.suite import Array, Observation, SuiteError, TaskSuite, build_suite, check_task, task_of
 from envs.rng import Stream, episode_rng
 from envs.targets import ConfigError
+
+ALIVE = "alive"  # the status of a sign of life
 
 
 @dataclass
@@ -112,14 +116,18 @@ class Worker:
     Args:
         spec: of the suite and its tasks.
         slots: episodes side by side.
+        alive: called after all that may take long.
 
     Raises:
         ConfigError: if there is no such suite or task.
     """
 
-    def __init__(self, spec: WorkerSpec, slots: int):
-        self.spec = spec
-        self.slots = [Slot(build_suite(spec.suite)) for _ in range(slots)]
+    def __init__(self, spec: WorkerSpec, slots: int, alive: Callable[[], None] = lambda: None):
+        self.spec, self._alive = spec, alive
+        self.slots: list[Slot] = []
+        while len(self.slots) < slots:
+            self.slots.append(Slot(build_suite(spec.suite)))
+            alive()
         self._played: list[set[str]] = [set() for _ in range(slots)]  # tasks of each slot's suite so far
         for task in spec.tasks:
             check_task(task, self.slots[0].suite.tasks)
@@ -171,6 +179,7 @@ class Worker:
                 observed = slot.suite.observe()
                 if slot.track is not None:
                     slot.track.add(slot.suite, observed)
+                self._alive()
             slot.over = slot.over or observed.success or slot.steps >= self.spec.horizon
             out[index] = self._answer(slot, observed)
             if slot.over and slot.track is not None:
@@ -195,6 +204,7 @@ class Worker:
                 suite.step(act())
                 observed = suite.observe()
                 track.add(suite, observed)
+                self._alive()
             out.append(track)
         return out
 
@@ -215,6 +225,7 @@ class Worker:
             for command in commands[1:]:
                 suite.step(command)
                 labels.append(suite.segment())
+                self._alive()
             pictures.append(rendered(suite))
             known = [one for one in labels if one is not None]
             out.append((np.stack(known) if len(known) == len(labels) else None, np.stack(pictures), start))
@@ -232,6 +243,7 @@ class Worker:
 
     def _lay_out(self, suite: TaskSuite, seed: int) -> None:
         suite.reset(task_of(self.spec.tasks, seed), seed)
+        self._alive()
 
     def _answer(self, slot: Slot, observed: Observation) -> dict[str, Any]:
         answer = {
@@ -243,18 +255,26 @@ class Worker:
             "instruction": observed.instruction,
             "over": slot.over,
         }
-        extra = {name: getattr(observed, name) for name in ("intrinsic", "c2w")}
-        return answer | {name: value for name, value in extra.items() if value is not None}
+        cameras = {"intrinsic": observed.intrinsic, "c2w": observed.c2w}
+        return answer | {name: value for name, value in cameras.items() if value is not None}
 
 
 def serve(pipe: Connection) -> None:
-    """Answer requests until the pipe closes, at whatever moment its owner dies: first (spec, slots), then
-    (method, arguments), None to end.
+    """Answer requests until the pipe closes, at whatever moment its owner dies: (spec, slots), then (method,
+    arguments), None to end. An answer is (status, value); signs of life may go before it.
     """
+    last = time.monotonic()
+
+    def alive() -> None:
+        nonlocal last
+        if (now := time.monotonic()) - last >= 1.0:
+            last = now
+            pipe.send((ALIVE, None))
+
     with contextlib.suppress(EOFError, OSError):
         spec, slots = pipe.recv()
         try:
-            worker = Worker(spec, slots)
+            worker = Worker(spec, slots, alive)
         except ConfigError as error:
             pipe.send(("config", str(error)))
             return
@@ -262,10 +282,9 @@ def serve(pipe: Connection) -> None:
             pipe.send(("broken", traceback.format_exc()))
             return
         pipe.send(("ok", None))
-        while (message := pipe.recv()) is not None:
-            name, arguments = message
+        while (asked := pipe.recv()) is not None:
             try:
-                answer = ("ok", getattr(worker, name)(*arguments))
+                answer = ("ok", getattr(worker, asked[0])(*asked[1]))
             except ConfigError as error:
                 answer = ("config", str(error))
             except Exception:

@@ -187,7 +187,26 @@ def test_a_worker_that_hangs_counts_like_one_that_died(
     monkeypatch.setattr(process, "PATIENCE", 8.0)
     tracks = pool.script([(seed, float(seed == 2)) for seed in range(4)], 1)
     assert [track.privileged["count"][-1] for track in tracks] == [8.0, 9.0, 10.0, 11.0]
-    assert (tmp_path / "once").exists() and "did not answer for 8 s" in caplog.text and not pool.lost
+    assert (tmp_path / "once").exists() and "no sign of life for 8 s" in caplog.text and not pool.lost
+    pool.close()
+
+
+class Slow(Counting):
+    def step(self, action: Array) -> None:
+        super().step(action)
+        time.sleep(1.2)
+
+
+def test_a_worker_that_is_slow_does_not_hang(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    pool = TaskPool({"_target_": f"{__name__}.Slow", "fault": ""}, "count", 2, 8, 2)
+    monkeypatch.setattr(process, "PATIENCE", 8.0)  # less than an episode takes
+    tracks = pool.script([(seed, 0.0) for seed in range(2)], 1)
+    assert [len(track) for track in tracks] == [9, 9] and not caplog.text
+    chunks = {slot: np.zeros((8, 1)) for slot in range(2)}
+    pool.reset({0: 5, 1: 6}, False)
+    assert [float(seen["state"][0]) for seen in pool.step(chunks).values()] == [13, 14]
     pool.close()
 
 
