@@ -184,13 +184,14 @@ def train_judge(
 def judge_recordings(
     judge: Judge, store: ClipStore, episodes: Tensor, features: Tensor | None = None, batch: int = 32
 ) -> Tensor:
-    """Success probabilities of recorded episodes, frame by frame, float32 [N, T]; 0 where they are over, NaN
-    throughout those that the judge could not judge.
+    """Success probabilities of recorded episodes, frame by frame, float32 [N, T]; 0 where they are over or of
+    which there is no picture, NaN throughout those that the judge could not judge.
 
     Args:
         features: of a judge that reads them, see simulators.features.features_of_episodes.
     """
     rows, valid = store.whole(episodes)
+    valid = valid & store.arrays["present"][rows]
     first = store.frames(store.start[episodes])
     parts = []
     for some in torch.arange(len(episodes)).split(batch):

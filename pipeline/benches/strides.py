@@ -106,11 +106,12 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     )
     psnr = -10 * error.clamp(min=1e-8).log10()
     shown = stride * torch.arange(1, psnr.shape[1] + 1)
-    alike = made.valid & (shown % common == 0)
+    seen = made.pictured(store).valid
+    alike = seen & (shown % common == 0)
     return {
         "covers": stride * store.spec.chunk / store.fps,
         "seconds": seconds,
-        "psnr": float(psnr[made.valid].mean()),
+        "psnr": float(psnr[seen].mean()),
         "psnr_common": float(psnr[alike].mean()),
-        "verdicts": verdict_tables(judge, store, held, [judged(judge, store, held, made, true)], made.valid),
+        "verdicts": verdict_tables(judge, store, held, [judged(judge, store, held, made)], made.valid),
     }

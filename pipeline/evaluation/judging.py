@@ -69,6 +69,20 @@ def judge_frames(
     return Scores(*(torch.cat(parts) for parts in zip(*scores, strict=True)))
 
 
+def judge_recorded(
+    judge: Judge, store: ClipStore, episodes: Tensor, rows: Tensor, features: Tensor | None = None
+) -> Scores:
+    """What the judge says of the recorded frames `rows` [N, T] of these episodes; those of which there is no
+    picture show no success.
+
+    Args:
+        features: as of `judge_frames`.
+    """
+    scores = judge_frames(judge, store.frames(rows), store, episodes, features)
+    seen = store.arrays["present"][rows]
+    return scores._replace(success=torch.where(seen, scores.success, 0.0))
+
+
 def judge_table(
     judge: Judge, scores: Scores, valid: Tensor, store: ClipStore, episodes: Tensor
 ) -> dict[str, Any]:
@@ -108,7 +122,7 @@ def judge_both(
     """
     known = features_of_episodes(simulator, store, episodes, bf16) if judge.reads_features else None
     return Views(
-        judge_frames(judge, store.frames(made.rows), store, episodes, known),
+        judge_recorded(judge, store, episodes, made.rows, known),
         judge_frames(judge, made.frames, store, episodes, made.features),
     )
 

@@ -164,7 +164,7 @@ class OpenLoop:
             hands = self.hands.measure(self.store, episodes, shown, true)
             out |= {f"hand/{name}": values for name, values in hands.items()}
         if self.judge is not None:
-            said = judged(self.judge, self.store, episodes, made, true)
+            said = judged(self.judge, self.store, episodes, made)
             out |= {f"judge/{name}": values for name, values in said.items()}
         return out
 

@@ -11,19 +11,16 @@ from torch import Tensor
 from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge
 from envs.simulators.replay import Replay
-from pipeline.evaluation.judging import Scores, judge_frames, judge_table
+from pipeline.evaluation.judging import Scores, judge_frames, judge_recorded, judge_table
 
 
-def judged(judge: Judge, store: ClipStore, episodes: Tensor, made: Replay, true: Tensor) -> dict[str, Tensor]:
-    """Scores of episodes int64 [N], as tensors by names such as generated/success.
-
-    Args:
-        true: uint8 [N, T, V, 3, H, W], the true frames beside made.frames. A judge that reads a simulator's
-            features is shown the generated ones alone: recordings have features at their own rate only.
+def judged(judge: Judge, store: ClipStore, episodes: Tensor, made: Replay) -> dict[str, Tensor]:
+    """Scores of episodes int64 [N], as tensors by names such as generated/success. A judge that reads a
+    simulator's features is shown generated frames alone: recordings have features at their own rate only.
     """
     videos = {"generated": judge_frames(judge, made.frames, store, episodes, made.features)}
     if not judge.reads_features:
-        videos["recorded"] = judge_frames(judge, true, store, episodes)
+        videos["recorded"] = judge_recorded(judge, store, episodes, made.rows)
     return {f"{name}/{field}": v for name, some in videos.items() for field, v in some._asdict().items()}
 
 

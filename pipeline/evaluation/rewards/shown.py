@@ -14,7 +14,7 @@ from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge
 from envs.specs import Status
 from envs.targets import ConfigError
-from pipeline.evaluation.judging import Scores, judge_frames, judge_table
+from pipeline.evaluation.judging import Scores, judge_recorded, judge_table
 
 ALL, ENDS = "all", "ends"
 _BATCH = 16  # episodes judged at once
@@ -44,7 +44,7 @@ def shown_table(judge: Judge, store: ClipStore, episodes: Tensor, frames: str) -
     judge.hold = 1 if frames == ENDS else max(1, round(held / (1 if frames == ALL else int(frames))))
     try:
         for some in tqdm(torch.arange(len(episodes)).split(_BATCH), desc=f"judge {frames}", leave=False):
-            parts.append(judge_frames(judge, store.frames(rows[some]), store, episodes[some]))
+            parts.append(judge_recorded(judge, store, episodes[some], rows[some]))
         scores = Scores(*(torch.cat(values) for values in zip(*parts, strict=True)))
         table = judge_table(judge, scores, valid, store, episodes)
     finally:

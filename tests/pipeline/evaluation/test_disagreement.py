@@ -14,7 +14,7 @@ from envs.simulators.base import Simulator
 from envs.simulators.replay import Replay
 from pipeline.evaluation.by_task import by_scene, scenes_of_seeds
 from pipeline.evaluation.disagreement import compared, curves, worst
-from pipeline.evaluation.judging import judge_both
+from pipeline.evaluation.judging import judge_both, judge_recorded
 from pipeline.evaluation.statistics import rate_entry
 from tests.envs.physics.sections import Counting
 
@@ -40,7 +40,8 @@ class Store:
         bright = torch.tensor(
             [[0, 0, 0, 0, 255, 255], [0] * FRAMES, [0, 0, 255, 255, 0, 0]], dtype=torch.uint8
         )
-        self.pictures = bright.flatten()[:, None, None, None, None].expand(-1, 1, 3, 2, 2)
+        self.pictures = bright.flatten()[:, None, None, None, None].expand(-1, 1, 3, 2, 2).clone()
+        self.arrays = {"present": torch.ones(3 * FRAMES, dtype=torch.bool)}
         self.start = torch.arange(3) * FRAMES
         self.instructions = ["do a", "do b", "do a"]
         self.episodes: list[dict[str, Any]] = [
@@ -83,6 +84,16 @@ def test_frames_that_do_not_exist_count_for_nothing() -> None:
     views = judge_both(judge, NOBODY, store, torch.tensor([0]), made, bf16=False)
     (row,) = compared({"task": {"name": "any"}}, judge, store, torch.tensor([0]), made, views)
     assert row["generated"] == 0.0 and not row["claims"] and len(curves(views, made, 0)["recorded"]) == 3
+
+
+def test_recorded_frames_without_a_picture_show_no_success() -> None:
+    store: ClipStore = Store()  # type: ignore[assignment]
+    store.pictures[:] = 255  # type: ignore[attr-defined]
+    rows = torch.arange(1, FRAMES)[None]
+    for dark, found in ((FRAMES, 1.0), (2, 0.0)):
+        store.arrays["present"][dark::2] = False
+        scores = judge_recorded(Brightness(), store, torch.tensor([0]), rows)
+        assert Brightness().confidence(scores.success).tolist() == [found]
 
 
 def test_confidence_is_the_highest_threshold_that_still_says_success() -> None:
