@@ -6,6 +6,7 @@ Every shape, head, encoder, transform, server and test is built from an `Embodim
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -186,6 +187,19 @@ class Embodiment:
     def grippers(self) -> tuple[int, ...]:
         """Positions of the grippers in the action vector."""
         return tuple(arm.gripper for arm in self.arms if arm.gripper is not None)
+
+    @property
+    def action_angles(self) -> tuple[int, ...]:
+        """Positions of an action's roll, pitch and yaw in radians; () where it commands changes."""
+        if self.delta or self.action_kind is not ActionKind.END_EFFECTOR:
+            return ()
+        return tuple(number for arm in self.arms for number in arm.numbers[3:6])
+
+    @property
+    def state_angles(self) -> tuple[int, ...]:
+        """Positions of a state's roll, pitch and yaw, by their names."""
+        last = [re.split(r"[^a-z]+", name.lower())[-1] for name in self.state_names]
+        return tuple(k for k, word in enumerate(last) if word in ("roll", "pitch", "yaw"))
 
     # -- what it allows
     @property

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from envs.conditioning.action_vector import RESOLUTION
+from envs.conditioning.units import RESOLUTION
 from envs.embodiment import ActionKind, Embodiment
 
 MARGIN = 0.01  # share of the greatest spread among numbers of one unit, below which a number is constant

@@ -6,7 +6,7 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
 
-from envs.conditioning.action_vector import RESOLUTION
+from envs.conditioning.units import Units
 from envs.embodiment import Embodiment
 from envs.specs import COMMAND, STATE
 
@@ -34,26 +34,21 @@ class Proprioception(nn.Module):
     [..., size] within -5..5.
     """
 
-    mean: Tensor
-    std: Tensor
-
     def __init__(self, robot: Embodiment, command: bool):
         super().__init__()
         self.keys = proprioception_keys(robot, command)
-        self.size = len(robot.state_names) + (robot.action_dim if COMMAND in self.keys else 0)
-        self.register_buffer("mean", torch.zeros(self.size))
-        self.register_buffer("std", torch.ones(self.size))
+        states, commanded = robot.state_dim, COMMAND in self.keys
+        self.size = states + robot.action_dim * commanded
+        angles = [states + number for number in robot.action_angles] if commanded else []
+        self.units = Units(self.size, [*robot.state_angles, *angles], still=1.0)
 
-    @torch.no_grad()
     def normalise(self, *values: Tensor) -> None:
         """Take units from values [N, S] and [N, A]; what hardly varies keeps its own."""
-        joined = torch.cat(values, -1)
-        spread = joined.std(0, unbiased=False)
-        self.mean.copy_(joined.mean(0))
-        self.std.copy_(torch.where(spread > RESOLUTION, spread, 1.0))
+        self.units.normalise(torch.cat(values, -1))
 
     def forward(self, *values: Tensor) -> Tensor:
-        return ((torch.cat(values, -1) - self.mean) / self.std).clamp(-5, 5)
+        told: Tensor = self.units(torch.cat(values, -1))
+        return told.clamp(-5, 5)
 
 
 def encoded(size: int) -> nn.Sequential:

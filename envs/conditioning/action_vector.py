@@ -5,11 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from envs.conditioning.units import RESOLUTION, UNTOLD, Units
 from envs.embodiment import Embodiment
-
-# Spread below which a number is a constant, in any unit in use (metres, radians, degrees, shares): no motor
-# moves by less.
-RESOLUTION = 1e-4
 
 
 class ActionVector(nn.Module):
@@ -26,32 +23,25 @@ class ActionVector(nn.Module):
         size: numbers per frame that `forward` gives.
     """
 
-    centre: Tensor
-    scale: Tensor
     move_scale: Tensor
 
     def __init__(self, embodiment: Embodiment):
         super().__init__()
         count = embodiment.action_dim
         self.delta, self.size = embodiment.delta, 2 * count
-        self.register_buffer("centre", torch.zeros(count))
-        self.register_buffer("scale", torch.ones(count))
+        self.units = Units(count, embodiment.action_angles, still=UNTOLD)
         self.register_buffer("move_scale", torch.ones(count))
 
     def normalise(self, commands: Tensor, moves: Tensor) -> None:
         """Take units from commands [N, A] and, of absolute ones, their moves within a chunk [N, A]."""
-        self.centre.copy_(commands.mean(0))
-        self.scale.copy_(_per_spread(commands.std(0)))
-        self.move_scale.copy_(_per_spread(moves.square().mean(0).sqrt()))
+        self.units.normalise(commands)
+        spread = moves.square().mean(0).sqrt()
+        self.move_scale.copy_(torch.where(spread > RESOLUTION, 1 / spread.clamp(min=RESOLUTION), 0.0))
 
     def forward(self, commands: Tensor, now: Tensor) -> Tensor:
         """float32 [..., K, size] of commands [..., K, A] after the command in force [..., A]."""
-        where = ((commands - self.centre) * self.scale).float()
+        where = self.units(commands).float()
         if self.delta:
             return torch.cat((where, where.cumsum(-2) / 2), -1)
-        return torch.cat(((commands - now.unsqueeze(-2)) * self.move_scale, where), -1).float()
-
-
-def _per_spread(spread: Tensor) -> Tensor:
-    """One over a spread [A]; 0 where a number is a constant."""
-    return torch.where(spread > RESOLUTION, 1 / spread.clamp(min=RESOLUTION), 0.0)
+        moves = self.units.shortest(commands - now.unsqueeze(-2))
+        return torch.cat((moves * self.move_scale, where), -1).float()

@@ -17,7 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from actors.policies.contract import with_text
-from envs.conditioning.action_vector import RESOLUTION
+from envs.conditioning.units import RESOLUTION
 from envs.episodes.clips import ClipStore
 from envs.rng import seed_process
 from envs.specs import ActionMode

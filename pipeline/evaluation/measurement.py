@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from envs.conditioning.units import Units
 from envs.episodes.clips import ClipStore
 from envs.simulators.base import Simulator
 from envs.simulators.replay import SIDE_BY_SIDE, Replay, replay, side_by_side
@@ -54,9 +55,10 @@ def rollout_error(store: ClipStore, episodes: Tensor, made: Replay) -> dict[str,
     )
     psnr = -10 * error.clamp(min=1e-8).log10()
     states = store.arrays["states"]
-    spread = states[store.rows(episodes)].std(0)
-    moving = spread > 1e-6 * states.abs().amax(0).clamp(min=1)
-    off = ((made.states - states[made.rows]).abs() / spread)[..., moving]
+    units = Units(store.spec.state_dim, store.spec.embodiment.state_angles, least=0.0)
+    units.normalise(states[store.rows(episodes)])
+    moving = units.std > 1e-6 * states.abs().amax(0).clamp(min=1)
+    off = units.change(made.states, states[made.rows]).abs()[..., moving]
     return {
         "episodes": len(episodes),
         "psnr_first_frames": float(psnr[shown.valid & early].mean()),

@@ -120,5 +120,5 @@ def test_small_changes_are_told_and_numbers_that_never_change_are_not() -> None:
     vector, units = ActionVector(ARM_DELTAS), torch.tensor([6e-4, 1, 1e-6, 1])
     commands = torch.randn(200, 4, generator=torch.Generator().manual_seed(0)) * units
     vector.normalise(commands, torch.zeros(200, 4))
-    spread = vector(commands[None], commands[:1])[0, :, :4].std(0)
+    spread = vector(commands[None], commands[:1])[0, :, :4].std(0, unbiased=False)
     assert spread.tolist() == pytest.approx([1, 1, 0, 1], abs=1e-3)

@@ -50,9 +50,9 @@ class GESimStateExpert(FlowStateDecoder):
         )
         if found is not None:
             stats = found[1]
-            for name in ("action", "state"):
-                getattr(self.tokens, f"{name}_mean").copy_(stats[name][0])
-                getattr(self.tokens, f"{name}_std").copy_(stats[name][1])
+            for name, units in (("action", self.tokens.actions), ("state", self.tokens.states)):
+                units.mean.copy_(stats[name][0])
+                units.std.copy_(stats[name][1])
             self.normalised = True
 
     @classmethod

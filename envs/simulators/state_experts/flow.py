@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from envs.conditioning.units import LEAST_SPREAD, Units
 from envs.embodiment import ActionKind, Embodiment
 from envs.ranges import Count
 from envs.rng import noise_generator
@@ -28,7 +29,6 @@ from envs.simulators.state_experts.base import StateDecoder
 
 _SHIFTS = (-3, -2, -1, 1, 2, 3)
 _STREAM = 2**40 + 15  # added to episode seeds, for other noise than the video's
-_LEAST_SPREAD = 0.02  # of a number's unit, so that what hardly moves is not blown up
 _DISTURBANCE = 0.02  # noise on past states in training, in spreads: in rollouts they are decoded, too
 
 
@@ -46,11 +46,6 @@ class StateTokens(nn.Module):
         width: numbers of a token.
     """
 
-    action_mean: Tensor
-    action_std: Tensor
-    state_mean: Tensor
-    state_std: Tensor
-
     def __init__(self, embodiment: Embodiment):
         super().__init__()
         self.action_dim, self.state_dim = embodiment.action_dim, embodiment.state_dim
@@ -58,26 +53,23 @@ class StateTokens(nn.Module):
         joints = embodiment.action_kind is ActionKind.JOINTS and not embodiment.delta
         self.absolute = joints and self.action_dim == self.state_dim
         self.moves = not self.absolute and not embodiment.delta
-        for name, size in (("action", self.action_dim), ("state", self.state_dim)):
-            self.register_buffer(f"{name}_mean", torch.zeros(size))
-            self.register_buffer(f"{name}_std", torch.ones(size))
+        self.actions = Units(self.action_dim, embodiment.action_angles, LEAST_SPREAD)
+        self.states = Units(self.state_dim, embodiment.state_angles, LEAST_SPREAD)
 
     def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
         """Set units from commands [N, A], their moves within a chunk [N, A] and states [N, S]."""
-        actions = moves if self.moves else commands
-        self.action_mean.copy_(torch.zeros_like(actions[0]) if self.moves else actions.mean(0))
-        self.action_std.copy_(actions.std(0).clamp(min=_LEAST_SPREAD))
-        self.state_mean.copy_(states.mean(0))
-        self.state_std.copy_(states.std(0).clamp(min=_LEAST_SPREAD))
+        self.actions.normalise(moves if self.moves else commands)
+        if self.moves:
+            self.actions.mean.zero_()
+        self.states.normalise(states)
 
     def clean(self, commands: Tensor, past_commands: Tensor, past_states: Tensor) -> tuple[Tensor, Tensor]:
         """Clean tokens [B, M + K + M, width], and what future states are counted from, in units [B, 1, S]."""
-        past = (past_states - self.state_mean) / self.state_std
+        past = self.states(past_states)
         actions = torch.cat([past_commands, commands], 1)
         if self.moves:
             actions = actions - past_commands[:, -1:]
-        actions = (actions - self.action_mean) / self.action_std
-        tokens = torch.cat([self.pad(actions), self.pad(past)], 1)
+        tokens = torch.cat([self.pad(self.actions(actions)), self.pad(past)], 1)
         return tokens, torch.zeros_like(past[:, -1:]) if self.absolute else past[:, -1:]
 
     def pad(self, values: Tensor) -> Tensor:
@@ -156,20 +148,22 @@ class FlowStateDecoder(StateDecoder):
             return self.prediction.velocity(output, z, level, torch.zeros_like(z))
 
         z = self.sampler(velocity, self._noise(seed, chunk_index).to(features.device))
-        return (origin + z) * self.tokens.state_std + self.tokens.state_mean
+        return self.tokens.states.values(origin + z)
 
     def loss(
         self, features: Tensor, history: TensorDict, future: TensorDict, generator: torch.Generator
     ) -> Tensor:
         """See StateDecoder.loss; the past is disturbed, for in rollouts it is decoded, too."""
-        past, spread = history["states"], self.tokens.state_std
+        past, spread = history["states"], self.tokens.states.std
         noise = torch.randn(past.shape, generator=generator).to(past.device)
         disturbed = disturb_history(past, generator) + _DISTURBANCE * spread * noise
         kept = slice(self.every - 1, None, self.every)  # as in `decode`; the disturbance shifts by frames
         tokens, origin = self.tokens.clean(
             future["commands"], history["commands"][:, kept], disturbed[:, kept]
         )
-        target = (future["states"] - self.tokens.state_mean) / spread - origin
+        target = (
+            self.tokens.states.shortest((self.tokens.states(future["states"]) - origin) * spread) / spread
+        )
         noise = torch.randn(target.shape, generator=generator).to(target.device)
         level = torch.rand(len(target), generator=generator).to(target.device)
         mixed = level[:, None, None]

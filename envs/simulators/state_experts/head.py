@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from envs.conditioning import ActionVector
+from envs.conditioning.units import LEAST_SPREAD, Units
 from envs.ranges import Count
 from envs.simulators.base import Simulator
 from envs.simulators.row_linear import RowLinear
@@ -23,17 +24,13 @@ class StateHead(StateDecoder):
         width: of its hidden layers.
     """
 
-    state_mean: Tensor
-    state_std: Tensor
-
     def __init__(self, simulator: Simulator, memory_frames: Count, width: Count):
         super().__init__(memory_frames)
         spec = simulator.spec
         self.chunk, self.states = spec.chunk, spec.state_dim
         self.vector = ActionVector(spec.embodiment)
         (features,) = simulator.feature_shape
-        self.register_buffer("state_mean", torch.zeros(self.states))
-        self.register_buffer("state_std", torch.ones(self.states))
+        self.units = Units(self.states, spec.embodiment.state_angles, LEAST_SPREAD)
         self.norm = nn.LayerNorm(features)
         size = features + (self.chunk + memory_frames) * self.vector.size + memory_frames * self.states
         last = RowLinear(width, self.chunk * self.states)
@@ -53,10 +50,10 @@ class StateHead(StateDecoder):
         self, features: Tensor, commands: Tensor, past_commands: Tensor, past_states: Tensor
     ) -> Tensor:
         moves = self.vector(torch.cat((past_commands, commands), 1), past_commands[:, -1])
-        past = (past_states - self.state_mean) / self.state_std
+        past = self.units(past_states)
         inputs = torch.cat([self.norm(features), moves.flatten(1), past.flatten(1)], 1)
         change = self.layers(inputs).float().unflatten(1, (self.chunk, self.states))
-        return past_states[:, -1:] + change * self.state_std
+        return past_states[:, -1:] + change * self.units.std
 
     def loss(
         self, features: Tensor, history: TensorDict, future: TensorDict, generator: torch.Generator
@@ -66,9 +63,9 @@ class StateHead(StateDecoder):
         """
         past = history["states"]
         noise = torch.randn(past.shape, generator=generator).to(past.device)
-        disturbed = past + 0.02 * self.state_std * noise
+        disturbed = past + 0.02 * self.units.std * noise
         states = self._decode(features, future["commands"], history["commands"], disturbed)
-        gap = (states - future["states"]) / self.state_std
+        gap = self.units.change(states, future["states"])
         error = F.smooth_l1_loss(gap, torch.zeros_like(gap), beta=0.05, reduction="none")
         valid = future["valid"].float()
         return (error * valid[..., None]).sum() / (valid.sum() * self.states).clamp(min=1)
@@ -76,5 +73,4 @@ class StateHead(StateDecoder):
     def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
         """See StateDecoder; states hardly varying are left in their own unit, a fiftieth."""
         self.vector.normalise(commands, moves)
-        self.state_mean.copy_(states.mean(0))
-        self.state_std.copy_(states.std(0).clamp(min=0.02))
+        self.units.normalise(states)

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from envs.conditioning import ActionVector, Pace
+from envs.conditioning.units import LEAST_SPREAD, Units
 from envs.precision import working_dtype
 from envs.simulators.row_linear import RowLinear
 from envs.simulators.unet.folding import fold
@@ -86,14 +87,10 @@ class ActionEncoder(nn.Module):
         cells: its rows and columns.
     """
 
-    state_mean: Tensor
-    state_std: Tensor
-
     def __init__(self, spec: WorldSpec, cond: int, width: int, cells: tuple[int, int]):
         super().__init__()
         self.vector = ActionVector(spec.embodiment)
-        self.register_buffer("state_mean", torch.zeros(spec.state_dim))
-        self.register_buffer("state_std", torch.ones(spec.state_dim))
+        self.units = Units(spec.state_dim, spec.embodiment.state_angles, LEAST_SPREAD)
         size = spec.chunk * self.vector.size + spec.state_dim
         self.layers = nn.Sequential(
             RowLinear(size, cond), nn.SiLU(), RowLinear(cond, cond), nn.SiLU(), RowLinear(cond, cond)
@@ -106,15 +103,14 @@ class ActionEncoder(nn.Module):
     def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
         """Take units from data; arguments as of Simulator.normalise."""
         self.vector.normalise(commands, moves)
-        self.state_mean.copy_(states.mean(0))
-        self.state_std.copy_(states.std(0).clamp(min=0.02))
+        self.units.normalise(states)
 
     def forward(self, commands: Tensor, now: Tensor, state: Tensor, stride: Tensor) -> tuple[Tensor, Tensor]:
         """[B, cond] and [B, width, *cells] of commands [B, K, A], the one in force [B, A], the state [B, S],
         and the robot's frames from one shown frame to the next [B].
         """
         actions = self.vector(commands, now).flatten(1)
-        joints = ((state - self.state_mean) / self.state_std).clamp(-5, 5)
+        joints = self.units(state).clamp(-5, 5)
         cond = self.layers(torch.cat((actions, joints), 1))
         cond = cond + self.pace(stride).to(cond.dtype)
         return cond, self.lift(self.map(cond))

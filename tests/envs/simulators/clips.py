@@ -97,3 +97,13 @@ def future_of(spec: WorldSpec, clips: TensorDict, number: int = 0) -> TensorDict
     part = slice(number * spec.chunk, (number + 1) * spec.chunk)
     names = [name for name in ("commands", "pose_map", "c2w") if name in clips["future"].keys()]
     return TensorDict({name: clips["future", name][:, part] for name in names}, clips.shape)
+
+
+def history_of(clips: TensorDict, frames: int) -> TensorDict:
+    """The newest frames [B, frames, n] of the clips' history, whose first is repeated if it has fewer."""
+    missing = max(0, frames - clips["history", "commands"].shape[1])
+    told = {
+        name: torch.cat([value[:, :1].expand(-1, missing, -1), value[:, -frames:]], 1)
+        for name, value in clips["history"].items()
+    }
+    return TensorDict(told, clips.shape)

@@ -22,7 +22,7 @@ from envs.simulators.state_experts.base import StateDecoder
 from envs.specs import WorldSpec
 from envs.targets import ConfigError, build
 from tests.embodiments import BIMANUAL_JOINTS, BIMANUAL_POSES, EMBODIMENTS, world_spec
-from tests.envs.simulators.clips import clip, first_of, future_of
+from tests.envs.simulators.clips import clip, first_of, future_of, history_of
 from tests.sections import offered
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs/simulator"
@@ -229,16 +229,7 @@ def test_a_state_expert_learns_from_frozen_features(engine: tuple[Simulator, Sta
     future, commands = clips["future"], clips["future", "commands"]
     moves = (commands - clips["now", "command"][:, None]).flatten(0, 1)
     decoder.normalise(commands.flatten(0, 1), moves, future["states"].flatten(0, 1))
-    missing = decoder.memory_frames - clips["history", "commands"].shape[1]
-    history = TensorDict(
-        {
-            name: torch.cat(
-                [value[:, :1].expand(-1, max(0, missing), -1), value[:, -decoder.memory_frames :]], 1
-            )
-            for name, value in clips["history"].items()
-        },
-        clips.shape,
-    )
+    history = history_of(clips, decoder.memory_frames)
     shown = decoder.look(simulator, build_inputs(simulator.spec, clips, 0))
     trained = [p for p in decoder.parameters() if p.requires_grad]
     optimiser = torch.optim.AdamW(trained, lr=3e-3)

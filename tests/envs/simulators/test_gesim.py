@@ -58,7 +58,7 @@ def test_the_released_folder_loads_with_one_path(world: GESimulator, folder: Pat
     assert world.diffusion.sampler == Distilled() and world.ahead == 2
     assert world.net.shape.num_layers == NET["num_layers"] and not hasattr(world.net, "pose_blocks")
     expert = GESimStateExpert(world, str(folder)).eval()
-    assert expert.normalised and expert.tokens.state_std[15] == pytest.approx(2.5)
+    assert expert.normalised and expert.tokens.states.std[15] == pytest.approx(2.5)
     tensors = load_file(folder / "model.safetensors")
     for part in (world.net, expert.net):
         assert all(torch.equal(value, tensors[name]) for name, value in part.state_dict().items())
