@@ -47,9 +47,10 @@ class Units(nn.Module):
     @torch.no_grad()
     def normalise(self, values: Tensor) -> None:
         """Take mean and spread from values [N, size]."""
+        values = values.to(self.mean)
         self.turn.zero_()
         for number in self.angles:
-            self.turn[number] = _TURN * bool(values[:, number].abs().max() <= _TURN)
+            self.turn[number] = _TURN * bool((values[:, number].abs() <= _TURN).all())
         middle = torch.atan2(values.sin().mean(0), values.cos().mean(0))
         self.mean.copy_(torch.where(self.turn > 0, middle, values.mean(0)))
         away = self.shortest(values - self.mean)

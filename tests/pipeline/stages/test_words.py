@@ -47,7 +47,7 @@ def test_a_cloned_policy_does_what_the_words_ask_at_the_same_first_frame(tmp_pat
     torch.manual_seed(0)
     policy = build_policy(cfg)
     cloning = Cloning(policy, store, torch.arange(len(store)), mode_of(cfg))
-    train_imitation(cloning, FitConfig(300, 48, 2e-3, warmup=30, bf16=False, ema=0.99), tmp_path / "fit")
+    train_imitation(cloning, FitConfig(500, 48, 2e-3, warmup=30, bf16=False, ema=0.99), tmp_path / "fit")
     done = {}
     for swapped in asked:
         env = build_physics(cfg, len(STARTS), changes={"swapped": swapped})
