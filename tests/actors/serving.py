@@ -19,10 +19,13 @@ from PIL import Image
 
 from actors.serving.app import Server
 from actors.serving.sessions import ServeConfig, SessionHost
+from envs.conditioning.joint_commands import JointCommands
 from envs.simulators.dit.engine import DiTSimulator
 from envs.simulators.state_experts.flow import StateExpert
 from tests.embodiments import EMBODIMENTS, world_spec
 
+# four commands of two_arms_poses
+POSES = np.tile(np.array([0.3, 0.2, 0.4, 0, 0, 0, 0.5, 0.3, -0.2, 0.4, 0, 0, 0, 0.5], np.float32), (4, 1))
 SERVE: dict[str, Any] = {
     "host": "127.0.0.1",
     "port": 0,
@@ -53,6 +56,10 @@ def tiny_world(robot: str = "two_arms_poses") -> DiTSimulator:
         world.net.proj_out.weight.mul_(40)
         world.codec.decoder[-1].weight.mul_(3)
     return world.eval()
+
+
+def make(world: DiTSimulator, joints: JointCommands | None = None, **config: Any) -> Running:
+    return Running(SessionHost(world, tiny_expert(world), serve_config(**config), joints, bf16=False))
 
 
 def tiny_expert(world: DiTSimulator) -> StateExpert:
