@@ -84,6 +84,44 @@ class Robot:
     held: Mapping[str, float] = field(default_factory=dict)
 
 
+_ANGLES = ("roll", "pitch", "yaw")
+_JOINTS = ("joint", "waist", "shoulder", "elbow", "wrist", "forearm", "neck", "head")
+_VECTORS = (("wx", "wy", "wz"), ("rotvec",), ("axis", "angle"), ("axisangle",))  # as LeRobot and others say
+_QUATERNIONS = (("qw", "qx", "qy", "qz"), ("quat",), ("quaternion",))
+
+
+def orientations(names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
+    """Positions of the numbers that tell orientations, by their names, in order.
+
+    Single angles are called roll, pitch or yaw and are no joint's (left_roll, but not wrist_roll); three in a
+    row are a rotation vector if they are called wx, wy, wz, or have rotvec, axis_angle or axisangle in their
+    names; four in a row a quaternion if they are called qx, qy, qz, qw in any order, or have quat or
+    quaternion in them.
+    """
+    words = [[word for word in re.split(r"[^a-z]+", name.lower()) if word] for name in names]
+    found: list[tuple[int, ...]] = []
+    place = 0
+    while place < len(words):
+        group: tuple[int, ...] = ()
+        if words[place][-1:] and words[place][-1] in _ANGLES and not {*words[place]} & {*_JOINTS}:
+            group = (place,)
+        for size, kinds in ((3, _VECTORS), (4, _QUATERNIONS)):
+            some = words[place : place + size]
+            if len(some) == size and any(_called(some, kind) for kind in kinds):
+                group = tuple(range(place, place + size))
+        if group:
+            found.append(group)
+        place += max(1, len(group))
+    return tuple(found)
+
+
+def _called(some: Sequence[Sequence[str]], kind: tuple[str, ...]) -> bool:
+    """Whether names end in these words, each in one, or all have them."""
+    if len(kind) == len(some):
+        return sorted(words[-1] if words else "" for words in some) == sorted(kind)
+    return all({*kind} <= {*words} for words in some)
+
+
 @dataclass(frozen=True)
 class Embodiment:
     """A robot as far as learning it needs to know.
@@ -189,17 +227,21 @@ class Embodiment:
         return tuple(arm.gripper for arm in self.arms if arm.gripper is not None)
 
     @property
-    def action_angles(self) -> tuple[int, ...]:
-        """Positions of an action's roll, pitch and yaw in radians; () where it commands changes."""
-        if self.delta or self.action_kind is not ActionKind.END_EFFECTOR:
+    def action_rotations(self) -> tuple[tuple[int, ...], ...]:
+        """Positions of an action's orientations: of commanded poses and by names, as `orientations` finds
+        them; () where it commands changes.
+        """
+        if self.delta:
             return ()
-        return tuple(number for arm in self.arms for number in arm.numbers[3:6])
+        poses = self.action_kind is ActionKind.END_EFFECTOR
+        angles = [number for arm in self.arms for number in arm.numbers[3:6]] if poses else []
+        named = [group for group in orientations(self.action_names) if not {*group} & {*angles}]
+        return tuple(sorted([*((number,) for number in angles), *named]))
 
     @property
-    def state_angles(self) -> tuple[int, ...]:
-        """Positions of a state's roll, pitch and yaw, by their names."""
-        last = [re.split(r"[^a-z]+", name.lower())[-1] for name in self.state_names]
-        return tuple(k for k, word in enumerate(last) if word in ("roll", "pitch", "yaw"))
+    def state_rotations(self) -> tuple[tuple[int, ...], ...]:
+        """Positions of a state's orientations, as `orientations` finds them by names."""
+        return orientations(self.state_names)
 
     # -- what it allows
     @property

@@ -39,8 +39,8 @@ class Proprioception(nn.Module):
         self.keys = proprioception_keys(robot, command)
         states, commanded = robot.state_dim, COMMAND in self.keys
         self.size = states + robot.action_dim * commanded
-        angles = [states + number for number in robot.action_angles] if commanded else []
-        self.units = Units(self.size, [*robot.state_angles, *angles], still=1.0)
+        turned = [tuple(states + number for number in group) for group in robot.action_rotations]
+        self.units = Units(self.size, [*robot.state_rotations, *turned * commanded], still=1.0)
 
     def normalise(self, *values: Tensor) -> None:
         """Take units from values [N, S] and [N, A]; what hardly varies keeps its own."""

@@ -29,7 +29,7 @@ class ActionVector(nn.Module):
         super().__init__()
         count = embodiment.action_dim
         self.delta, self.size = embodiment.delta, 2 * count
-        self.units = Units(count, embodiment.action_angles, still=UNTOLD)
+        self.units = Units(count, embodiment.action_rotations, still=UNTOLD)
         self.register_buffer("move_scale", torch.ones(count))
 
     def normalise(self, commands: Tensor, moves: Tensor) -> None:
@@ -43,5 +43,5 @@ class ActionVector(nn.Module):
         where = self.units(commands).float()
         if self.delta:
             return torch.cat((where, where.cumsum(-2) / 2), -1)
-        moves = self.units.shortest(commands - now.unsqueeze(-2))
+        moves = self.units.moves(commands, now.unsqueeze(-2))
         return torch.cat((moves * self.move_scale, where), -1).float()

@@ -6,24 +6,32 @@ import math
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from envs.embodiment import ActionKind, Embodiment
+from envs.conditioning.turns import Turns
+from envs.embodiment import Embodiment
 from envs.episodes.episode import EpisodeError
 
 _TURNS = 4 * math.pi  # of a joint commanded in radians, at most
 
 
 def turned_steadily(robot: Embodiment, commands: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Commands [T, A] of an episode whose roll, pitch and yaw, in radians, do not jump by a whole turn where
-    they pass pi: networks learn from differences.
+    """Commands [T, A] of an episode whose orientations do not jump: networks learn from differences.
+
+    Each is told the way that is nearest to the one before (see Turns).
     """
-    out = commands.copy()
-    if robot.commands_poses and robot.action_kind is ActionKind.END_EFFECTOR:
-        for arm in robot.arms:
-            angles = list(arm.numbers[3:6])
-            out[:, angles] = np.unwrap(commands[:, angles].astype(np.float64), axis=0)
-    return out
+    turns = Turns(robot.action_dim, robot.action_rotations)
+    told = torch.from_numpy(commands).double()
+    turns.fit(told)
+    out = told.numpy().copy()
+    angles = [number for number in turns.angles if turns.turn[number] > 0]
+    out[:, angles] = np.unwrap(out[:, angles], axis=0)
+    if turns.wholes:
+        told = torch.from_numpy(out)
+        for frame in range(1, len(told)):
+            told[frame] = turns.nearest(told[frame], told[frame - 1])
+    return out.astype(np.float32)
 
 
 def check_radians(robot: Embodiment, commands: NDArray[np.float32], where: Path) -> None:

@@ -55,7 +55,7 @@ def rollout_error(store: ClipStore, episodes: Tensor, made: Replay) -> dict[str,
     )
     psnr = -10 * error.clamp(min=1e-8).log10()
     states = store.arrays["states"]
-    units = Units(store.spec.state_dim, store.spec.embodiment.state_angles, least=0.0)
+    units = Units(store.spec.state_dim, store.spec.embodiment.state_rotations, least=0.0)
     units.normalise(states[store.rows(episodes)])
     moving = units.std > 1e-6 * states.abs().amax(0).clamp(min=1)
     off = units.change(made.states, states[made.rows]).abs()[..., moving]

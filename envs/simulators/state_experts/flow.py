@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from envs.conditioning.turns import Turns
 from envs.conditioning.units import LEAST_SPREAD, Units
 from envs.embodiment import ActionKind, Embodiment
 from envs.ranges import Count
@@ -53,11 +54,13 @@ class StateTokens(nn.Module):
         joints = embodiment.action_kind is ActionKind.JOINTS and not embodiment.delta
         self.absolute = joints and self.action_dim == self.state_dim
         self.moves = not self.absolute and not embodiment.delta
-        self.actions = Units(self.action_dim, embodiment.action_angles, LEAST_SPREAD)
-        self.states = Units(self.state_dim, embodiment.state_angles, LEAST_SPREAD)
+        self.turns = Turns(self.action_dim, embodiment.action_rotations)
+        self.actions = Units(self.action_dim, least=LEAST_SPREAD)
+        self.states = Units(self.state_dim, embodiment.state_rotations, LEAST_SPREAD)
 
     def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
         """Set units from commands [N, A], their moves within a chunk [N, A] and states [N, S]."""
+        self.turns.fit(commands)
         self.actions.normalise(moves if self.moves else commands)
         if self.moves:
             self.actions.mean.zero_()
@@ -68,7 +71,8 @@ class StateTokens(nn.Module):
         past = self.states(past_states)
         actions = torch.cat([past_commands, commands], 1)
         if self.moves:
-            actions = actions - past_commands[:, -1:]
+            now = past_commands[:, -1:]
+            actions = self.turns.nearest(actions, now) - now
         tokens = torch.cat([self.pad(self.actions(actions)), self.pad(past)], 1)
         return tokens, torch.zeros_like(past[:, -1:]) if self.absolute else past[:, -1:]
 
@@ -154,16 +158,14 @@ class FlowStateDecoder(StateDecoder):
         self, features: Tensor, history: TensorDict, future: TensorDict, generator: torch.Generator
     ) -> Tensor:
         """See StateDecoder.loss; the past is disturbed, for in rollouts it is decoded, too."""
-        past, spread = history["states"], self.tokens.states.std
+        past, told = history["states"], self.tokens.states
         noise = torch.randn(past.shape, generator=generator).to(past.device)
-        disturbed = disturb_history(past, generator) + _DISTURBANCE * spread * noise
+        disturbed = disturb_history(past, generator) + _DISTURBANCE * told.std * noise
         kept = slice(self.every - 1, None, self.every)  # as in `decode`; the disturbance shifts by frames
         tokens, origin = self.tokens.clean(
             future["commands"], history["commands"][:, kept], disturbed[:, kept]
         )
-        target = (
-            self.tokens.states.shortest((self.tokens.states(future["states"]) - origin) * spread) / spread
-        )
+        target = told.change(future["states"], told.values(origin))
         noise = torch.randn(target.shape, generator=generator).to(target.device)
         level = torch.rand(len(target), generator=generator).to(target.device)
         mixed = level[:, None, None]

@@ -30,7 +30,7 @@ class StateHead(StateDecoder):
         self.chunk, self.states = spec.chunk, spec.state_dim
         self.vector = ActionVector(spec.embodiment)
         (features,) = simulator.feature_shape
-        self.units = Units(self.states, spec.embodiment.state_angles, LEAST_SPREAD)
+        self.units = Units(self.states, spec.embodiment.state_rotations, LEAST_SPREAD)
         self.norm = nn.LayerNorm(features)
         size = features + (self.chunk + memory_frames) * self.vector.size + memory_frames * self.states
         last = RowLinear(width, self.chunk * self.states)

@@ -90,7 +90,7 @@ class ActionEncoder(nn.Module):
     def __init__(self, spec: WorldSpec, cond: int, width: int, cells: tuple[int, int]):
         super().__init__()
         self.vector = ActionVector(spec.embodiment)
-        self.units = Units(spec.state_dim, spec.embodiment.state_angles, LEAST_SPREAD)
+        self.units = Units(spec.state_dim, spec.embodiment.state_rotations, LEAST_SPREAD)
         size = spec.chunk * self.vector.size + spec.state_dim
         self.layers = nn.Sequential(
             RowLinear(size, cond), nn.SiLU(), RowLinear(cond, cond), nn.SiLU(), RowLinear(cond, cond)

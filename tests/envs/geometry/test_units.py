@@ -23,14 +23,15 @@ def wrapped(angles: torch.Tensor) -> torch.Tensor:
 
 
 def test_which_numbers_are_angles() -> None:
-    assert list(BIMANUAL_POSES.action_angles) == list(BIMANUAL_POSES.state_angles) == ANGLES
+    angles = tuple((number,) for number in ANGLES)
+    assert BIMANUAL_POSES.action_rotations == BIMANUAL_POSES.state_rotations == angles
     for robot in (ARM_DELTAS, ARM_JOINTS):
-        assert not robot.action_angles and not robot.state_angles
+        assert not robot.action_rotations and not robot.state_rotations
 
 
 def test_an_angle_around_pi_has_the_spread_that_it_has_around_zero() -> None:
     values = 0.1 * torch.randn(500, 2, generator=torch.Generator().manual_seed(0))
-    around, zero = Units(2, [0, 1]), Units(2, [0, 1])
+    around, zero = Units(2, [[0], [1]]), Units(2, [[0], [1]])
     zero.normalise(values)
     turned = wrapped(values + math.pi)
     assert turned.std(0).min() > 3  # as numbers they lie at both ends
@@ -44,7 +45,7 @@ def test_an_angle_around_pi_has_the_spread_that_it_has_around_zero() -> None:
 
 def test_degrees_and_numbers_that_are_no_angles_are_taken_as_they_are() -> None:
     degrees = torch.tensor([[-179.0, 5.0], [179.0, 5.0]])
-    units = Units(2, [0], least=0.5, still=UNTOLD)
+    units = Units(2, [[0]], least=0.5, still=UNTOLD)
     units.normalise(degrees)
     assert units.mean.tolist() == [0, 5] and units.std.tolist() == [179, UNTOLD]
     assert torch.allclose(units(torch.tensor([358.0, 100.0])), torch.tensor([2.0, 0.0]), atol=1e-6)

@@ -1,0 +1,91 @@
+"""Numbers that tell one orientation in several ways, and the one of them that lies nearest to others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+_TURN = 2 * math.pi
+_UNIT = 0.05  # how far from 1 the norm of a recorded quaternion may be
+
+
+class Turns(nn.Module):
+    """Which of a robot's numbers are orientations, if data bear it out.
+
+    Roll, pitch and yaw jump by a whole turn where they pass pi, rotation vectors change their direction
+    there, and a quaternion is the same orientation as its negative. A gripper that points down comes there
+    from one episode to the next, or within one.
+
+    Args:
+        size: how many numbers there are.
+        groups: positions of the numbers of each orientation: 1 is an angle in radians, 3 are a rotation
+            vector in radians, 4 a quaternion in any order. Angles and vectors of more than a turn, and
+            quaternions of another norm than 1, are counted in something else, or counted on, and are taken
+            as they are.
+    """
+
+    turn: Tensor
+    borne_out: Tensor
+
+    def __init__(self, size: int, groups: Sequence[Sequence[int]]):
+        super().__init__()
+        self.angles = [group[0] for group in groups if len(group) == 1]
+        self.wholes = [list(group) for group in groups if len(group) > 1]
+        if any(len(group) not in (3, 4) for group in self.wholes):
+            raise ValueError(f"orientations {self.wholes} must have 1, 3 or 4 numbers")
+        self.register_buffer("turn", torch.zeros(size))  # of angles; 0 of all other numbers
+        self.register_buffer("borne_out", torch.zeros(len(self.wholes), dtype=torch.bool))
+
+    @torch.no_grad()
+    def fit(self, values: Tensor) -> Tensor:
+        """See which orientations values [N, size] bear out; their mean [size], whatever way each is told."""
+        self.turn.zero_()
+        for number in self.angles:
+            self.turn[number] = _TURN * bool((values[:, number].abs() <= _TURN).all())
+        circular = torch.atan2(values.sin().mean(0), values.cos().mean(0))
+        middle = torch.where(self.turn > 0, circular, values.mean(0))
+        for which, group in enumerate(self.wholes):
+            some, norm = values[:, group], values[:, group].norm(dim=-1)
+            fits = norm <= _TURN if len(group) == 3 else (norm - 1).abs() <= _UNIT
+            self.borne_out[which] = bool(fits.all())
+            if len(values) and self.borne_out[which]:
+                middle[group] = _vector(_axis(_quaternion(some))) if len(group) == 3 else _axis(some)
+        return middle + (self.nearest(values, middle) - middle).mean(0)
+
+    def nearest(self, values: Tensor, to: Tensor) -> Tensor:
+        """Values [..., size] whose orientations are told as near to those of others [..., size] as may be."""
+        if self.angles:
+            turn = self.turn
+            values = values - turn * ((values - to) / torch.where(turn > 0, turn, 1.0)).round()
+        for group, borne_out in zip(self.wholes, self.borne_out, strict=True):
+            some = values[..., group]
+            along = (some * to[..., group]).sum(-1, keepdim=True)
+            if len(group) == 4:
+                factor = torch.where(along < 0, -1.0, 1.0)
+            else:
+                norm = some.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+                factor = 1 - _TURN / norm * ((norm - along / norm) / _TURN).round()
+            values = values.clone()
+            values[..., group] = some * torch.where(borne_out, factor, 1.0).to(some)
+        return values
+
+
+def _axis(quaternions: Tensor) -> Tensor:
+    """The mean [4] of quaternions [N, 4], whatever their signs; the largest number is positive."""
+    mean = torch.linalg.eigh(quaternions.double().T @ quaternions.double())[1][:, -1]
+    return (mean * mean[mean.abs().argmax()].sign()).to(quaternions)
+
+
+def _quaternion(vectors: Tensor) -> Tensor:
+    """Quaternions [N, 4], w first, of rotation vectors [N, 3]."""
+    norm = vectors.norm(dim=-1, keepdim=True)
+    return torch.cat(((norm / 2).cos(), vectors / norm.clamp(min=1e-6) * (norm / 2).sin()), -1)
+
+
+def _vector(quaternion: Tensor) -> Tensor:
+    """The rotation vector [3] of a quaternion [4], w first."""
+    sine = quaternion[1:].norm()
+    return 2 * torch.atan2(sine, quaternion[0]) * quaternion[1:] / sine.clamp(min=1e-6)
