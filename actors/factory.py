@@ -116,11 +116,8 @@ def build_physics(
     Raises:
         ConfigError: if the task has no suite, or no task of that name.
     """
-    task = cfg["task"]
-    if task.get("suite") is None:
-        raise ConfigError("task.suite is empty: this task is known from data alone and has no physics")
+    task, suite = cfg["task"], _suite_of(cfg, changes)
     try:
-        suite = {**task["suite"], **(changes or {})}
         pool = TaskPool(suite, task["name"], batch, task["horizon"], cfg["launch"]["workers"])
         return PhysicsEnv(pool, world_spec(cfg), ActionMode(task["mode"]), rewards_of(cfg), record, seed)
     except (SuiteError, EmbodimentError) as error:
@@ -135,13 +132,27 @@ def build_pool(
     Args:
         changes: see build_physics.
         horizon: actions of an episode, the task's by default; 0 only lays it out.
+
+    Raises:
+        ConfigError: if the task has no suite, or no task of that name.
     """
     task, workers = cfg["task"], cfg["launch"]["workers"] or available_cores()
-    actions = task["horizon"] if horizon is None else horizon
+    actions, suite = task["horizon"] if horizon is None else horizon, _suite_of(cfg, changes)
     try:
-        return TaskPool({**task["suite"], **(changes or {})}, task["name"], workers, actions, workers)
+        return TaskPool(suite, task["name"], workers, actions, workers)
     except (SuiteError, EmbodimentError) as error:
         raise ConfigError(str(error)) from error
+
+
+def _suite_of(cfg: Mapping[str, Any], changes: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The section of the task's suite, some of its options changed."""
+    suite = cfg["task"].get("suite")
+    if suite is None:
+        raise ConfigError(
+            "task.suite is empty: this task is known from data alone and has no physics; choose a task with a"
+            " suite (task=push)"
+        )
+    return {**suite, **(changes or {})}
 
 
 def build_algorithm(cfg: Mapping[str, Any], policy: TensorDictModuleBase) -> Any:

@@ -11,7 +11,7 @@ from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDict
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal
 
-from envs.language import TextEncoder
+from envs.encoders.language import TextEncoder
 from envs.specs import CHUNK, IMAGE, INSTRUCTION_UTF8, LOG_PROB, STATE, WorldSpec
 
 _CELLS = 8  # rows and columns of the coarse picture

@@ -201,7 +201,10 @@ def _together(cfg: Cfg) -> Iterator[str]:
     variants = task.get("variants", {})
     for name in cfg["extra_starts"]["variants"]:
         if name not in variants:
-            yield f"extra_starts.variants holds {name!r}, no key of task.variants{nearest(name, variants)}"
+            yield (
+                f"extra_starts.variants holds {name!r}, no key of task.variants{nearest(name, variants)}; say"
+                " extra_starts.variants=[] for starts of the task alone"
+            )
     study = cfg["study"]
     known = {"rows": "methods", "columns": "measures", "places": "across", "only": "rows", "against": "rows"}
     for key, among in known.items():

@@ -72,6 +72,16 @@ def has_physics(cfg: Cfg) -> bool:
     return bool(cfg["task"].get("suite"))
 
 
+def check_physics(cfg: Cfg, who: str) -> None:
+    """Refuse a task that is known from recordings alone, for `who` plays the task.
+
+    Raises:
+        ConfigError: saying what to choose.
+    """
+    if not has_physics(cfg):
+        raise ConfigError(f"{who} records its own episodes; choose a task with a suite (task=push)")
+
+
 def check_labels(cfg: Cfg, graph: Graph, until: str = "") -> None:
     """See that recordings say what the judge is taught by, hours before it is its turn.
 

@@ -16,7 +16,7 @@ FILES = [path for room in ORDER for path in sorted((ROOT / room).rglob("*.py"))]
 # Where robots learn, act and are judged: nothing here may open what only physics knows.
 UNPRIVILEGED = (
     *("envs/simulators", "envs/judges", "envs/transforms", "envs/world.py", "actors", "learners"),
-    *("envs/conditioning", "envs/initial_states.py", "envs/encoders.py", "envs/language.py"),
+    *("envs/conditioning", "envs/initial_states.py", "envs/encoders"),
     *("envs/chunked.py", "envs/specs.py"),
     *("pipeline/stages", "pipeline/loop.py"),
 )

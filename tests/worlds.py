@@ -48,3 +48,9 @@ def scripted_set(cfg: Mapping[str, Any], root: Path, count: int, noise_level: fl
     LeRobotWriter(root, robot).write([Episode.from_track(track, "noisy", robot) for track in tracks])
     write_splits(root, {"train": 0, "held_out": count, "calibration": 0})
     return root
+
+
+def written(root: Path, name: str) -> Path:
+    """The file of that name which a command wrote for the one simulator that was named."""
+    (found,) = root.glob(f"simulators/*/{name}")
+    return found

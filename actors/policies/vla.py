@@ -19,8 +19,8 @@ from actors.policies.contract import POLICY_FEATURES, VISUAL_FEATURES
 from actors.policies.heads import Head, varying
 from actors.policies.proprioception import FEATURES, Proprioception, encoded, proprioception_keys
 from envs.embodiment import Embodiment
-from envs.encoders import MultiViewEncoder
-from envs.language import TextEncoder
+from envs.encoders.images import MultiViewEncoder
+from envs.encoders.language import TextEncoder
 from envs.ranges import Count, Natural
 from envs.specs import CHUNK, IMAGE, INSTRUCTION_UTF8, LOG_PROB, WorldSpec
 from envs.targets import build

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from envs.embodiment import Embodiment
-from envs.language import FEATURES, TextEncoder
+from envs.encoders.language import FEATURES, TextEncoder
 from envs.ranges import Natural
 from envs.specs import TEXT_BYTES, text_to_bytes
 
@@ -13,8 +13,8 @@ from envs.specs import TEXT_BYTES, text_to_bytes
 class ActionText(nn.Module):
     """Commands as fixed features of the text that says them, such as "minus 3 7 plus 1 2".
 
-    The embedding is that of envs/language.py: hashed n-grams of words and their order, without a vocabulary,
-    a language model or anything that learns. In place of ActionVector, whose contract this has.
+    The embedding is that of envs/encoders/language.py: hashed n-grams of words and their order, without a
+    vocabulary, a language model or anything that learns. In place of ActionVector, whose contract this has.
 
     Args:
         embodiment: whose actions.

@@ -20,7 +20,8 @@ _USUAL = 0.9
 def key_frames(store: EpisodeStore, episodes: Tensor) -> Tensor:
     """Which rows of a store are key frames, bool [N]; only rows of the given episodes can be.
 
-    A first frame is none: nothing has changed there yet.
+    A first frame is none: nothing has changed there yet. Where nobody knows which numbers are an arm's, all
+    together are taken for one.
     """
     commands, key = store.arrays["commands"], torch.zeros(len(store.arrays["commands"]), dtype=torch.bool)
     rows = store.rows(episodes)
@@ -29,7 +30,7 @@ def key_frames(store: EpisodeStore, episodes: Tensor) -> Tensor:
     robot = store.spec.embodiment
     moves = commands[rows] if robot.delta else commands[rows] - commands[earlier]
     found = torch.zeros(len(rows), dtype=torch.bool)
-    for arm in robot.arms:
+    for arm in robot.arms or (Arm("all", tuple(range(robot.action_dim))),):
         found |= _switches(arm, commands, rows, earlier) | _rests(moves[:, list(arm.numbers)], first)
     key[rows] = found & ~first
     return key

@@ -13,9 +13,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from envs.encoders.language import TextEncoder
 from envs.judges.base import Judgement, features_of_all
 from envs.judges.fitted import FittedJudge
-from envs.language import TextEncoder
 from envs.ranges import Count, Discount, Share
 from envs.simulators.features import pooled_size
 from envs.specs import WorldSpec, text_to_bytes

@@ -12,9 +12,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from envs.encoders import MultiViewEncoder, to_signed
+from envs.encoders.images import MultiViewEncoder, to_signed
+from envs.encoders.language import TextEncoder
 from envs.judges.fitted import FrameJudge
-from envs.language import TextEncoder
 from envs.ranges import Count, Discount, Natural, Share
 from envs.specs import WorldSpec
 

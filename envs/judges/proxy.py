@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from envs.encoders import to_signed
+from envs.encoders.images import to_signed
 from envs.judges.fitted import FrameJudge
 from envs.ranges import Count, Discount, Share
 from envs.specs import WorldSpec

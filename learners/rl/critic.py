@@ -7,8 +7,8 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
 from actors.policies.contract import VISUAL_FEATURES, writes_features
-from envs.encoders import MultiViewEncoder
-from envs.language import TextEncoder
+from envs.encoders.images import MultiViewEncoder
+from envs.encoders.language import TextEncoder
 from envs.specs import IMAGE, INSTRUCTION_UTF8, STATE, WorldSpec
 
 _POINTS, _WIDTH, _TEXT = 16, 16, 32  # of the encoder of a critic that has to see for itself

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from envs.conditioning import end_effector_poses
-from envs.encoders import bells
+from envs.encoders.images import bells
 from envs.episodes.clips import ClipStore
 from envs.geometry.cameras import project
 from envs.geometry.kinematics import Kinematics

@@ -64,6 +64,7 @@ class FitConfig:
         microbatches: parts a batch is cut into, each with a backward pass of its own, to save memory or to be
             shared out to workers.
         optimiser: a name in optimisers.OPTIMISERS: "adamw" or "muon".
+        key: where the config has these options, for messages; "" if it has them nowhere.
 
     Raises:
         ValueError: if batch is no multiple of microbatches, or the optimiser is unknown.
@@ -81,6 +82,7 @@ class FitConfig:
     seed: Natural = 0
     microbatches: Count = 1
     optimiser: str = "adamw"
+    key: str = ""
 
     def __post_init__(self) -> None:
         if self.microbatches < 1 or self.batch % self.microbatches:
@@ -99,6 +101,12 @@ def _rate(config: FitConfig, step: int) -> float:
         return config.lr * (step + 1) / config.warmup
     share = (step - config.warmup) / max(1, config.steps - config.warmup)
     return config.lr * (0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * min(1.0, share))))
+
+
+def _advice(config: FitConfig) -> str:
+    """What may help training that diverges; ++ sets a key whether or not the config's YAML has it."""
+    path = f"{config.key}." if config.key else ""
+    return f"lower {path}lr{f' or say ++{path}bf16=false' if config.bf16 else ''}"
 
 
 def fit(
@@ -201,8 +209,7 @@ def fit(
             figure = figures.pop("loss")
             if not math.isfinite(norm) or not math.isfinite(figure):
                 raise TrainingDiverged(
-                    f"{name}: loss {figure:.4g}, gradient norm {norm:.4g} at step {step}; lower {name}.lr or"
-                    f" switch {name}.bf16 off"
+                    f"{name}: loss {figure:.4g}, gradient norm {norm:.4g} at step {step}; {_advice(config)}"
                 )
             for optimiser in optimisers:
                 optimiser.step()

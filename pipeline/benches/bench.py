@@ -24,6 +24,7 @@ DISTIL = (
     "tokenizer_fit={steps: 250, batch: 16, lr: 3e-3}",
     "simulator_fit.first={single_chunk_fraction: 0.9, fit: {steps: 400, batch: 16, lr: 3e-3}}",
     *("distill.first.fit.steps=500", "state_fit.first.fit={steps: 120, batch: 16, lr: 4e-3}"),
+    "judge_fit.first.imagined=0",  # one judge for all, which has seen the video of none
     *JUDGED,
 )
 STRIDES = (

@@ -28,7 +28,7 @@ from pipeline.evaluation.judging import judge_frames, judge_table, labelled
 from pipeline.evaluation.measurement import rollout_error, speed
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, Place, stage
-from pipeline.loop import has_physics
+from pipeline.loop import check_physics
 from pipeline.stages import collect, world
 from pipeline.stages.given import WORLD, Cfg, open_store
 from pipeline.stages.judging import stage as judging
@@ -113,10 +113,7 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
     many updates. "not distilled" has the weights of the teacher jump as students do: a jump that nobody has
     taught ends in the mean of all that may come, which PSNR likes, and which has no detail.
     """
-    if not has_physics(cfg):
-        raise ConfigError(
-            "bench distil records its own episodes; choose a task with a suite, such as task=push"
-        )
+    check_physics(cfg, "bench distil")
     engine, most = target(cfg["simulator"], "simulator"), cfg["distill"]["steps"]
     if not most:
         raise ConfigError("distill.steps=0 is without a student; say distill.steps=4")
@@ -134,8 +131,8 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
     )
 
     def judged(own: Graph, name: str, simulator: str, state: str) -> str:
-        """The judge of a simulator; one that sees pictures alone is the same for all."""
-        if not judge_class.reads_features:
+        """The judge of a simulator; one that learned from recorded pictures alone is the same for all."""
+        if not judge_class.reads_features and not cfg["judge_fit"]["first"]["imagined"]:
             own, name, simulator, state = graph, "all", teacher, ""
         if f"judge-{name}" in own.nodes:
             return f"judge-{name}"

@@ -20,6 +20,7 @@ from envs.physics.worker import Track
 from envs.rng import Purpose, episode_seeds
 from pipeline.evaluation.by_task import tasks_of_seeds
 from pipeline.evaluation.statistics import rate, rate_entry, rate_line
+from pipeline.loop import check_physics
 from pipeline.stages.collect import LEAST
 
 SHOWN = 3  # failures of a task that are saved as videos
@@ -39,12 +40,14 @@ class Outcomes:
         actions: of those that succeeded.
         failed: some of the others, recorded.
         seeds: of all others.
+        dropped: episodes that physics did not bring to an end; they count for nothing.
     """
 
     success: list[bool] = field(default_factory=list)
     actions: list[int] = field(default_factory=list)
     failed: list[Track] = field(default_factory=list)
     seeds: list[int] = field(default_factory=list)
+    dropped: int = 0
 
     def add(self, track: Track) -> None:
         """Count an episode."""
@@ -57,13 +60,15 @@ class Outcomes:
 
 
 def experts(cfg: dict[str, Any]) -> None:
-    """Print each task's success on evaluate.episodes unseen seeds, with Wilson intervals: of the expert, in
-    the suite as it is and in each of task.variants, and of behaviour as noisy as collect.noise_level says,
-    and random.
+    """Print each task's success on evaluate.episodes unseen seeds, with Wilson intervals, and how many were
+    dropped: of the expert, in the suite as it is and in each of task.variants, and of behaviour as noisy as
+    collect.noise_level says, and random.
 
     Raises:
+        ConfigError: if the task has no physics.
         ExpertFails: if an expert succeeds in less than LEAST of its episodes.
     """
+    check_physics(cfg, "bench experts")
     low, high = cfg["collect"]["noise_level"]
     rows: list[tuple[str, Mapping[str, Any], float]] = [("expert", {}, 0.0)]
     rows += [(f"expert, {name}", changes, 0.0) for name, changes in cfg["task"].get("variants", {}).items()]
@@ -74,7 +79,7 @@ def experts(cfg: dict[str, Any]) -> None:
         for name, outcomes in _play(cfg, changes, level).items():
             entry = rate_entry(torch.tensor(outcomes.success))
             actions = f", {np.median(outcomes.actions):.0f} actions" if outcomes.actions else ""
-            print(f"  {name:<24} {rate_line(entry)}{actions}", flush=True)
+            print(f"  {name:<24} {rate_line(entry)}, {outcomes.dropped} dropped{actions}", flush=True)
             if level == 0.0 and rate(entry) < LEAST:
                 wrong.append(_complaint(f"{title}: {name}", outcomes, cfg))
     if wrong:
@@ -95,6 +100,8 @@ def _play(cfg: Mapping[str, Any], changes: Mapping[str, Any], level: float) -> d
             played = tasks_of_seeds(cfg, (track.seed for track in tracks))
             for name, track in zip(played, tracks, strict=True):
                 out[name].add(track)
+        for name in tasks_of_seeds(cfg, pool.lost):
+            out[name].dropped += 1
     finally:
         pool.close()
     return out

@@ -20,13 +20,12 @@ from actors.factory import build_judge, build_simulator
 from actors.process import prepare_process
 from envs.files import write_text
 from envs.simulators.replay import replay
-from envs.targets import ConfigError
 from pipeline.cli.words import root_of
 from pipeline.evaluation.fidelity.strides import VERDICTS, common_stride
 from pipeline.evaluation.fidelity.verdicts import judged, verdict_tables, verdict_text
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, Place, stage
-from pipeline.loop import has_physics
+from pipeline.loop import check_physics
 from pipeline.stages import collect, world
 from pipeline.stages.given import WORLD, Cfg, open_store
 from pipeline.stages.judging import stage as judging
@@ -63,8 +62,7 @@ def strides(cfg: dict[str, Any]) -> dict[int, dict[str, Any]]:
 
 def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[int, str]]:
     """The stages, and the names of those that measure, by stride: simulator_fit.first.strides."""
-    if not has_physics(cfg):
-        raise ConfigError("bench strides records its own episodes; choose a task with a suite (task=push)")
+    check_physics(cfg, "bench strides")
     graph = Graph(cfg, root)
     data = [graph.add("collect", collect.collect)]
     warm = graph.add("tokenizer", world.tokenizer, {"data": data}) if "codec" in cfg["simulator"] else ""

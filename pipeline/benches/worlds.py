@@ -21,6 +21,7 @@ from envs.precision import mixed_precision
 from envs.simulators.replay import future_of
 from envs.targets import ConfigError
 from pipeline.commands.demo_world import demo_recipe
+from pipeline.loop import check_physics
 
 _SHARD = 16  # episodes written while the next ones are played
 _CHUNKS = 8  # steps of a simulator that are timed
@@ -32,7 +33,11 @@ def collection(cfg: dict[str, Any], episodes: int = 64) -> dict[int, float]:
 
     Both collect the same episodes, so they carry out the same actions; a core that this process may not use
     is one that nobody uses, threads that write videos included.
+
+    Raises:
+        ConfigError: if the task has no physics, or this process may use one core only.
     """
+    check_physics(cfg, "bench collection")
     known = sorted(os.sched_getaffinity(0))
     if len(known) < 2:
         raise ConfigError("bench collection compares one core with two, and this process may use one only")
@@ -47,18 +52,19 @@ def collection(cfg: dict[str, Any], episodes: int = 64) -> dict[int, float]:
             with tempfile.TemporaryDirectory() as folder:
                 writer = LeRobotWriter(Path(folder) / "dataset", robot)
                 began = time.perf_counter()
-                actions = 0
+                actions = played = 0
                 with WriteBehind(writer) as behind:
                     for begin in range(0, episodes, _SHARD):
                         tracks = pool.script(jobs[begin : begin + _SHARD], task["chunk"])
                         behind.write([Episode.from_track(track, "noisy", robot) for track in tracks])
                         actions += sum(len(track) - 1 for track in tracks)
+                        played += len(tracks)
                 seconds[cores] = time.perf_counter() - began
             pool.close()
             rate, views = actions / seconds[cores], len(robot.cameras)
             print(
                 f"{cores} core(s): {rate:.0f} actions/s, {views * rate:.0f} view-frames/s at"
-                f" {list(task['size'])}, {episodes} episodes"
+                f" {list(task['size'])}, {played} episodes, {episodes - played} dropped"
             )
     finally:
         os.sched_setaffinity(0, known)

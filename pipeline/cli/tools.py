@@ -198,15 +198,15 @@ def tasks(words: Words) -> None:
     """list what can be tried in physics: suites, robots, tasks, scenes; of one all, and its pictures into a
     folder: worldloop tasks task=metaworld [pictures=FOLDER]
     """
-    from envs.physics.suite import build_suite
-    from pipeline.commands.tasks import chosen_tasks, table
+    from pipeline.commands.tasks import check_chosen, chosen_tasks, table
 
     wanted = [word.partition("=")[2] for word in words if word.startswith("pictures=")]
     found = chosen_tasks([word for word in words if not word.startswith("pictures=")])
-    if wanted and len(found) > 1:
-        raise ConfigError("say of which task: worldloop tasks task=metaworld pictures=FOLDER")
-    if len(found) == 1 and (suite := next(iter(found.values()))["suite"]):
-        build_suite(suite)  # or says what is wrong with the one that is asked for
+    for option, meant in (("pictures", "FOLDER"), ("task.name", "NAME")):
+        if len(found) > 1 and any(word.startswith(f"{option}=") for word in words):
+            raise ConfigError(f"say of which task: worldloop tasks task=metaworld {option}={meant}")
+    if len(found) == 1:
+        check_chosen(*found.values())
     print(table(found))
     if wanted:
         from pipeline.commands.task_pictures import draw  # loads torch

@@ -18,7 +18,6 @@ def policy_value(words: Words) -> None:
 
     with owning(root, "policy-value"):
         print(estimate(cfg, root))
-    print(f"{root}/policy-value.html, {root}/policy-value.json")
 
 
 def fidelity(words: Words) -> None:
@@ -31,7 +30,6 @@ def fidelity(words: Words) -> None:
 
     with owning(root, "fidelity"):
         print(measure(cfg, root))
-    print(f"{root}/fidelity.html, {root}/fidelity.json")
 
 
 def ewmbench(words: Words) -> None:
@@ -44,7 +42,6 @@ def ewmbench(words: Words) -> None:
 
     with owning(root, "ewmbench"):
         print(measure(cfg, root))
-    print(f"{root}/ewmbench.html, {root}/ewmbench.json")
 
 
 def summary(words: Words) -> None:
@@ -54,11 +51,10 @@ def summary(words: Words) -> None:
     from pipeline.cli.words import root_of
     from pipeline.config import load_config
 
-    root = root_of(load_config(words))
+    cfg = load_config(words)
     from pipeline.commands.worlds.summary import summary as joined
 
-    print(joined(root))
-    print(f"{root}/summary.html")
+    print(joined(cfg, root_of(cfg)))
 
 
 def evaluate_simulator(name: str, words: Words) -> None:

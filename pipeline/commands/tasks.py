@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from envs.physics.suite import build_suite
+from envs.physics.suite import build_suite, check_task, task_names
 from envs.targets import ConfigError, nearest
 from pipeline.config import choices, read_config
 
@@ -27,6 +27,18 @@ def chosen_tasks(words: Sequence[str]) -> dict[str, dict[str, Any]]:
             raise ConfigError(f"task={name} is not a choice of configs/task{nearest(name, known)}")
     rest = [word for word in words if not word.startswith("task=")]
     return {name: read_config([*rest, f"task={name}"])["task"] for name in named[-1:] or known}
+
+
+def check_chosen(task: Mapping[str, Any]) -> None:
+    """See that the suite of a section task can be built, and that it has the tasks that are named.
+
+    Raises:
+        ConfigError: naming the key and the nearest names.
+    """
+    if task["suite"]:
+        suite = build_suite(task["suite"])
+        for name in task_names(task["name"]):
+            check_task(name, suite.tasks)
 
 
 def table(found: Mapping[str, Mapping[str, Any]]) -> str:

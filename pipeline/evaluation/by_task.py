@@ -13,6 +13,8 @@ from envs.physics.suite import TaskSuite, build_suite, scene_of, task_names, tas
 from envs.targets import ConfigError, nearest
 
 T = TypeVar("T")
+_MOST = 8  # instructions that are told apart, where they alone tell tasks apart
+VARIOUS = "various instructions"  # in place of a task, where there are more
 
 
 def tasks_of_seeds(cfg: Mapping[str, Any], seeds: Iterable[int]) -> list[str]:
@@ -29,7 +31,10 @@ def variant_of(cfg: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     """
     known = cfg["task"].get("variants", {})
     if name and not known:
-        raise ConfigError(f"variant={name}: this task has no variants; leave it out, or add task.variants")
+        raise ConfigError(
+            f"variant={name}: this task has no variants; leave it out (a study's column by"
+            " if_chosen.study.<study>.columns=[success]), or add task.variants"
+        )
     if name and name not in known:
         raise ConfigError(f"variant={name} is not one of task.variants{nearest(name, known)}")
     return dict(known[name]) if name else {}
@@ -74,6 +79,15 @@ def tasks_of_episodes(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor
         laid_out = iter(tasks_told(suite, names, told))
         tasks = [(known and next(laid_out)) or task for known, task in zip(seeded, tasks, strict=True)]
     return tasks
+
+
+def groups_of_episodes(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor) -> list[str]:
+    """The task of each of a store's episodes int64 [N], to have figures of each: as tasks_of_episodes, but
+    where words alone tell tasks apart, people say one thing in many ways, and more than _MOST are one group.
+    """
+    tasks = tasks_of_episodes(cfg, store, episodes)
+    many = not cfg["task"].get("suite") and len(set(tasks)) > _MOST
+    return [VARIOUS] * len(tasks) if many else tasks
 
 
 def evenly(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor, count: int) -> Tensor:

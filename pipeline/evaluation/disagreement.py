@@ -25,21 +25,23 @@ def compared(
 
     episode, its number in the store; seed, source, task, scene and instruction; success as recorded, None if
     nobody labelled it; recorded and generated, the judge's confidence that the episode succeeded on either
-    video; claims, its verdict on the generated one; disagreement in 0..1, how far its confidence on the
-    generated video lies from the recorded success, or where that is unknown from its confidence on the
-    recorded video. Where the judge gave no judgement they are None, and disagreement 0.
+    video; claims, its verdict on the generated one; disagreement in 0..1, how far it is on generated video
+    (see `_sure`) from the recorded success, or where that is unknown from where it is on recorded video:
+    above a half its verdict is another than the truth. Where the judge gave no judgement they are None, and
+    disagreement 0.
     """
     over = ~made.valid
     recorded, generated = (
         _rounded(judge.confidence(scores.success.masked_fill(over, 0.0)), scores.judged) for scores in views
     )
-    device = judge.threshold.device
+    device, threshold = judge.threshold.device, float(judge.threshold)
     claims = judge.episode(views.generated.success.to(device), made.valid.to(device)).tolist()
     tasks, scenes = (of(cfg, store, episodes) for of in (tasks_of_episodes, scenes_of_episodes))
     rows = []
     for n, number in enumerate(episodes.tolist()):
         about = store.episodes[number]
-        truth = recorded[n] if about["success"] is None else float(about["success"])
+        known = about["success"]
+        truth = _sure(recorded[n], threshold) if known is None else float(known)
         rows.append(
             {
                 "episode": number,
@@ -49,7 +51,7 @@ def compared(
                 "recorded": recorded[n],
                 "generated": generated[n],
                 "claims": None if generated[n] is None else bool(claims[n]),
-                "disagreement": _apart(generated[n], truth),
+                "disagreement": _apart(_sure(generated[n], threshold), truth),
             }
         )
     return rows
@@ -59,6 +61,17 @@ def _rounded(confidence: Tensor, judged: Tensor) -> list[float | None]:
     """Confidences [N] as they are written down, None where they are worth nothing."""
     pairs = zip(confidence.tolist(), judged.tolist(), strict=True)
     return [round(value, _DIGITS) if known else None for value, known in pairs]
+
+
+def _sure(confidence: float | None, threshold: float) -> float | None:
+    """A confidence in 0..1 on a scale on which the judge's threshold, where it is as likely right as wrong,
+    is a half.
+    """
+    if confidence is None:
+        return None
+    if confidence < threshold:
+        return 0.5 * confidence / threshold
+    return 0.5 + 0.5 * (confidence - threshold) / max(1 - threshold, 1e-6)
 
 
 def _apart(one: float | None, other: float | None) -> float:

@@ -1,11 +1,11 @@
-"""Honest numbers: Wilson intervals, the exact McNemar test, confusion tables."""
+"""Honest numbers: Wilson intervals, the exact McNemar test, Student's t over seeds, confusion tables."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from scipy.stats import binomtest
+from scipy.stats import binomtest, ttest_1samp
 from torch import Tensor
 
 
@@ -48,6 +48,19 @@ def mcnemar(before: Tensor, after: Tensor) -> dict[str, Any]:
     discordant = gained + lost
     p = float(binomtest(gained, discordant, 0.5).pvalue) if discordant else 1.0
     return {"gained": gained, "lost": lost, "p": p}
+
+
+def over_seeds(gains: Sequence[float], confidence: float = 0.95) -> dict[str, Any]:
+    """{"mean", "low", "high", "p"} of what a method gained with two seeds of training or more: Student's t,
+    which takes a seed for one observation however many episodes its policy played; p is None if all are
+    alike.
+    """
+    mean = sum(gains) / len(gains)
+    if max(gains) == min(gains):
+        return {"mean": mean, "low": mean, "high": mean, "p": None}
+    test = ttest_1samp(gains, 0.0)
+    low, high = test.confidence_interval(confidence)
+    return {"mean": mean, "low": float(low), "high": float(high), "p": float(test.pvalue)}
 
 
 def confusion(predicted: Tensor, truth: Tensor) -> dict[str, Any]:

@@ -166,7 +166,11 @@ def first_frames(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     finally:
         pool.close()
     LeRobotWriter(data, robot).write([Episode.from_track(track, "start", robot) for track in tracks])
-    return {"starts": len(open_clips(cfg, [data])), "physics_episodes": {"first frames": len(seeds)}}
+    return {
+        "starts": len(open_clips(cfg, [data])),
+        "dropped": len(seeds) - len(tracks),
+        "physics_episodes": {"first frames": len(tracks)},
+    }
 
 
 @stage(reads=(*ROBOT, "extra_starts.data"))

@@ -46,8 +46,9 @@ DATASETS = "datasets.json"  # of a stage whose data sets lie elsewhere: a list o
 
 
 def fit_options(cfg: Cfg, section: Mapping[str, Any], key: str) -> FitConfig:
-    """FitConfig of a section, seeded by the experiment."""
-    return options(FitConfig, {**section, "seed": cfg["seed"], "microbatches": cfg["microbatches"]}, key)
+    """FitConfig of the section at `key`, such as imitation.fit, seeded by the experiment."""
+    given = {"seed": cfg["seed"], "microbatches": cfg["microbatches"], "key": key}
+    return options(FitConfig, {**section, **given}, key)
 
 
 def rl_options(cfg: Cfg, **more: Any) -> RLConfig:

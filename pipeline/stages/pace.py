@@ -68,9 +68,9 @@ def pace(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     decoder = build_state_decoder(cfg, model)
     first = dict(cfg["simulator_fit"]["first"])
     fits = {
-        "tokenizer": cfg["tokenizer_fit"],
-        "simulator": first.pop("fit"),
-        "state": cfg["state_fit"]["first"]["fit"],
+        "tokenizer": (cfg["tokenizer_fit"], "tokenizer_fit"),
+        "simulator": (first.pop("fit"), "simulator_fit.first.fit"),
+        "state": (cfg["state_fit"]["first"]["fit"], "state_fit.first.fit"),
     }
     how = options(SimulatorFitConfig, first, "simulator_fit.first")
     common = (store, episodes)
@@ -88,7 +88,7 @@ def pace(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     for part, train in trained.items():
         if not present[part]:
             continue
-        fit = fit_options(cfg, fits[part], part)
+        fit = fit_options(cfg, *fits[part])
         train(replace(fit, steps=_WARM_UP), trial / f"{part}-warm-up")
         fit = replace(fit, steps=cfg["equal_time"]["measured"])
         spent = train(fit, trial / part)

@@ -41,7 +41,11 @@ def variant_episodes(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     sources = dict(zip(seeds, (source for *_, source in jobs), strict=True))
     made = [Episode.from_track(track, sources[track.seed], robot) for track in tracks]
     LeRobotWriter(data, robot).write(made)
-    return {"episodes": len(made), "successes": sum(bool(track.rows["success"][-1]) for track in tracks)}
+    return {
+        "episodes": len(made),
+        "dropped": count - len(made),
+        "successes": sum(bool(track.rows["success"][-1]) for track in tracks),
+    }
 
 
 @stage(reads=())

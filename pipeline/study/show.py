@@ -11,6 +11,11 @@ from pipeline.evaluation.report import templates
 from pipeline.study.columns import Column
 from pipeline.study.side_by_side import NOT_RUN, best_of, headlines
 
+OVER_SEEDS = (
+    "Rows over several seeds count the episodes of all their policies: their intervals, and McNemar's p, hold"
+    " for these policies. What other seeds may bring is told by the gains by seed, with Student's interval at"
+    " 95% and p, which take a seed for one observation."
+)
 Lines = list[list[str]]
 Columns = Mapping[str, Column]
 
@@ -43,6 +48,8 @@ def markdown(table: Mapping[str, Any], columns: Columns) -> str:
         rows = [lines[0], ["---"] * len(lines[0]), *lines[1:]]
         parts.append(f"## {title}\n\n" + "\n".join(f"| {' | '.join(row)} |" for row in rows))
     parts += best_of(table, columns)
+    if table["pooled"]:
+        parts.append(OVER_SEEDS)
     parts += [f"{title}: {text}." for title, text in notes_of(table).items()]
     return "\n\n".join(parts) + "\n"
 
@@ -55,7 +62,7 @@ def page(table: Mapping[str, Any], columns: Columns, charts: Sequence[Markup]) -
         .render(
             name=table["name"],
             sections=sections_of(table, columns),
-            best=best_of(table, columns),
+            best=[*best_of(table, columns), *([OVER_SEEDS] if table["pooled"] else [])],
             charts=charts,
             notes=notes_of(table),
             not_run=NOT_RUN,
@@ -94,7 +101,12 @@ def _cell(column: Column, cells: Mapping[str, Any], label: str) -> str:
 def _gain(cell: Mapping[str, Any] | None) -> str:
     if cell is None:
         return "-"
-    return f"{cell['gain']:+.1f}, p {cell['p']:.2g} ({cell['gained']} won, {cell['lost']} lost)"
+    text = f"{cell['gain']:+.1f}, p {cell['p']:.2g} ({cell['gained']} won, {cell['lost']} lost)"
+    if over := cell.get("over_seeds"):
+        known = "" if over["p"] is None else f", p {over['p']:.2g}"
+        gains = ", ".join(f"{gain:+.1f}" for gain in cell["by_seed"])
+        text += f"; by seed {gains} [{over['low']:+.1f}, {over['high']:+.1f}]{known}"
+    return text
 
 
 def _episodes(row: Mapping[str, Any]) -> str:

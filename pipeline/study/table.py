@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from pipeline.evaluation.statistics import mcnemar
-from pipeline.study.columns import ALL, Measured, together
+from pipeline.evaluation.statistics import mcnemar, over_seeds
+from pipeline.study.columns import ALL, Measured, Outcomes
 from pipeline.study.plan import Row, Study
 
 Table = dict[str, Any]
@@ -26,7 +26,8 @@ def study_table(study: Study) -> Table:
         acted and minutes, both None before what the row is about is there, and cells by column and label, of
         those labels that the row has); pooled (the same rows over all their seeds, where several were run);
         comparisons (row, place, other, title, column, seeds, and by label gain in points, episodes, and
-        McNemar's gained, lost, p of the same episodes).
+        McNemar's gained, lost, p of the same episodes; with several seeds by_seed, the gain of each, and
+        over_seeds, see statistics.over_seeds).
     """
     found = measured(study)
     rows = {row.key: row for row in study.rows}
@@ -126,15 +127,17 @@ def _compared(
     """
     mine, theirs = found[row.key, column], found[(other, row.place), column]
     seeds = [seed for seed in mine if seed in theirs]
-    after, before = (together([side[seed].outcomes for seed in seeds]) for side in (mine, theirs))
-    pairs = [(task, before[task, seed], won) for (task, seed), won in after.items() if (task, seed) in before]
-    if not pairs:
+    pairs = [_pairs(theirs[seed].outcomes, mine[seed].outcomes) for seed in seeds]
+    if not any(pairs):
         return None
     cells: dict[str, Any] = {}
     for label in labels:
-        chosen = [(one, two) for task, one, two in pairs if label in (task, ALL)]
-        if chosen:
-            cells[label] = gain_of(*zip(*chosen, strict=True))
+        chosen = [[(one, two) for task, one, two in some if label in (task, ALL)] for some in pairs]
+        if all(chosen):
+            cells[label] = gain_of(*zip(*(pair for some in chosen for pair in some), strict=True))
+            if len(chosen) > 1:
+                gains = [gain_of(*zip(*some, strict=True))["gain"] for some in chosen]
+                cells[label] |= {"by_seed": gains, "over_seeds": over_seeds(gains)}
     return {
         "row": row.name,
         "place": row.place,
@@ -144,6 +147,11 @@ def _compared(
         "seeds": seeds,
         "cells": cells,
     }
+
+
+def _pairs(before: Outcomes, after: Outcomes) -> list[tuple[str, bool, bool]]:
+    """Task, and success before and after, of the episodes that both have."""
+    return [(where[0], before[where], won) for where, won in after.items() if where in before]
 
 
 def gain_of(before: Sequence[bool], after: Sequence[bool]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import torch
 
 from envs.conditioning import ActionVector
 from envs.embodiment import Embodiment
-from envs.encoders import MultiViewEncoder, QueriedKeypoints, centres, to_signed
+from envs.encoders.images import MultiViewEncoder, QueriedKeypoints, centres, to_signed
 from envs.specs import IMAGE
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, EMBODIMENTS, observations, world_spec
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from envs.language import TextEncoder
+from envs.encoders.language import TextEncoder
 from envs.specs import TEXT_BYTES, text_to_bytes
 
 

@@ -19,7 +19,7 @@ from envs.specs import WorldSpec
 from envs.targets import TARGET, ConfigError, _within, target
 from pipeline.checks import faults
 from pipeline.cli.words import prepared
-from pipeline.config import CONFIGS, choices, groups, load_config
+from pipeline.config import CONFIGS, choices, groups, load_config, read_config
 from pipeline.loop import build_loop
 
 
@@ -372,3 +372,12 @@ def test_an_option_has_one_default(path: Path) -> None:
         return
     kind = target(section, path.stem)
     assert not list(doubled(getattr(kind, "config_type", kind), section, path.stem))
+
+
+@pytest.mark.parametrize("experiment", ["metaworld5", "aloha", "bench4", "roboscape"])
+@pytest.mark.parametrize("task", ["metaworld", "aloha"])
+def test_what_is_out_of_domain_is_learned_from_in_no_suite(experiment: str, task: str) -> None:
+    cfg = read_config([f"experiment={experiment}", f"task={task}"])
+    assert cfg["extra_starts"]["variants"] == ["out_of_domain"]
+    assert cfg["task"]["suite"]["starts"] == "inner"
+    assert cfg["task"]["variants"]["out_of_domain"]["starts"] == "outer"

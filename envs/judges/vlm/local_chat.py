@@ -13,6 +13,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from envs.encoders.pretrained import read_pretrained
 from envs.judges.vlm.chat import Question, Reply
 from envs.ranges import Count, NonNegative
 from envs.rng import vote_generator
@@ -147,11 +148,11 @@ def _load(folder: Path, dtype: str, device: str) -> tuple[Any, Any]:
         ) from error
     try:
         processor = AutoProcessor.from_pretrained(folder, local_files_only=True)
-        model: Any = AutoModelForImageTextToText.from_pretrained(
-            folder, local_files_only=True, use_safetensors=True, dtype=dtype
-        )
+        model: Any = read_pretrained(AutoModelForImageTextToText, folder, "judge.chat.path", dtype=dtype)
+    except ConfigError:
+        raise
     except (OSError, ValueError, ImportError, KeyError) as error:
         raise ConfigError(f"judge.chat.path={folder}: transformers cannot load it: {error}") from error
     if getattr(processor, "chat_template", None) is None:
         raise ConfigError(f"judge.chat.path={folder} holds no chat template, by which questions are put")
-    return processor, model.to(device).eval()
+    return processor, model.to(device)

@@ -9,7 +9,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from envs.language import FEATURES, TextEncoder
+from envs.encoders.language import FEATURES, TextEncoder
+from envs.encoders.pretrained import read_pretrained
 from envs.ranges import Count
 from envs.simulators.row_linear import RowLinear
 from envs.specs import TEXT_BYTES, text_to_bytes
@@ -41,7 +42,7 @@ class WordEncoder(Protocol):
 
 
 class HashedWords:
-    """The fixed features of envs/language.py: a text is one token, and nothing is downloaded."""
+    """The fixed features of envs/encoders/language.py: a text is one token, and nothing is downloaded."""
 
     tokens, size = 1, FEATURES
 
@@ -85,8 +86,8 @@ class T5Words:
         self.tokens = max_tokens
         self._cut: Any = AutoTokenizer.from_pretrained(folder, local_files_only=True)
         with torch.device("cpu"):  # also where a model is built without memory: it is no part of its weights
-            model = T5EncoderModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)
-        self._model: Any = model.eval().requires_grad_(False)
+            model = read_pretrained(T5EncoderModel, folder, "text_world.words.folder")
+        self._model: Any = model.requires_grad_(False)
         self.size = int(model.config.d_model)
 
     def check(self, texts: Sequence[str]) -> None:

@@ -20,7 +20,7 @@ from envs.files import write_text
 from envs.judges.vlm import VLMJudge
 from envs.targets import ConfigError, build, target
 from pipeline.commands.worlds.subject import Subject
-from pipeline.evaluation.by_task import tasks_of_episodes
+from pipeline.evaluation.by_task import groups_of_episodes
 from pipeline.evaluation.ewmbench.choose import BenchSet, Paths, choose, in_pictures, in_space
 from pipeline.evaluation.ewmbench.features import PatchExtractor, TextExtractor
 from pipeline.evaluation.ewmbench.measure import Instruments
@@ -84,11 +84,11 @@ class Extractors:
 
 
 def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
-    """Measure; writes ewmbench.json and ewmbench.html into the run's folder, and keeps what it measures under
-    ewmbench/.
+    """Measure; writes ewmbench.json and ewmbench.html into the simulator's folder (see pages_of), and keeps
+    what it measures under ewmbench/ in the run's.
 
     Returns:
-        The figures, as Markdown.
+        The figures, as Markdown, and where they lie.
 
     Raises:
         ConfigError: if what is named is not there or cannot work.
@@ -141,15 +141,15 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
         extractors.texts,
         () if reader is None else reader.errors,
     )
-    tasks = tasks_of_episodes(cfg, store, chosen.episodes)
+    group = dict(zip(held.tolist(), groups_of_episodes(cfg, store, held), strict=True))
     rows = [
         {
             "episode": number,
-            "task": task,
+            "task": group[number],
             "instruction": store.instructions[number],
             **scoring.episode(made[number], true[number], store.instructions[number]),
         }
-        for number, task in zip(chosen.episodes.tolist(), tasks, strict=True)
+        for number in chosen.episodes.tolist()
     ]
     notes += [NO_MODEL] * (reader is None) + [PARITY] * section["strict_parity"]
     notes += without_picture(store, chosen.episodes)
@@ -177,10 +177,12 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
         "rows": rows,
         "notes": notes,
     }
-    write_text(root / "ewmbench.json", json.dumps(result, indent=1))
+    page = subject.pages / "ewmbench.html"
+    write_text(page.with_suffix(".json"), json.dumps(result, indent=1))
     films = {row["episode"]: samples.film(row["episode"], row["best"]) for row in rows}
-    write_text(root / "ewmbench.html", build_page(result, films))
-    return f"{summary_text(result)}\n{samples.made.reused} samples were reused"
+    write_text(page, build_page(result, films))
+    reused = f"{samples.made.reused} samples were reused"
+    return f"{summary_text(result)}\n{page}, {page.with_suffix('.json')}\n{reused}"
 
 
 def reader_of(cfg: Mapping[str, Any]) -> Reader | None:
@@ -201,7 +203,7 @@ def bench_set(cfg: Mapping[str, Any], store: ClipStore, held: Tensor, ruler: Gri
         paths = in_space(store, known_ends(cfg, store), held)
     except EmbodimentError:
         paths = None if ruler is None else in_pictures(store, ruler, held)
-    return choose(held, tasks_of_episodes(cfg, store, held), section["episodes"], section["voxel"], paths)
+    return choose(held, groups_of_episodes(cfg, store, held), section["episodes"], section["voxel"], paths)
 
 
 def _identity(

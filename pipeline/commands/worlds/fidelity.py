@@ -5,7 +5,7 @@ episodes.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from pipeline.evaluation.fidelity.strides import by_stride, common_stride
 from pipeline.evaluation.fidelity.verdicts import verdict_tables
 from pipeline.evaluation.measurement import evenly, groups, speed
 from pipeline.graph.code_version import code_of
-from pipeline.graph.kept import Kept
+from pipeline.graph.kept import Kept, Tensors
 from pipeline.loop import has_physics
 
 Cfg = Mapping[str, Any]
@@ -37,21 +37,21 @@ _MODULE = "pipeline.evaluation.fidelity.open_loop"
 
 
 def fidelity(cfg: Cfg, root: Path) -> str:
-    """Measure; writes fidelity.json and fidelity.html into the run's folder.
+    """Measure; writes fidelity.json and fidelity.html into the simulator's folder (see pages_of).
 
     Returns:
-        The figures, as Markdown.
+        The figures, as Markdown, and where they lie.
 
     Raises:
         ConfigError: if what is named is not there or cannot work.
         JudgeError: if there are strides, and the judge cannot be asked any more; the same command goes on.
     """
-    section = cfg["fidelity"]
+    section, subject = cfg["fidelity"], Subject.of(cfg, root)
+    cfg = subject.cfg
     # what cannot work is told before anything is measured
     tried = {} if section["grid"] is None else section["grid"]
     settled = [with_settings(cfg, settings) for settings in combinations(tried)] if tried else []
     extractors = build_extractors(section)
-    subject = Subject.of(cfg, root)
     for other in settled:  # options that change what the weights are of are refused here
         subject.simulator(other)
     store = subject.store()
@@ -62,9 +62,9 @@ def fidelity(cfg: Cfg, root: Path) -> str:
     episodes = evenly(held, section["episodes"])
     strides = _checked_strides(section["strides"], store, episodes)
     simulator = subject.simulator()
-    labels = part_labels(cfg, store, episodes, section["masks"])
-    hands = end_effector_ruler(subject.cfg, store, subject.data, root)
     kept = Kept(root / "fidelity")
+    labels = _labels(cfg, subject, store, episodes, kept)
+    hands = end_effector_ruler(cfg, store, subject.data, root)
     loop = OpenLoop(
         *(store, episodes, cfg["simulator"]["bf16"], labels, extractors, section["clip"], hands),
         kept=kept,
@@ -101,9 +101,30 @@ def fidelity(cfg: Cfg, root: Path) -> str:
         result["strides"] = by_stride(_with_judge(subject, alone), simulator, strides)
     if settled:
         result["grid"] = _grid(cfg, subject, alone, tried, len(settled))
-    write_text(root / "fidelity.json", json.dumps(result, indent=1))
-    write_text(root / "fidelity.html", build_page(result))
-    return f"{summary_text(result)}\n{kept.reused} parts were reused"
+    page = subject.pages / "fidelity.html"
+    write_text(page.with_suffix(".json"), json.dumps(result, indent=1))
+    write_text(page, build_page(result))
+    return f"{summary_text(result)}\n{page}, {page.with_suffix('.json')}\n{kept.reused} parts were reused"
+
+
+def _labels(cfg: Cfg, subject: Subject, store: ClipStore, episodes: Tensor, kept: Kept) -> Tensor | None:
+    """See masks.part_labels; what physics said is kept, for it says the same of every simulator."""
+    masks = cfg["fidelity"]["masks"]
+    if masks is not None:
+        return part_labels(cfg, store, episodes, masks)
+
+    def asked() -> Tensors:
+        found = part_labels(cfg, store, episodes, None)
+        return {} if found is None else {"labels": found}
+
+    suite = {"suite": cfg["task"].get("suite")}
+    about = {
+        "data": subject.data_mark(),
+        "size": list(store.spec.size),
+        "episodes": episodes.tolist(),
+        **suite,
+    }
+    return kept.get("labels", {**about, "code": code_of(part_labels.__module__, suite)}, asked).get("labels")
 
 
 def build_extractors(section: Mapping[str, Any]) -> list[Extractor]:
@@ -173,13 +194,16 @@ def _long(cfg: Cfg, root: Path, subject: Subject, store: ClipStore, loop: OpenLo
         episodes = torch.arange(len(store))
     else:
         episodes = longest(store, subject.held_out(store), section["episodes"])
-    assert loop.kept is not None
     code = code_of(drift.__module__, cfg["simulator"])
     about = {**loop.identity, "long": dict(section), "episodes": episodes.tolist(), "code": code}
     if has_physics(cfg):  # which records them, whatever data are looked at
         about["physics"] = cfg["task"]
-    bf16, distance = cfg["simulator"]["bf16"], loop.distance
-    out = loop.kept.figures("long", about, lambda: drift(simulator, store, episodes, bf16, distance))
+
+    def keep(places: list[int], make: Callable[[], Tensors]) -> Tensors:
+        assert loop.kept is not None
+        return loop.kept.get(f"long-{places[0]}", {**about, "places": places}, make)
+
+    out = drift(simulator, store, episodes, cfg["simulator"]["bf16"], loop.distance, keep)
     return {"wanted": section["frames"], **out}
 
 

@@ -38,15 +38,17 @@ OPEN_LOOP = (
 
 
 def policy_value(cfg: Mapping[str, Any], root: Path) -> str:
-    """Estimate values; writes policy-value.json and policy-value.html into the run's folder.
+    """Estimate values; writes policy-value.json and policy-value.html into the simulator's folder (see
+    pages_of).
 
     Returns:
-        The table, as Markdown.
+        The table, as Markdown, and where it lies.
 
     Raises:
         ConfigError: if what is named is not there, or there is nothing to compare.
     """
     subject, section = Subject.of(cfg, root), cfg["policy_value"]
+    cfg = subject.cfg
     physics_there = has_physics(cfg)
     given = policies_of(subject)
     everybody = candidates(given, section["noise"], section["experts"] if physics_there else ())
@@ -75,9 +77,10 @@ def policy_value(cfg: Mapping[str, Any], root: Path) -> str:
         "agreement": agreement(cells),
         "notes": notes(section, starts, everybody, cells),
     }
-    write_text(root / "policy-value.json", json.dumps(result, indent=1))
-    write_text(root / "policy-value.html", build_page(result))
-    return f"{table_text(result)}\n{kept.reused} parts were reused"
+    page = subject.pages / "policy-value.html"
+    write_text(page.with_suffix(".json"), json.dumps(result, indent=1))
+    write_text(page, build_page(result))
+    return f"{table_text(result)}\n{page}, {page.with_suffix('.json')}\n{kept.reused} parts were reused"
 
 
 def policies_of(subject: Subject) -> dict[str, tuple[Mapping[str, Any], Path | None]]:

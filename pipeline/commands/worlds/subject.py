@@ -13,7 +13,7 @@ from actors.factory import build_judge, build_simulator, build_state_decoder, op
 from actors.weights import load
 from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge
-from envs.manifest import mark_of
+from envs.manifest import mark_of, read_manifest
 from envs.simulators.base import Simulator
 from envs.simulators.state_experts.base import StateDecoder
 from envs.targets import ConfigError
@@ -36,12 +36,16 @@ class Subject:
         graph: of the run.
         weights: files of simulator, state and judge, by role.
         data: data sets.
+        student: function evaluations of a chunk, if the simulator is a few-step student; else 0.
+        pages: folder of what is measured of it.
     """
 
     cfg: Cfg
     graph: Graph
     weights: Mapping[str, Path]
     data: list[Path]
+    student: int
+    pages: Path
 
     @classmethod
     def of(cls, cfg: Cfg, root: Path) -> Subject:
@@ -51,7 +55,6 @@ class Subject:
             ConfigError: if what is named is not there.
         """
         graph, section = build_loop(cfg, root), cfg["imagined"]
-        cfg = graph.cfg  # of the world that is acted in
         inputs = graph.inputs("evaluate-imagined")
         weights = {
             role: weights_at(graph, section[role], f"imagined.{role}")
@@ -59,6 +62,15 @@ class Subject:
             else inputs.folder(role) / WEIGHTS
             for role in ("simulator", "state", "judge")
         }
+        named = section["simulator"]
+        made_as = stage_of(weights["simulator"]) if named else "student"
+        student = cfg["distill"]["steps"] if made_as != "simulator" else 0
+        if made_as == "student" and named and not student:
+            raise ConfigError(
+                f"imagined.simulator={named} is a few-step student, which distill.steps=0 would sample as its"
+                " teacher; say distill.steps=<as it was distilled>"
+            )
+        cfg = graph.cfg if student else cfg  # a teacher is sampled as one, whatever the run acts in
         if section["data"]:
             data = [Path(folder) for folder in section["data"]]
         elif has_physics(cfg):
@@ -71,7 +83,7 @@ class Subject:
                 f"{missing[0]} is no LeRobot data set (yet); run the stages that record, or name data sets by"
                 " imagined.data=[folder]"
             )
-        return cls(cfg, graph, weights, data)
+        return cls(cfg, graph, weights, data, student, pages_of(root, graph, section))
 
     def store(self) -> ClipStore:
         """Its data sets."""
@@ -87,7 +99,8 @@ class Subject:
         if not len(held):
             raise ConfigError(
                 f"no episode of {[str(folder) for folder in self.data]} is held out; name other data sets by"
-                " imagined.data=[folder], or give these a split 'held_out' (envs/episodes/splits.py)"
+                " imagined.data=[folder], or say in meta/info.json of these which are, as in"
+                ' "splits": {"train": "0:4", "held_out": "4:5"}'
             )
         return held
 
@@ -132,9 +145,10 @@ class Subject:
         """What is looked at, for people: name, classes of simulator and judge, the weights' files, and their
         marks, by which a file that was written anew is another.
         """
+        engine = str(self.cfg["simulator"]["_target_"]).rpartition(".")[2]
         return {
             "name": self.cfg["name"],
-            "simulator": str(self.cfg["simulator"]["_target_"]).rpartition(".")[2],
+            "simulator": f"{engine}, a student of {self.student} evaluations" if self.student else engine,
             "judge": str(self.cfg["judge"]["_target_"]).rpartition(".")[2],
             "weights": {role: str(path) for role, path in self.weights.items()},
             "marks": {role: mark_of(path) for role, path in self.weights.items()},
@@ -150,6 +164,26 @@ class Subject:
             "weights": {role: mark_of(self.weights[role]) for role in roles},
             **(judge_files(self.cfg) if "judge" in roles else {}),
         }
+
+
+def pages_of(root: Path, graph: Graph, section: Mapping[str, Any]) -> Path:
+    """The folder of what is measured of a run's simulator: the run's own, and one of its own for each that
+    imagined.simulator names.
+
+    Args:
+        section: imagined.
+    """
+    name = section["simulator"]
+    if not name:
+        return root
+    path = weights_at(graph, name, "imagined.simulator")
+    place = path.parent.name if path.name == WEIGHTS else path.stem
+    return root / "simulators" / (name if name in graph.nodes else f"{place}-{mark_of(path)[:8]}")
+
+
+def stage_of(weights: Path) -> str:
+    """The stage that left weights, without its round, such as simulator or student; "" of others."""
+    return str((read_manifest(weights.parent) or {}).get("stage", "")).partition("-")[0]
 
 
 def weights_at(graph: Graph, name: str, key: str) -> Path:

@@ -9,43 +9,43 @@ from typing import Any
 
 from envs.files import write_text
 from envs.targets import ConfigError
+from pipeline.commands.worlds.subject import pages_of
 from pipeline.evaluation.joined.page import build_page, parts_of, summary_text
+from pipeline.loop import build_loop
 
 RESULTS = ("fidelity", "ewmbench", "policy-value")  # commands, and the names of what they write
 
 
-def summary(root: Path) -> str:
-    """Write summary.html into the run's folder, from what is there.
+def summary(cfg: Mapping[str, Any], root: Path) -> str:
+    """Write summary.html into the simulator's folder (see pages_of), from what is there. What was measured of
+    other weights than the newest result, such as before they were trained anew, is left out.
 
     Returns:
-        The table, as Markdown.
+        The table, as Markdown, and where the page lies.
 
     Raises:
-        ConfigError: if nothing has been measured, or different weights were: of other files, or of one that
-            was written anew in between.
+        ConfigError: if nothing has been measured.
     """
-    found = {name: _read(root / f"{name}.json") for name in RESULTS}
-    there = {name: result for name, result in found.items() if result is not None}
+    folder = pages_of(root, build_loop(cfg, root), cfg["imagined"])
+    files = {name: folder / f"{name}.json" for name in RESULTS}
+    there = {name: dict(json.loads(file.read_text())) for name, file in files.items() if file.is_file()}
     if not there:
         raise ConfigError(
-            f"nothing was measured of the simulator of {root}: first `worldloop fidelity`, `worldloop"
+            f"nothing was measured of the simulator of {folder}: first `worldloop fidelity`, `worldloop"
             " ewmbench` or `worldloop policy-value` with the same options"
         )
-    weights = {name: _weights(result) for name, result in there.items()}
-    if len(set(weights.values())) > 1:
-        measured = "; ".join(f"{name}: {path}, {mark[:12]}" for name, (path, mark) in weights.items())
-        raise ConfigError(f"different weights were measured ({measured}); measure anew, by equal options")
-    first = next(iter(there.values()))
-    parts = parts_of(*found.values())
-    page = build_page(first["name"], first["simulator"], first["weights"]["simulator"], parts)
-    write_text(root / "summary.html", page)
-    return summary_text(first["simulator"], parts)
+    newest = there[max(there, key=lambda name: files[name].stat().st_mtime)]
+    left_out = {
+        name: f"What {files[name].name} says is of other weights: {', '.join(_weights(result))}."
+        for name, result in there.items()
+        if _weights(result) != _weights(newest)
+    }
+    parts = parts_of({name: result for name, result in there.items() if name not in left_out}, left_out)
+    page = build_page(newest["name"], newest["simulator"], newest["weights"]["simulator"], parts)
+    write_text(folder / "summary.html", page)
+    return f"{summary_text(newest['simulator'], parts)}\n{folder / 'summary.html'}"
 
 
 def _weights(result: Mapping[str, Any]) -> tuple[str, str]:
     """The file of the simulator's weights and its mark; results of former versions hold no marks."""
     return result["weights"]["simulator"], result.get("marks", {}).get("simulator", "unknown")
-
-
-def _read(path: Path) -> dict[str, Any] | None:
-    return dict(json.loads(path.read_text())) if path.is_file() else None

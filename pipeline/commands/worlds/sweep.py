@@ -34,13 +34,14 @@ _HEIGHT = 128  # pixels of a picture, about
 
 
 def sweep(cfg: Mapping[str, Any], root: Path) -> list[Path]:
-    """Draw a contact sheet for each number of the action into the run's folder; beside them sweep.json says
-    what was commanded, and by how much pictures changed against those of a robot at rest.
+    """Draw a contact sheet for each number of the action into the simulator's folder (see pages_of); beside
+    them sweep.json says what was commanded, and by how much pictures changed against a robot's at rest.
 
     Raises:
         ConfigError: if there is no such episode, or what is named is not there.
     """
     section, subject = cfg["sweep"], Subject.of(cfg, root)
+    cfg = subject.cfg
     store = subject.store()
     if section["episode"] >= len(store):
         raise ConfigError(f"sweep.episode={section['episode']}: there are {len(store)}, from 0 on")
@@ -53,7 +54,7 @@ def sweep(cfg: Mapping[str, Any], root: Path) -> list[Path]:
     horizon = section["chunks"] * store.spec.chunk
     shared = {**cfg, "simulator": {**cfg["simulator"], "shared_noise": True}}  # rows differ by actions alone
     world = build_world(shared, *parts, starts, len(levels), horizon=horizon)
-    folder, about, made = root / "sweep", [], []
+    folder, about, made = subject.pages / "sweep", [], []
     for number, name in enumerate(tqdm(names, desc="sweep", unit="number", dynamic_ncols=True)):
         travel = torch.zeros(len(levels), len(names))
         travel[:, number] = torch.tensor(levels) * spread[number]

@@ -21,6 +21,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 from torch.nn import functional
 
+from envs.encoders.pretrained import read_pretrained
 from envs.judges.perceptual import PerceptualDistance
 from envs.manifest import digest_of
 from envs.targets import ConfigError
@@ -220,12 +221,12 @@ def pretrained(path: str, kinds: Sequence[str], title: str) -> tuple[Any, Any]:
                 f"path={path} is of another architecture: {config.model_type}, and {title} is one of"
                 f" {list(kinds)}; give its folder, or choose another extractor"
             )
-        network: Any = AutoModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)
+        network: Any = read_pretrained(AutoModel, folder, "path")
     except (OSError, ValueError, RuntimeError, KeyError, SafetensorError) as error:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"path={path}: transformers cannot load {title} from it: {error}") from error
-    return network.eval(), config
+    return network, config
 
 
 def fingerprint(path: str) -> str:

@@ -79,6 +79,8 @@ class Samples:
         """
         out: dict[int, Record] = {}
         for number in episodes.tolist():
+            if number in self.filmed and not self.film(number, draw).is_file():
+                continue  # measured without a film
             record = self.made.get(f"{number}-{draw}", self._about(number, draw))
             if record is not None:
                 out[number] = record

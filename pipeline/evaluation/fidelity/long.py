@@ -7,7 +7,7 @@ longest recordings there are.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +26,15 @@ from envs.simulators.base import Simulator
 from envs.simulators.replay import replay, side_by_side
 from pipeline.evaluation.fidelity.frames import by_frame, frame_errors, psnr
 
+Tensors = dict[str, Tensor]
+Keep = Callable[[list[int], Callable[[], Tensors]], Tensors]
 _TRIES = 4  # scripted episodes for each that is wanted; physics gives some up
 _END = 0.1  # share of an episode's frames that are its end
 _OFFSET = 500_000  # of their seeds among those of evaluation
+
+
+def _anew(places: list[int], make: Callable[[], Tensors]) -> Tensors:
+    return make()
 
 
 def long_episodes(cfg: Mapping[str, Any], folder: Path) -> ClipStore:
@@ -77,9 +83,13 @@ def drift(
     episodes: Tensor,
     bf16: bool,
     distance: PerceptualDistance,
+    keep: Keep = _anew,
 ) -> dict[str, Any]:
     """Error against frame number of long rollouts, and whether they collapse; frames of which no picture was
     recorded are left out.
+
+    Args:
+        keep: what is measured of the episodes at some places of `episodes`, now or at some earlier time.
 
     Returns:
         episodes and frames; by_frame, errors [T]; still and unrelated, the PSNR [T] of the first frame held
@@ -92,7 +102,7 @@ def drift(
     """
     rows, valid = store.whole(episodes)
     valid &= store.arrays["present"][rows]
-    errors = _rolled_out(simulator, store, episodes, bf16, distance)
+    errors = _rolled_out(simulator, store, episodes, bf16, distance, keep)
     sharp, still, unrelated = (errors.pop(name) for name in ("sharp", "still", "unrelated"))
     both = valid & valid.roll(1, 0) if len(episodes) > 1 else torch.zeros_like(valid)
     number = valid.long().cumsum(1)
@@ -117,28 +127,36 @@ def drift(
 
 
 def _rolled_out(
-    simulator: Simulator, store: ClipStore, episodes: Tensor, bf16: bool, distance: PerceptualDistance
-) -> dict[str, Tensor]:
+    simulator: Simulator,
+    store: ClipStore,
+    episodes: Tensor,
+    bf16: bool,
+    distance: PerceptualDistance,
+    keep: Keep,
+) -> Tensors:
     """Of N episodes, generated as many at once as have room: frames.frame_errors, and [N, T] each sharp, the
     gradient of generated over that of true frames, and the MSE of still, the first frame held, and of
     unrelated, the episode before; 0 where an episode is over.
     """
     rows, _ = store.whole(episodes)
-    out: dict[str, Tensor] = {}
-    for some in torch.arange(len(episodes)).split(side_by_side(store, 1 + rows.shape[1])):
+
+    def measured(some: Tensor) -> Tensors:
         made = replay(simulator, store, episodes[some], bf16=bf16).frames[:, : rows.shape[1]]
         count = made.shape[1]
         true, other = (store.frames(of[some, :count]) for of in (rows, rows.roll(1, 0)))
         first = store.frames(store.start[episodes[some]])[:, None]
-        found = {
+        return {
             **frame_errors(made, true, distance),
             "sharp": _gradient(made) / _gradient(true).clamp(min=1e-6),
             "still": _mse(first.expand_as(true), true),
             "unrelated": _mse(other, true),
         }
-        for name, values in found.items():
+
+    out: Tensors = {}
+    for some in torch.arange(len(episodes)).split(side_by_side(store, 1 + rows.shape[1])):
+        for name, values in keep(some.tolist(), lambda some=some: measured(some)).items():  # type: ignore[misc]
             whole = out.setdefault(name, values.new_zeros(*rows.shape, *values.shape[2:]))
-            whole[some, :count] = values
+            whole[some, : values.shape[1]] = values
     return out
 
 

@@ -83,9 +83,19 @@ class OpenLoop:
                 out.hands.append(_named(part, "hand"))
             if self.judge is not None:
                 out.judged.append(_named(part, "judge"))
-        out.frechet = [frechet(*pair) for pair in sides if min(one.count for one in pair) > 1]
+        out.frechet = [self._distance(*pair) for pair in sides]
         out.end_effector = end_effector_summary(self.hands, out.hands)
         return out
+
+    def _distance(self, made: Moments, true: Moments) -> dict[str, Any]:
+        """See Measured.frechet."""
+        extractor, count = made.extractor, min(made.count, true.count)
+        name = f"{extractor.name}, clips of {self.clip} frames" if extractor.clips else extractor.name
+        if count > 1:
+            return {**frechet(made, true), "extractor": name}
+        lasting = f" that last {self.clip} frames (fidelity.clip)" if extractor.clips else ""
+        why = f"a covariance needs two samples{lasting}, and there is {count or 'none'}"
+        return {"extractor": name, "value": None, "dim": None, "samples": count, "unknown": why}
 
     def held_still(self) -> Measured:
         """Errors of a world that shows each episode's first frame for ever: what is to be beaten."""
@@ -176,7 +186,8 @@ class Measured:
         errors: float32 [N, T, V] by name, see frames.frame_errors; NaN too where no picture was recorded.
         valid: bool [N, T].
         seconds: of wall time in which everything was generated.
-        frechet: see frechet.frechet, one for each extractor that had samples enough.
+        frechet: see frechet.frechet, one for each extractor, named with the length of its clips; where there
+            are too few samples, value is None and `unknown` says why.
         objects: see objects.error.object_offsets, of each part.
         hands: see end_effector.EndEffectorRuler.measure, of each part; end_effector: what they come to.
         judged: see verdicts.judged, of each part; [] without a judge.

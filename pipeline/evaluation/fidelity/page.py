@@ -65,7 +65,7 @@ def summary_text(result: Mapping[str, Any]) -> str:
         lines.append(f"| {name} | {' | '.join(texts(row))} |")
     lines.append("")
     for one in result["frechet"]:
-        lines.append(f"Frechet distance {one['value']:.4g} of {one['samples']} samples by {one['extractor']}")
+        lines.append(frechet_text(one))
     if result["without_picture"]:
         lines.append(pictures_text(result))
     lines.append(object_text(result))
@@ -80,6 +80,13 @@ def summary_text(result: Mapping[str, Any]) -> str:
             lines += [f"| {' | '.join(cells)} |" for cells in table["rows"]]
             lines += ["", table["note"]]
     return "\n".join(lines)
+
+
+def frechet_text(one: Mapping[str, Any]) -> str:
+    """A Frechet distance in a sentence, or why there is none."""
+    if one["value"] is None:
+        return f"No Frechet distance by {one['extractor']}: {one['unknown']}"
+    return f"Frechet distance {one['value']:.4g} of {one['samples']} samples by {one['extractor']}"
 
 
 def texts(row: Mapping[str, Any]) -> list[str]:

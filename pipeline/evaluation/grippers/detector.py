@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from envs.encoders import ResidualBlock, bells, pixel_centres, to_signed
+from envs.encoders.images import ResidualBlock, bells, pixel_centres, to_signed
 
 _NEAR = 2  # cells around the largest within which the centre of mass is taken
 _AT_ONCE = 64  # pictures

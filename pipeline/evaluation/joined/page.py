@@ -39,7 +39,7 @@ class Part:
         title: of the part.
         command: that measures it.
         rows: () if it has not been measured.
-        notes: what must be known to read them.
+        notes: what must be known to read them, or why there are none.
     """
 
     title: str
@@ -48,14 +48,22 @@ class Part:
     notes: tuple[str, ...] = ()
 
 
-def parts_of(fidelity: Found | None, ewmbench: Found | None, value: Found | None) -> list[Part]:
-    """The parts of the page, of results of `worldloop fidelity`, `ewmbench` and `policy-value`."""
-    out = [Part(title, command) for title, command in _PARTS]
-    if fidelity:
+def parts_of(results: Mapping[str, Found], left_out: Mapping[str, str]) -> list[Part]:
+    """The parts of the page.
+
+    Args:
+        results: of `worldloop fidelity`, `ewmbench` and `policy-value`, as far as there are any, by name.
+        left_out: why others were left out.
+    """
+    out = [
+        Part(title, command, notes=(left_out[name],) if (name := command.split()[-1]) in left_out else ())
+        for title, command in _PARTS
+    ]
+    if fidelity := results.get("fidelity"):
         out[0] = Part(*_PARTS[0], tuple(_video(fidelity)), tuple(_video_notes(fidelity)))
-    if ewmbench:
+    if ewmbench := results.get("ewmbench"):
         out[1] = Part(*_PARTS[1], tuple(_scenes(ewmbench)), tuple(_scene_notes(ewmbench)))
-    if value:
+    if value := results.get("policy-value"):
         out[2] = Part(*_PARTS[2], tuple(_values(value)), tuple(value["notes"]))
     return out
 
@@ -72,7 +80,8 @@ def _video(found: Found) -> Iterator[Row]:
         value = found["overall"].get(key)
         yield Row(f"{title} {_BETTER[key]}", MISSING if value is None else form.format(value))
     for one in found["frechet"]:
-        yield Row(f"Frechet distance, {one['extractor']}, {one['samples']} samples ↓", f"{one['value']:.4g}")
+        text = MISSING if one["value"] is None else f"{one['value']:.4g}"
+        yield Row(f"Frechet distance, {one['extractor']}, {one['samples']} samples ↓", text)
     cm, lost, hands = found["object_cm"], found["object_lost"], found["end_effector"]
     floor = found.get("locator_cm")  # results of former versions hold none
     yield Row(
@@ -135,6 +144,7 @@ def summary_text(simulator: str, parts: list[Part]) -> str:
     """The same as Markdown."""
     lines = [f"| {simulator} | generated | recorded | first frame held |", f"|{' --- |' * 4}"]
     for part in parts:
-        lines.append(f"| **{part.title}** | {'' if part.rows else f'{MISSING}; {part.command}'} | | |")
+        told = "" if part.rows else "; ".join((MISSING, part.command, *part.notes))
+        lines.append(f"| **{part.title}** | {told} | | |")
         lines += [f"| {row.name} | {row.value} | {row.recorded} | {row.still} |" for row in part.rows]
     return "\n".join(lines)

@@ -16,7 +16,7 @@ from envs.episodes.clips import ClipStore
 from envs.initial_states import InitialStates
 from envs.manifest import mark_of
 from envs.targets import ConfigError
-from pipeline.evaluation.by_task import evenly, tasks_of_episodes
+from pipeline.evaluation.by_task import evenly, groups_of_episodes
 from pipeline.evaluation.value.agreement import Cell
 from pipeline.evaluation.value.candidates import Candidate
 from pipeline.evaluation.value.trials import Imagination, Physics
@@ -26,8 +26,6 @@ from pipeline.outside import fingerprint
 
 Cfg = Mapping[str, Any]
 _SIDE_BY_SIDE = 64  # imagined episodes
-_MOST = 8  # instructions that are told apart, a column each
-_VARIOUS = "various instructions"  # in place of a task, where there are more
 _ALIKE = 12.0  # mean grey levels between a recorded picture and its start rendered anew; encoding costs some
 _NEARER = 0.5  # mean grey levels, more than encoding a picture changes its distance to others
 
@@ -144,14 +142,14 @@ class Comparison:
 def starts_of(cfg: Cfg, store: ClipStore, held: Tensor) -> dict[str, Tensor]:
     """Numbers int64 [N] of held-out episodes by task, policy_value.starts of each at most.
 
-    Where words alone tell tasks apart, people say one thing in many ways: there it is so many of all
-    together, of each instruction as many as of the others, and more than _MOST instructions are one group.
+    Where words alone tell tasks apart (see groups_of_episodes) it is so many of all together, of each
+    instruction as many as of the others.
     """
-    count, tasks = cfg["policy_value"]["starts"], tasks_of_episodes(cfg, store, held)
+    count, groups = cfg["policy_value"]["starts"], groups_of_episodes(cfg, store, held)
+    group = dict(zip(held.tolist(), groups, strict=True))
     if not cfg["task"].get("suite"):
-        many = len(set(tasks)) > _MOST
         held = evenly(cfg, store, held, count)
-        tasks = [_VARIOUS] * len(held) if many else tasks_of_episodes(cfg, store, held)
+    tasks = [group[number] for number in held.tolist()]
     mine = {task: held[torch.tensor([one == task for one in tasks])] for task in sorted(set(tasks))}
     return {task: episodes[:count] for task, episodes in mine.items()}
 

@@ -47,7 +47,8 @@ def explore(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     Returns:
         level, which was chosen, with its name, width and share (the first if the mode never succeeds, for
         then nothing can be told); mode and levels, the successes of those that were tried, with the same by
-        task under tasks; alarm, if no level keeps enough.
+        task under tasks; alarm, if no level keeps enough; episodes, of all of them together, and how many
+        more were dropped.
     """
     section = cfg["explore"]
     prepare_process(cfg["seed"], cfg["threads"])
@@ -59,10 +60,12 @@ def explore(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         found = find_level(choices, section["keep"], partial(_tried, cfg, inputs, seeds, behind))
     level, mode, tried = found
     levels = {level_name(one): _summed(rates) for one, rates in tried.items()}
-    seen = ", ".join(f"{name} {entry['successes']}" for name, entry in levels.items())
     total = _summed(mode)
-    tqdm.write(f"explore: of {total['episodes']} episodes each succeed: mode {total['successes']}, {seen}")
-    episodes = sum(entry["episodes"] for entry in (total, *levels.values()))
+    trials = {"mode": total, **levels}
+    episodes = sum(entry["episodes"] for entry in trials.values())
+    dropped = len(trials) * len(seeds) - episodes
+    seen = ", ".join(f"{name} {entry['successes']}/{entry['episodes']}" for name, entry in trials.items())
+    tqdm.write(f"explore: successes {seen}; {dropped} dropped")
     # Levels share starts, so no episode is fit to be held out.
     write_splits(data, {name: episodes if name == TRAIN else 0 for name in SPLITS})
     save_weights(_scaled(cfg, inputs, level), folder)
@@ -72,6 +75,7 @@ def explore(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         "levels": levels,
         **_alarm(mode, tried, section["keep"]),
         "episodes": episodes,
+        "dropped": dropped,
         "physics_episodes": {"own": episodes},
     }
 

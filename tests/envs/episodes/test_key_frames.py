@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -43,6 +44,18 @@ def test_switches_and_rests_are_found(tiny_store: Stores, robot: Embodiment) -> 
     rows = key_frames(store, chosen).nonzero().flatten()
     wanted = [int(store.start[n]) + t for n in sorted(chosen.tolist()) for t in (4, 6)]
     assert rows.tolist() == sorted(wanted)
+
+
+def test_where_nobody_knows_the_arms_all_numbers_are_taken_for_one(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    told(store, torch.tensor([1.0, 1, 1, 1, 0, 0, *[1] * 100]), open_until=200)
+    spec = store.spec
+    store.spec = replace(spec, embodiment=replace(spec.embodiment, arms=()))
+    try:
+        rows = key_frames(store, torch.tensor([1])).nonzero().flatten()
+    finally:
+        store.spec = spec
+    assert rows.tolist() == [int(store.start[1]) + 4]
 
 
 def test_decisions_before_key_frames_are_chosen(tiny_store: Stores) -> None:

@@ -123,6 +123,18 @@ def test_starts_are_those_chosen(starts: str) -> None:
             assert belongs(starts, drawn, space.low, space.high)
 
 
+@pytest.mark.parametrize("task", ["sweep-into-v3", "push-v3", "bin-picking-v3"])
+def test_an_outer_start_is_seen_to_be_one(task: str) -> None:
+    """Numbers that are drawn from millimetres, or never laid out, make no start an outer one."""
+    chosen = built(starts="outer")
+    for seed in range(8):
+        chosen.reset(task, seed)
+        space, drawn = chosen._env._random_reset_space, chosen._env._last_rand_vec
+        wide = space.high - space.low > 0.02
+        low, ranges = space.low[wide], (space.high - space.low)[wide]
+        assert np.abs(2 * (drawn[wide] - low) / ranges - 1).max() > 0.8
+
+
 def test_actions_move_the_hand(suite: MetaWorld) -> None:
     suite.reset("reach-v3", 1)
     before = suite.observe().state

@@ -175,8 +175,21 @@ def test_strange_tensors_come_back_as_they_were(tmp_path: Path) -> None:
 
 
 def test_divergence_is_said_at_once(tmp_path: Path) -> None:
-    with pytest.raises(TrainingDiverged, match=r"toy: loss nan.*at step 4; lower toy\.lr"):
+    with pytest.raises(TrainingDiverged, match=r"toy: loss nan.*at step 4; lower lr$"):
         train(tmp_path, spoil=4)
+
+
+@pytest.mark.parametrize(
+    ("bf16", "said"),
+    [
+        (False, r"lower state_fit\.first\.fit\.lr$"),
+        (True, r"lower state_fit\.first\.fit\.lr or say \+\+state_fit\.first\.fit\.bf16=false$"),
+    ],
+)
+def test_divergence_is_said_with_the_keys_of_the_config(tmp_path: Path, bf16: bool, said: str) -> None:
+    net, options = Net(), FitConfig(2, 8, lr=1e-2, bf16=bf16, key="state_fit.first.fit")
+    with pytest.raises(TrainingDiverged, match=f"state: loss nan.*at step 0; {said}"):
+        fit("state", net, lambda *_: torch.full((8, 1, 6), math.nan), net.loss, options, tmp_path)
 
 
 def test_the_average_follows_the_weights() -> None:

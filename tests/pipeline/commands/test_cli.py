@@ -138,6 +138,10 @@ def test_tasks_are_listed_with_what_can_be_chosen(tmp_path: Path) -> None:
     assert "did you mean metaworld" in worldloop("tasks", "task=metawrld").stderr
     assert "no physics" in worldloop("tasks", "task=lerobot").stdout
     assert "say of which task" in worldloop("tasks", f"pictures={tmp_path}").stderr
+    assert "say of which task" in worldloop("tasks", "task.name=push").stderr
+    odd = worldloop("tasks", "task=tabletop", "task.name=[push,pushh]")
+    assert "task.name='pushh' is unknown; the nearest of" in odd.stderr and "'push'" in odd.stderr
+    assert odd.returncode == 1 and not odd.stdout
     mine = f"hydra.searchpath=[file://{ROOT}/examples/configs]"
     drawn = worldloop("tasks", mine, "task=dot", f"pictures={tmp_path}")
     assert "robot dot" in drawn.stdout and (tmp_path / "dot-reach.gif").exists(), drawn

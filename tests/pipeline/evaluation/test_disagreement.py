@@ -78,6 +78,18 @@ def test_the_surer_and_the_more_wrong_the_worse() -> None:
     assert curves(views, made, 1)["generated"] == pytest.approx([0, 0.4, 0.4, 0.4, 0])
 
 
+def test_a_verdict_that_contradicts_is_worse_than_one_that_agrees_by_whatever_threshold() -> None:
+    store: ClipStore = Store()  # type: ignore[assignment]
+    judge, episodes = Brightness(), torch.arange(2)
+    judge.threshold.fill_(0.05)  # .1 is success: surely of the failed one, hardly of the other
+    made = replayed([[0, 0, 26, 26, 26], [0, 26, 26, 26, 0]])
+    views = judge_both(judge, NOBODY, store, episodes, made, bf16=False)
+    rows = compared({"task": {"name": "any"}}, judge, store, episodes, made, views)
+    assert [row["claims"] for row in rows] == [True, True] and rows[0]["success"]
+    assert rows[0]["disagreement"] < 0.5 < rows[1]["disagreement"]
+    assert worst(rows, 1)[0]["episode"] == 1
+
+
 def test_frames_that_do_not_exist_count_for_nothing() -> None:
     store: ClipStore = Store()  # type: ignore[assignment]
     judge, made = Brightness(), replayed([[0, 0, 255, 255, 255]], valid=3)

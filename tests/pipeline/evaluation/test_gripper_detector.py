@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from envs.embodiment import Embodiment, EmbodimentError
 from envs.episodes.clips import ClipStore
@@ -207,6 +208,13 @@ def test_extractors_refuse_weights_of_another_architecture(tmp_path: Path) -> No
         DinoPatches(str(tmp_path / "clip"))
     with pytest.raises(ConfigError, match="of another architecture: dinov2, and CLIP"):
         ClipFrames(str(tmp_path / "dino"))
+    lacking = tmp_path / "lacking"  # transformers would fill in what is missing with random numbers
+    shutil.copytree(tmp_path / "dino", lacking)
+    found = load_file(lacking / "model.safetensors")
+    some = {f"backbone.{name}": value for name, value in found.items()}
+    save_file(some, lacking / "model.safetensors", metadata={"format": "pt"})
+    with pytest.raises(ConfigError, match=r"lacks \d+ of the weights of Dinov2Model.*such as \['backbone"):
+        DinoPatches(str(lacking))
     with pytest.raises(ConfigError, match="holds no tokenizer"):
         ClipTexts(str(tmp_path / "clip"))
     from tokenizers import Tokenizer, models, pre_tokenizers

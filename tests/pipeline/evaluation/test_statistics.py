@@ -7,7 +7,7 @@ import torch
 
 from pipeline.evaluation.by_task import by_task
 from pipeline.evaluation.quantiles import quantiles
-from pipeline.evaluation.statistics import confusion, mcnemar, rate_entry, wilson
+from pipeline.evaluation.statistics import confusion, mcnemar, over_seeds, rate_entry, wilson
 
 
 def test_wilson_matches_published_values() -> None:
@@ -23,6 +23,15 @@ def test_exact_mcnemar() -> None:
     result = mcnemar(before, after)
     assert (result["gained"], result["lost"]) == (62, 19) and result["p"] == pytest.approx(1.773e-6, rel=0.01)
     assert mcnemar(before, before)["p"] == 1.0
+
+
+def test_a_seed_is_one_observation() -> None:
+    found = over_seeds([18.5, 17.5, 24.5])
+    half = 4.3027 * 3.7859 / 3**0.5  # Student's t of two degrees of freedom, times the standard error
+    assert found["mean"] == pytest.approx(20.1667, abs=1e-3)
+    assert (found["low"], found["high"]) == pytest.approx((20.1667 - half, 20.1667 + half), abs=1e-2)
+    assert 0.01 < found["p"] < 0.05 and over_seeds([3.0, -1.0, 1.0])["p"] > 0.3
+    assert over_seeds([2.0, 2.0]) == {"mean": 2.0, "low": 2.0, "high": 2.0, "p": None}
 
 
 def test_confusion_and_rates() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,11 @@ import torch
 from safetensors.torch import load_file
 
 from actors.factory import open_clips
+from envs.physics.pool import Track
 from pipeline.config import load_config
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.loop import build_loop
+from pipeline.stages.collect import run_recorded
 from pipeline.stages.measured.explore import Level, find_level, kept
 from pipeline.study.methods import add_rl_in_physics
 
@@ -54,12 +57,21 @@ def test_easy_tasks_do_not_make_up_for_hard_ones() -> None:
     assert kept(rates(99, 10, 5), mode) == 1.0  # more than the mode is no more than all
 
 
-def test_trials_are_recorded_and_the_policy_goes_on_with_what_was_found(tmp_path: Path) -> None:
+def test_trials_are_recorded_and_the_policy_goes_on_with_what_was_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def losing(*args: Any, stochastic: bool) -> Iterator[list[Track]]:
+        """Without the first episode of the mode, as if physics had crashed in it."""
+        for tracks in run_recorded(*args, stochastic=stochastic):
+            yield tracks if stochastic else tracks[1:]
+
+    monkeypatch.setattr("pipeline.stages.measured.explore.run_recorded", losing)
     cfg = load_config(WORDS)
     graph = build_loop(cfg, tmp_path)
     made = graph.run("explore")["explore"]["result"]
     store = open_clips(cfg, [graph.folder("explore") / "dataset"])
-    assert len(store) == made["episodes"] == 3 * (1 + len(made["levels"]))
+    assert len(store) == made["episodes"] == 3 * (1 + len(made["levels"])) - 1
+    assert made["dropped"] == 1 and made["mode"]["episodes"] == 2
     assert len(store.select(["policy-0"])) == len(store.split("train")) == len(store)
     assert ("alarm" in made) is (made["mode"]["successes"] == 0 or made["level"]["width"] == 0.5)
     before, after = (

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +20,21 @@ from envs.episodes.splits import write_splits
 from envs.manifest import DamagedArtefact, write_manifest
 from envs.physics.suite import Observation
 from envs.rng import Purpose, episode_seeds
+from learners.training.fit import TrainingDiverged, fit
 from pipeline.config import load_config
 from pipeline.evaluation.by_task import evenly, tasks_of_episodes, tasks_of_seeds, tasks_told
 from pipeline.graph.stage import Inputs
-from pipeline.stages.collect import collect, scripted_jobs, split_counts
-from pipeline.stages.given import DATASETS, datasets, demonstrations, imagined_chunks, newest_episodes
+from pipeline.stages import pace
+from pipeline.stages.collect import collect, first_frames, scripted_jobs, split_counts
+from pipeline.stages.given import (
+    DATASETS,
+    datasets,
+    demonstrations,
+    fit_options,
+    imagined_chunks,
+    newest_episodes,
+)
+from pipeline.stages.variant import variant_episodes
 from tests.embodiments import ARM_DELTAS, world_spec
 from tests.envs.physics.sections import Counting
 from tests.moving_square import moving_square
@@ -80,6 +92,34 @@ def test_an_episode_that_crashes_physics_is_left_out_of_its_split(tmp_path: Path
             1,
             2 - sources[2:4].count("random"),
         )
+
+
+class Startless(Counting):
+    """Counts, and cannot lay out what every third seed draws."""
+
+    def reset(self, task: str, seed: int) -> None:
+        super().reset(task, seed)
+        if seed % 3 == 0:
+            raise RuntimeError("things lie in each other")
+
+
+@pytest.mark.parametrize(
+    ("stage", "settings", "made"),
+    [
+        (first_frames, {}, "starts"),
+        (variant_episodes, {"episodes": 3}, "episodes"),
+    ],
+)
+def test_starts_that_crash_physics_are_dropped_and_counted(
+    stage: Any, settings: dict[str, Any], made: str, tmp_path: Path
+) -> None:
+    cfg = load_config(["experiment=soak", "launch.workers=2", "extra_starts.episodes=3"])
+    cfg["task"] |= {"suite": {"_target_": f"{__name__}.Startless", "fault": ""}, "variants": {"odd": {}}}
+    cfg["task"] |= {"name": "count", "size": [4, 4], "horizon": 4, "mode": "absolute"}
+    asked = {"variant": "odd", **settings}
+    said = stage.run(stage.view("odd", cfg, asked), tmp_path, Inputs(settings=asked))
+    assert (said[made], said["dropped"]) == (2, 1)
+    assert said.get("physics_episodes", {"first frames": 2}) == {"first frames": 2}
 
 
 def test_any_prefix_of_the_scripted_episodes_is_mixed() -> None:
@@ -187,3 +227,49 @@ def test_of_sets_that_a_user_lists_none_is_newer_than_the_others(tmp_path: Path)
         store = ClipStore(datasets(stages[:count]), spec)
         found = newest_episodes(store, Inputs({"data": stages[:count]}), torch.arange(len(store)))
         assert found.tolist() == newest
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        *("tokenizer_fit", "simulator_fit.first.fit", "state_fit.refresh.fit", "judge_fit.first.fit"),
+        *("text_world_fit.tokenizer", "imitation.perception", "imitation.fit", "clone.fit"),
+        *("distill.first.fit", "finetune.state.fit"),
+    ],
+)
+def test_what_helps_training_that_diverges_is_in_the_config(key: str, tmp_path: Path) -> None:
+    cfg = load_config(["experiment=smoke", f"++{key}.bf16=true"])
+    section = reduce(lambda part, name: part[name], key.split("."), cfg)
+    net = torch.nn.Linear(1, 1)
+    with pytest.raises(TrainingDiverged) as error:
+        fit(
+            "part",
+            net,
+            lambda *_: torch.full((1, 1), torch.nan),
+            lambda data, _: (net(data).sum(), {}),
+            fit_options(cfg, section, key),
+            tmp_path,
+        )
+    said = re.search(r"lower (\S+) or say (\S+)$", str(error.value))
+    assert said is not None
+    cfg = load_config(["experiment=smoke", f"{said[1]}=1e-7", said[2]])
+    section = reduce(lambda part, name: part[name], key.split("."), cfg)
+    assert section["lr"] == 1e-7 and section["bf16"] is False
+
+
+def test_parts_that_are_timed_know_where_their_options_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def train(*args: Any) -> dict[str, float]:
+        known.append(args[-2].key)
+        return {"compute_seconds": 1.0}
+
+    known: list[str] = []
+    for part in ("tokenizer", "simulator", "state"):
+        monkeypatch.setattr(pace, f"train_{part}", train)
+    for name in ("open_store", "learning_episodes", "build_simulator", "build_state_decoder", "learns"):
+        monkeypatch.setattr(pace, name, lambda *_: True)
+    cfg = load_config(["experiment=soak", "simulator=dit_small"])
+    (tmp_path / "trial").mkdir()
+    pace.pace.run(pace.pace.view("pace", cfg, {}), tmp_path, Inputs())
+    assert list(dict.fromkeys(known)) == ["tokenizer_fit", "simulator_fit.first.fit", "state_fit.first.fit"]

@@ -6,12 +6,15 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 
 from envs.embodiment import Embodiment
+from envs.episodes import LeRobotWriter
+from envs.episodes.splits import write_splits
 from envs.targets import ConfigError
 from pipeline.commands.worlds.ewmbench import Extractors, _identity, ewmbench
 from pipeline.commands.worlds.subject import Subject
@@ -19,7 +22,8 @@ from pipeline.config import load_config
 from pipeline.evaluation.ewmbench.measure import Instruments
 from tests.embodiments import ARM_DELTAS
 from tests.envs.judges.chat_server import MODEL, Asked, serving
-from tests.worlds import scripted_set, untrained_world
+from tests.moving_square import SIZE, moving_square
+from tests.worlds import scripted_set, untrained_world, written
 
 SMOKE = ["experiment=smoke", "track=disabled", "launch.workers=1", "cameras=main", "task.size=[32,32]"]
 SMOKE += ["ewmbench.episodes=2", "ewmbench.videos=1", "ewmbench.detector.fit={steps: 4, batch: 8, lr: 1e-3}"]
@@ -48,9 +52,9 @@ def test_two_arms_in_physics_with_a_model_that_reads(tmp_path: Path) -> None:
         more = load_config([*words, "ewmbench.samples=3", "ewmbench.strict_parity=false"])
         assert "4 samples were reused" in ewmbench(more, tmp_path / "run")
         assert server.tries == asked + 3 * 2
-        paid = json.loads((tmp_path / "run/ewmbench.json").read_text())["judge_cost"]
+        paid = json.loads(written(tmp_path / "run", "ewmbench.json").read_text())["judge_cost"]
         assert paid["calls"] == server.tries  # of all three lives
-    result = json.loads((tmp_path / "run/ewmbench.json").read_text())
+    result = json.loads(written(tmp_path / "run", "ewmbench.json").read_text())
     assert len(result["rows"]) == 2 and len(result["rows"][0]["samples"]) == 3
     assert result["set"]["of"] == 4 and "end effectors in space (commanded poses)" in result["set"]["by"]
     whole = result["overall"]
@@ -67,7 +71,7 @@ def test_two_arms_in_physics_with_a_model_that_reads(tmp_path: Path) -> None:
     assert (
         set(result["detector"]["cameras"]) == {"head"} and result["detector"]["source"] == "commanded poses"
     )
-    page = (tmp_path / "run/ewmbench.html").read_text()
+    page = written(tmp_path / "run", "ewmbench.html").read_text()
     assert f"Asking the model: calls {paid['calls']:g}, prompt tokens" in page
     assert "Best samples" in page and page.count("<video") == 1 and "best of 2" in said
     assert not re.findall(r'(?:src|href)=(?!"(?:#|data:))', page)
@@ -103,6 +107,22 @@ def test_what_was_measured_belongs_to_recordings_and_to_the_shape_of_the_task(
     assert identities()[0] != recorded
 
 
+def test_of_many_instructions_the_set_is_no_larger(tmp_path: Path) -> None:
+    made = [moving_square(ARM_DELTAS, seed, length=9) for seed in range(12)]
+    made = [replace(one, instruction=f"do it in way {n}") for n, one in enumerate(made)]
+    LeRobotWriter(tmp_path / "set", ARM_DELTAS.at(SIZE)).write(made)
+    write_splits(tmp_path / "set", {"train": 0, "held_out": 12, "calibration": 0})
+    words = [*SMOKE, "task=lerobot", f"task.data=[{tmp_path / 'set'}]", "task.chunk=4", "task.horizon=8"]
+    words += [*untrained_world(load_config(words), tmp_path), "ewmbench.samples=1", "ewmbench.videos=0"]
+    assert "0 samples were reused" in ewmbench(load_config(words), tmp_path / "run")
+    result = json.loads(written(tmp_path / "run", "ewmbench.json").read_text())
+    assert len(result["rows"]) == 2 and result["set"]["of"] == 12  # ewmbench.episodes, of all together
+    assert {row["task"] for row in result["rows"]} == {"various instructions"}
+    # films of samples that were measured without any
+    assert "0 samples were reused" in ewmbench(load_config([*words, "ewmbench.videos=2"]), tmp_path / "run")
+    assert written(tmp_path / "run", "ewmbench.html").read_text().count("<video") == 2
+
+
 def test_one_arm_that_nobody_calibrated(tmp_path: Path, tiny_data: Callable[[Embodiment], Path]) -> None:
     words = [*SMOKE, "task=lerobot", f"task.data=[{tiny_data(ARM_DELTAS)}]", "task.chunk=4", "task.horizon=8"]
     words += untrained_world(load_config(words), tmp_path)
@@ -112,7 +132,7 @@ def test_one_arm_that_nobody_calibrated(tmp_path: Path, tiny_data: Callable[[Emb
     )
     assert "No semantics" in said and "All samples of each episode came out alike" in said
     assert "| first of 2 |" in said and "best of 2" not in said  # nothing tells which is the best
-    result = json.loads((tmp_path / "run/ewmbench.json").read_text())
+    result = json.loads(written(tmp_path / "run", "ewmbench.json").read_text())
     assert "positions in the state" in result["set"]["by"] and result["detector"] is None
     assert 0 <= result["set"]["overlap"] <= 1
     whole = result["overall"]

@@ -26,7 +26,7 @@ from pipeline.evaluation.fidelity.masks import part_labels
 from pipeline.evaluation.joined.page import parts_of
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
 from tests.moving_square import SIZE, moving_square
-from tests.worlds import scripted_set, untrained_world
+from tests.worlds import scripted_set, untrained_world, written
 
 SOAK = ["experiment=soak", "track=disabled", "launch.workers=1", "cameras=main"]
 
@@ -39,7 +39,7 @@ def test_fidelity_with_masks_from_physics(tmp_path: Path) -> None:
     words += ["fidelity.long={frames: 30, episodes: 1, noise_level: 1.0}", "fidelity.strides=[1,2]"]
     tried = load_config([*words, "fidelity.grid={simulator.context: [1, 4], simulator.horizon: [4]}"])
     said = fidelity(tried, tmp_path / "run")
-    result = json.loads((tmp_path / "run/fidelity.json").read_text())
+    result = json.loads(written(tmp_path / "run", "fidelity.json").read_text())
     assert result["masks"] == {"source": "physics", "episodes": 3}
     assert set(result["overall"]) == {
         *("mse", "psnr", "ssim", "perceptual", "arm_mse", "object_mse"),
@@ -62,18 +62,19 @@ def test_fidelity_with_masks_from_physics(tmp_path: Path) -> None:
     assert "| verdicts right |" in said and "Errors are those of frames 2, 4, ..." in said
     assert result["grid"]["figure"] == "arm_mse" and "Least arm MSE: simulator.context=" in said
     lost = result["object_lost"]  # of two rows of the summary none hides the other
-    rows = {row.name: row.value for row in parts_of(result, None, None)[0].rows}
+    rows = {row.name: row.value for row in parts_of({"fidelity": result}, {})[0].rows}
     assert "The first object " in said and rows["object lost ↓"] == f"{lost:.1%}"
     hands = result["end_effector"]
     assert hands["truth"] == "physics" and "line of sight of head" in hands["method"]
     assert hands["generated_cm"]["median"] > 0 and "End effectors lie" in said
-    # nothing is rolled out twice: neither the one batch, nor that of each setting
+    # nothing is done twice: neither what physics says of masks, nor the one batch, that of each setting and
+    # that of long rollouts
     again = fidelity(tried, tmp_path / "run")
-    assert said.endswith("0 parts were reused") and again.endswith("5 parts were reused")
-    both = json.loads((tmp_path / "run/fidelity.json").read_text())
+    assert said.endswith("0 parts were reused") and again.endswith("7 parts were reused")
+    both = json.loads(written(tmp_path / "run", "fidelity.json").read_text())
     for name in ("overall", "by_frame", "frechet", "long", "strides", "end_effector", "object_cm"):
         assert both[name] == result[name]
-    page = (tmp_path / "run/fidelity.html").read_text()
+    page = written(tmp_path / "run", "fidelity.html").read_text()
     assert (
         "Frechet distances" in page
         and "Strides at inference" in page
@@ -121,8 +122,22 @@ def test_a_judge_that_learns_nothing_is_asked_and_one_that_has_not_learned_is_no
     goal = ["judge=goal_image", f"judge.picture={tmp_path / 'goal.png'}"]
     given = fidelity(load_config([*words, *goal]), tmp_path / "run")
     assert "No verdicts: the judge has learned nothing yet" in learned and "No verdicts" not in given
-    rows = json.loads((tmp_path / "run/fidelity.json").read_text())["strides"]
+    rows = json.loads(written(tmp_path / "run", "fidelity.json").read_text())["strides"]
     assert all(row["verdicts"]["generated"] for row in rows)
+
+
+def test_why_there_is_no_distance_between_clips(
+    tmp_path: Path, tiny_data: Callable[[Embodiment], Path]
+) -> None:
+    words = ["experiment=smoke", "track=disabled", "task=lerobot", f"task.data=[{tiny_data(ARM_DELTAS)}]"]
+    words += ["task.size=[32,32]", "task.chunk=2", "task.horizon=8", "fidelity.long.frames=0"]
+    words += [*untrained_world(load_config(words), tmp_path), "fidelity.clip=500"]
+    said = fidelity(load_config(words), tmp_path / "run")
+    why = "that last 500 frames (fidelity.clip), and there is none"
+    assert "clips of 500 frames: a covariance needs two samples " + why in said
+    assert why in written(tmp_path / "run", "fidelity.html").read_text()
+    one, two = json.loads(written(tmp_path / "run", "fidelity.json").read_text())["frechet"]
+    assert one["value"] > 0 and two["value"] is None and "clips of" not in one["extractor"]
 
 
 EXTRACTOR = """
@@ -151,7 +166,9 @@ def test_extractors_of_one_name_and_different_code_are_told_apart(
         fidelity(
             load_config([*words, f"fidelity.frames_extractor._target_=own_{scale}.Own"]), tmp_path / "run"
         )
-        distances.append(json.loads((tmp_path / "run/fidelity.json").read_text())["frechet"][0]["value"])
+        distances.append(
+            json.loads(written(tmp_path / "run", "fidelity.json").read_text())["frechet"][0]["value"]
+        )
     assert distances[1] > 5 * distances[0] > 0
 
 
@@ -166,7 +183,7 @@ def test_a_contact_sheet_for_each_number_of_any_robot(
     assert [path.stem for path in sheets] == [f"{n:02d}-{name}" for n, name in enumerate(robot.action_names)]
     wide = 3 * (4 * 32 * len(robot.cameras) + 4)
     assert cv2.imread(str(sheets[0])).shape == (3 * (BAR + 4 * 32), wide, 3)
-    rows = json.loads((tmp_path / "run/sweep/sweep.json").read_text())["numbers"]
+    rows = json.loads(written(tmp_path / "run", "sweep/sweep.json").read_text())["numbers"]
     assert all(row["changed"][0] == 0.0 for row in rows) and any(row["changed"][1] > 0 for row in rows)
     with pytest.raises(ConfigError, match=r"sweep\.episode=99: there are 20"):
         sweep(load_config([*words, "sweep.episode=99"]), tmp_path / "run")

@@ -29,7 +29,7 @@ from pipeline.evaluation.value.page import judge_lines
 from pipeline.evaluation.value.trials import scripted_outcomes
 from tests.embodiments import ARM_DELTAS, world_spec
 from tests.moving_square import SIZE, moving_square
-from tests.worlds import scripted_set, untrained_world
+from tests.worlds import scripted_set, untrained_world, written
 
 SOAK = ["experiment=soak", "track=disabled", "launch.workers=1", "cameras=main"]
 
@@ -59,7 +59,7 @@ def test_values_beside_true_ones_and_nothing_is_tried_twice(tmp_path: Path) -> N
     policy_value(load_config([*words, "policy_value.repeats=1"]), root)
     said = policy_value(load_config([*words, "policy_value.repeats=2"]), root)
     assert said.endswith("9 parts were reused")  # the starts, true outcomes and the first repeat of all four
-    result = json.loads((root / "policy-value.json").read_text())
+    result = json.loads(written(root, "policy-value.json").read_text())
     rows = {cell["policy"]: cell for cell in result["cells"]}
     assert list(rows) == ["policy", "policy + noise 0.5", "expert 0", "expert 1"]
     assert rows["expert 0"]["true_value"] == 1.0 and rows["expert 1"]["true_value"] == 0.0
@@ -77,7 +77,7 @@ def test_values_beside_true_ones_and_nothing_is_tried_twice(tmp_path: Path) -> N
         "Judged by metric: NLPD, goals unfinished: 1.",
         "Asking the judge: calls 2, cost 0.5.",
     ]
-    page = (root / "policy-value.html").read_text()
+    page = written(root, "policy-value.html").read_text()
     assert page.count("<title>") == 5 and "expert 0, push: 100 -&gt; " in page
     assert not re.findall(r'(?:src|href)=(?!"#)', page)
     # Recordings without seeds say their numbers, from which physics lays out starts of its own.
@@ -97,7 +97,7 @@ def test_without_physics_values_are_estimated_alone(
     words += untrained_world(load_config(words), tmp_path)
     words += [f"policy_value.policies=[{tmp_path / 'policy'}]", "policy_value.noise=[0.1,0.5]"]
     said = policy_value(load_config(words), tmp_path / "run")
-    result = json.loads((tmp_path / "run/policy-value.json").read_text())
+    result = json.loads(written(tmp_path / "run", "policy-value.json").read_text())
     assert result["agreement"] == {} and "nobody knows" in said and "expert" not in said.split("\n\n")[1]
     assert [cell["policy"] for cell in result["cells"]] == [
         *("policy", "policy + noise 0.1", "policy + noise 0.5")
@@ -106,7 +106,7 @@ def test_without_physics_values_are_estimated_alone(
     assert "Fewer held-out starts than policy_value.starts=32" in said
     said = policy_value(load_config([*words, "policy_value.judged=whole"]), tmp_path / "run")
     assert "\n0 parts were reused" in said  # other judgements, kept apart
-    assert json.loads((tmp_path / "run/policy-value.json").read_text())["judged"] == "whole"
+    assert json.loads(written(tmp_path / "run", "policy-value.json").read_text())["judged"] == "whole"
     other = "policy_value.others={mine: {_target_: actors.policies.vla.ChunkPolicy, nope: 1}}"
     with pytest.raises(ConfigError, match=r"policy_value\.others\.mine\.nope is not an option"):
         load_config([*words, other])
