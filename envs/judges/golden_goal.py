@@ -85,10 +85,11 @@ class GoldenGoalJudge(GoalJudge):
         ending, fallback = options["text_world"].get("ending", {}), options["fallback"]
         told = {key: "null" if value is None else value for key, value in ending.items()}
         settings = ", ".join(f"judge.text_world.ending.{key}={value}" for key, value in told.items())
+        others = f"judge.fallback={Fallback.LAST_FRAME.value} or {Fallback.PROGRESS_ONLY.value}"
+        more = f", change these, or set {others}" if fallback == Fallback.DROP.value else " or change these"
         return (
             f"its text world does not say in the goals it imagines that the task is done ({settings}), and"
-            f" judge.fallback={fallback}: train it longer (text_world_fit), change these, or set"
-            f" judge.fallback={Fallback.LAST_FRAME.value} or {Fallback.PROGRESS_ONLY.value}"
+            f" judge.fallback={fallback}: train it longer (text_world_fit){more}"
         )
 
     def goals(self, first: Tensor, instruction: list[str]) -> Goals:

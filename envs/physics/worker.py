@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.suite import Array, Observation, SuiteError, TaskSuite, build_suite, check_task, task_of
+from envs.physics.checked import first_observation, rendered
+from envs.physics.suite import Array, Observation, TaskSuite, build_suite, check_task, task_of
 from envs.rng import Stream, episode_rng
 from envs.targets import ConfigError
 
@@ -67,22 +68,6 @@ class Track:
     def stack(self) -> dict[str, Array]:
         """`rows` as arrays [T, ...]."""
         return {name: np.stack(values) for name, values in self.rows.items()}
-
-
-def rendered(suite: TaskSuite) -> NDArray[np.uint8]:
-    """The suite's pictures as its embodiment announces them; all that is learned is built for those.
-
-    Raises:
-        SuiteError: if they are not.
-    """
-    shown, cameras = np.asarray(suite.render()), suite.embodiment.cameras
-    due = (len(cameras), 3, *cameras[0].size)
-    if shown.shape != due or shown.dtype != np.uint8:
-        raise SuiteError(
-            f"task.suite: {type(suite).__name__}.render gives {shown.dtype} {list(shown.shape)}, but its"
-            f" embodiment's cameras make it uint8 {list(due)} (views, 3, height, width); correct either"
-        )
-    return shown
 
 
 @dataclass(frozen=True)
@@ -133,14 +118,18 @@ class Worker:
             check_task(task, self.slots[0].suite.tasks)
 
     def reset(self, seeds: dict[int, int], record: bool) -> dict[int, dict[str, Any]]:
-        """Start episodes {slot: seed}; returns an observation per slot."""
+        """Start episodes {slot: seed}; returns an observation per slot.
+
+        Raises:
+            SuiteError: if pictures or calibration are not what the embodiment says.
+        """
         self._exchange({index: task_of(self.spec.tasks, seed) for index, seed in seeds.items()})
         out = {}
         for index, seed in seeds.items():
             slot = self.slots[index]
             self._lay_out(slot.suite, seed)
             slot.steps, slot.over, slot.track = 0, False, None
-            observed = slot.suite.observe()
+            observed = first_observation(slot.suite)
             if record:
                 slot.track = Track(seed, observed.instruction, observed.intrinsic)
                 slot.track.add(slot.suite, observed)
@@ -189,13 +178,16 @@ class Worker:
     def script(self, jobs: list[tuple[int, float]], chunk: int | None) -> list[Track]:
         """Whole episodes of scripted behaviours for (seed, noise_level) pairs; recorded to the horizon, or to
         the end of the `chunk` actions in which they succeed, if it is not None.
+
+        Raises:
+            SuiteError: see reset.
         """
         out = []
         suite = self.slots[0].suite
         for seed, noise_level in jobs:
             self._lay_out(suite, seed)
             act = suite.expert(noise_level, episode_rng(seed, Stream.BEHAVIOUR))
-            observed = suite.observe()
+            observed = first_observation(suite)
             track = Track(seed, observed.instruction, observed.intrinsic)
             track.add(suite, observed)
             for step in range(self.spec.horizon):

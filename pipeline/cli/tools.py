@@ -108,7 +108,7 @@ def bench(words: Words) -> None:
 def judge(words: Words) -> None:
     """verdicts on recorded episodes against their recorded success, and what they cost, by which frames are
     shown: worldloop judge judge=vlm judge.chat.model=<name> [data=<LeRobot set>] [split=held_out|all]
-    [episodes=N] [frames=all,4,ends] experiment=...
+    [episodes=N] [frames=all,4,ends judge.pictures.span=clip judge.pictures.every=1] experiment=...
     """
     from pipeline.commands.worlds.judge import Selection, judge_study
 

@@ -103,6 +103,7 @@ def rewards(words: Words) -> None:
     if not own["episodes"].isdigit() or int(own["episodes"]) < 2 or not names:
         raise ConfigError("say which rewards=[...], and episodes=N of at least 2")
     cfg, root = prepared(rest)
+    from actors.world_config import check_world
     from pipeline.commands.worlds.rewards import Plan, compare_rewards
     from pipeline.graph.owner import owning
     from pipeline.loop import has_physics
@@ -117,6 +118,8 @@ def rewards(words: Words) -> None:
     for name in (name for name in names if name != "rule"):
         asked = [*others, f"judge={name}"]
         configs[name] = cfg if read_config(asked)["judge"] == chosen else load_config(asked)
+    for own_cfg in configs.values():  # what the others need is told before any work, too
+        check_world(own_cfg)
     if "rule" in names:
         configs["rule"] = cfg
     variants = listed(own["variants"]) if own["variants"] else list(cfg["task"].get("variants", {}))

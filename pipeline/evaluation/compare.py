@@ -99,9 +99,9 @@ _ROWS: tuple[tuple[str, Callable[[Result], str]], ...] = (
         lambda r: ", ".join(str(n) for n in r["imagined_episodes_used"]),
     ),
     ("minutes in all", _minutes("")),
-    ("tokenizer, simulator", _minutes("tokenizer", "simulator")),
+    ("tokenizer, simulator, student", _minutes("tokenizer", "simulator", "student", "pace")),
     ("state expert", _minutes("state")),
-    ("judge", _minutes("judge")),
+    ("judge", _minutes("judge", "text_world")),
     ("RL in imagination", _minutes("rl")),
     (
         "PSNR dB, first → last frames",

@@ -153,7 +153,7 @@ def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         outcome = evaluate(world, policy, list(range(len(starts))), label=f"imagined {label}")
         write_film(folder / f"media/{label}.mp4", side_by_side(world.base_env.video(0).numpy()), store.fps)
         won[label], known = outcome.success, known & outcome.counted
-    return {
+    rates = {
         label: {
             **_counted(success, known),
             "tasks": by_task(tasks, _counted, success, known),
@@ -161,6 +161,7 @@ def evaluate_imagined(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         }
         for label, success in won.items()
     }
+    return {**rates, "judged_by": world.transform[-1].judge.facts()}
 
 
 def _counted(success: Tensor, counted: Tensor) -> dict[str, Any]:
@@ -208,4 +209,4 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         f"batch {n}": measurement.speed(simulator, store, n, cfg["measure"]["speed_chunks"], bf16)
         for n in (1, 32)
     }
-    return result
+    return {**result, "judged_by": judge.facts()}

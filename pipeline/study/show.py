@@ -46,7 +46,8 @@ def markdown(table: Mapping[str, Any], columns: Columns) -> str:
     parts = [f"# {table['name']}"]
     for title, lines in sections_of(table, columns):
         rows = [lines[0], ["---"] * len(lines[0]), *lines[1:]]
-        parts.append(f"## {title}\n\n" + "\n".join(f"| {' | '.join(row)} |" for row in rows))
+        texts = [[cell.replace("|", "\\|") for cell in row] for row in rows]
+        parts.append(f"## {title}\n\n" + "\n".join(f"| {' | '.join(row)} |" for row in texts))
     parts += best_of(table, columns)
     if table["pooled"]:
         parts.append(OVER_SEEDS)

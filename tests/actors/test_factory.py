@@ -15,7 +15,7 @@ import pytest
 import torch
 from torch import nn
 
-from actors.factory import build_policy, open_clips
+from actors.factory import build_physics, build_policy, build_pool, open_clips
 from actors.process import device_of, prepare_process
 from actors.world_config import world_spec
 from envs.embodiment import Embodiment
@@ -189,3 +189,9 @@ def test_gradients_of_indexing_are_the_same_every_time() -> None:
     weight = torch.randn(20000, 32)
     once, *again = [torch.autograd.grad((table[place] * weight).sum(), table)[0] for _ in range(20)]
     assert all(torch.equal(once, other) for other in again)
+
+
+@pytest.mark.parametrize("make", [build_pool, lambda cfg: build_physics(cfg, 1)])
+def test_recordings_are_no_physics(make: Callable[[Any], Any]) -> None:
+    with pytest.raises(ConfigError, match=r"task\.suite is empty: .*; choose a task with a suite"):
+        make(composed(["task=lerobot", "task.data=[anywhere]"]))

@@ -159,7 +159,8 @@ class Asker:
                 f"{self._unusable} answers in a row say nothing usable (judge.asking.stop_after="
                 f"{self.options.stop_after}): they must end as {option} asks, and the last ends with"
                 f" {end!r}. Choose another prompt or another model (judge.chat), or raise"
-                " judge.chat.max_tokens where answers are cut off"
+                " judge.chat.max_tokens where answers are cut off; answers are remembered in"
+                f" judge.asking.cache={self.options.cache}"
             )
             raise self._over
 

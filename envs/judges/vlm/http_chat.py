@@ -179,17 +179,20 @@ class HTTPChat:
         """The answer in a completion.
 
         Raises:
-            Unanswered: if it is no completion.
+            Unanswered: if it is no completion, or one without a word, as of a server that is out of order.
         """
         try:
             found = json.loads(text)
             message = found["choices"][0]["message"]
             content, usage = message.get("content"), found.get("usage") or {}
+            refused = bool(message.get("refusal"))
             tokens = [_count(usage.get(name)) for name in ("prompt_tokens", "completion_tokens")]
         except (*_NO_JSON, KeyError, IndexError, TypeError, AttributeError):
             raise Unanswered(f"{self.url} answered no chat completion: {self._words(text)}") from None
-        # A refusal has no content: an answer that is neither yes nor no.
-        return Reply(self._hidden(content) if isinstance(content, str) else "", *tokens)
+        said = self._hidden(content).strip() if isinstance(content, str) else ""
+        if not said and not refused:
+            raise Unanswered(f"{self.url} answered a completion without a word")
+        return Reply(said, *tokens)  # a refusal has none: an answer that is neither yes nor no
 
 
 def _content(question: Question) -> list[dict[str, Any]]:

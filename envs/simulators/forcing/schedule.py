@@ -26,6 +26,9 @@ class Sigmoid:
         start, end: of the stretch of the sigmoid that is used.
         temperature: by which it is flattened.
 
+    Raises:
+        ValueError: unless end is above start, and temperature above 0.
+
     Examples:
         >>> Sigmoid(-3.0, 3.0, 1.0).levels(2)
         [1.0, 0.5, 0.0]
@@ -34,6 +37,13 @@ class Sigmoid:
     start: float
     end: float
     temperature: float
+
+    def __post_init__(self) -> None:
+        if self.temperature <= 0 or self.end <= self.start:
+            raise ValueError(
+                f"start={self.start}, end={self.end}, temperature={self.temperature} are no schedule: end"
+                " must be above start, and temperature above 0"
+            )
 
     def level(self, time: Tensor) -> Tensor:
         """Level s, like `time` in 0..1; the share of the signal's variance falls along the sigmoid."""

@@ -69,7 +69,7 @@ class CrossAttention:
 class AdaLN:
     """The mean of a frame's `cond` shifts, scales and gates all its tokens alike."""
 
-    tokens: int = 1
+    tokens: Count = 1
 
     def reader(self, width: int, heads: int) -> Reader:
         """See Conditioning."""

@@ -15,9 +15,10 @@ import torch
 
 from actors.factory import build_judge, open_clips
 from envs.judges.base import Judge
+from envs.judges.vlm import VLMJudge
 from envs.targets import ConfigError, target
 from pipeline.evaluation.judging import cost_text, facts_text, labelled
-from pipeline.evaluation.rewards.shown import check_frames, shown_table
+from pipeline.evaluation.rewards.shown import ALL, check_frames, shown_table
 from pipeline.loop import build_loop, has_physics, last_round
 from pipeline.stages.given import datasets, learns
 
@@ -79,6 +80,8 @@ def judge_study(cfg: Mapping[str, Any], root: Path, selection: Selection) -> str
         )
     episodes = episodes[: selection.episodes or None]
     judge, kind = _judge(cfg, root), target(cfg["judge"], "judge")
+    if isinstance(judge, VLMJudge) and selection.frames != (ALL,):
+        check_shown(cfg["judge"]["pictures"])
     name = str(cfg["judge"]["_target_"]).rpartition(".")[2]
     lines = [f"{name} on {len(episodes)} recorded episodes ({selection.split})", _line(_HEAD)]
     for frames in selection.frames:
@@ -90,6 +93,23 @@ def judge_study(cfg: Mapping[str, Any], root: Path, selection: Selection) -> str
     if facts := facts_text(judge.facts()):
         lines.append(f"Judged by {facts}")
     return "\n".join(lines)
+
+
+def check_shown(pictures: Mapping[str, Any]) -> None:
+    """See that a vision-language model is shown just the frames that are chosen.
+
+    Args:
+        pictures: section judge.pictures.
+
+    Raises:
+        ConfigError: if it would leave out some of these, or be asked about parts of them.
+    """
+    if pictures["span"] != "clip" or pictures["every"] != 1:
+        raise ConfigError(
+            f"judge.pictures.span={pictures['span']} and judge.pictures.every={pictures['every']} choose"
+            " again among the frames that frames=[...] chooses; say judge.pictures.span=clip"
+            " judge.pictures.every=1"
+        )
 
 
 def _cells(found: Mapping[str, Any]) -> list[Any]:

@@ -68,7 +68,7 @@ def policy_value(cfg: Mapping[str, Any], root: Path) -> str:
     result = {
         **subject.about(),
         "judged": section["judged"],
-        "judged_by": judge.facts(),
+        "judged_by": {**judge.facts(), **comparison.counted},
         "judge_cost": cost,
         "starts": {task: len(episodes) for task, episodes in starts.items()},
         "repeats": section["repeats"],
@@ -128,11 +128,14 @@ def notes(
         )
     if any(one.noise for one in everybody):
         out.append("Noise is in units of each number's standard deviation in recorded chunks.")
-    if section["repeats"] > 1 and not any(cell.error for cell in cells):
+    if section["repeats"] > 1 and all(cell.error is None for cell in cells):
         out.append(
-            "All repeats came out alike: neither this simulator nor these policies draw anything, so standard"
-            " errors of 0 say nothing."
+            "All repeats came out alike, as where neither the simulator nor the policies draw anything, or"
+            " the judge always says the same: there are no standard errors."
         )
+    if dropped := sum(int((~cell.judged).sum()) for cell in cells):
+        of = sum(cell.judged.numel() for cell in cells)
+        out.append(f"{dropped} of {of} imagined episodes could not be judged and are left out.")
     counts = {task: len(some) for task, some in starts.items()}
     if cells[0].true is None:  # words alone tell tasks apart, and all together are bounded
         counts = {ALL: sum(counts.values())}

@@ -74,10 +74,14 @@ def read_labels(path: Path, store: ClipStore, episodes: Tensor) -> Tensor:
         with _reading(path):
             found = torch.from_numpy(held[str(number)])
         due = (int(store.length[number]), store.spec.views)
-        if found.ndim != 4 or tuple(found.shape[:2]) != due or int(found.max()) > max(PARTS.values()):
+        whole = not found.is_floating_point() and not found.is_complex()
+        known = whole and found.numel() and int(found.min()) >= 0 and int(found.max()) <= max(PARTS.values())
+        if found.ndim != 4 or tuple(found.shape[:2]) != due or not known:
             raise ConfigError(
-                f"fidelity.masks={path}: array '{number}' is {tuple(found.shape)} up to {int(found.max())};"
-                f" the episode takes [{due[0]}, {due[1]}, h, w] of {PARTS}"
+                f"fidelity.masks={path}: array '{number}' is {found.dtype} {tuple(found.shape)}, from"
+                f" {found.min().item() if found.numel() else 'nothing'} to"
+                f" {found.max().item() if found.numel() else 'nothing'}; the episode takes whole numbers"
+                f" [{due[0]}, {due[1]}, h, w] of {PARTS}"
             )
         small = functional.interpolate(found.float(), store.spec.size, mode="nearest").to(torch.uint8)
         out[n, : len(small) - 1] = small[1:]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from envs.targets import ConfigError
 from pipeline.evaluation.by_task import evenly, groups_of_episodes
 from pipeline.evaluation.value.agreement import Cell
 from pipeline.evaluation.value.candidates import Candidate
-from pipeline.evaluation.value.trials import Imagination, Physics
+from pipeline.evaluation.value.trials import COUNT, Imagination, Physics
 from pipeline.evaluation.value.whole import Onlooker
 from pipeline.graph.kept import Kept, Tensors
 from pipeline.outside import fingerprint
@@ -41,6 +42,9 @@ class Comparison:
         starts: numbers int64 [N] of those in whose first frames all begin, by task.
         candidates: everybody.
         spread: float32 [A], see candidates.action_spread.
+
+    Attributes:
+        counted: what the judge counted in `imagined`, of parts that were kept as well (see trials.counted).
     """
 
     cfg: Cfg
@@ -49,6 +53,7 @@ class Comparison:
     starts: Mapping[str, Tensor]
     candidates: Sequence[Candidate]
     spread: Tensor
+    counted: Counter[str] = field(default_factory=Counter, init=False)
 
     @property
     def count(self) -> int:
@@ -116,6 +121,9 @@ class Comparison:
                         imagination.outcome(candidate, about, repeat, known)
                         for repeat in range(self.cfg["policy_value"]["repeats"])
                     ]
+                    for one in made:
+                        told = ((name, int(value)) for name, value in one.items() if name.startswith(COUNT))
+                        self.counted.update({name.removeprefix(COUNT): value for name, value in told})
                     won, judged = (torch.stack([one[key] for one in made]) for key in ("success", "judged"))
                     success = known["success"] if known else None
                     cells.append(Cell(candidate.name, task, candidate.inside, won, judged, success))

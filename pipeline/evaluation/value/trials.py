@@ -17,12 +17,15 @@ from torchrl.envs import TransformedEnv
 from actors.factory import build_physics, build_pool
 from actors.policies.recorded import Commands, RecordedActions
 from actors.rollouts.evaluate import Outcome, evaluate
+from envs.judges.base import Judge
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import PoolError, TaskPool
 from envs.physics.worker import Track
 from envs.specs import IMAGE
 from pipeline.evaluation.value.candidates import Candidate
 from pipeline.graph.kept import Kept, Tensors
+
+COUNT = "count/"  # before the names of what a judge counted, in what is kept
 
 
 @dataclass
@@ -154,7 +157,7 @@ class Imagination:
     def outcome(
         self, candidate: Candidate, about: Mapping[str, Any], repeat: int, true: Tensors | None
     ) -> Tensors:
-        """success and judged, bool [N] each, of one repeat.
+        """success and judged, bool [N] each, of one repeat, and what the judge counted meanwhile, int64 [].
 
         Args:
             about: what tells the candidate from others.
@@ -172,7 +175,8 @@ class Imagination:
             policy: Any = RecordedActions(commands, base.spec, base.mode, lambda: base.elapsed)
         else:
             policy = candidate.build(self.cfg, self.spread)
-        count = len(base.starts)
+        count, judge = len(base.starts), self.world.transform[-1].judge
+        before = counted(judge)
         # seeds that differ by a multiple of the initial states' number begin alike and draw other noise
         seeds = list(range(repeat * count, (repeat + 1) * count))
         outcome: Outcome = evaluate(
@@ -183,4 +187,10 @@ class Imagination:
             f"imagined {candidate.name}",
             sampling_seed=repeat,
         )
-        return {"success": outcome.success, "judged": outcome.counted}
+        told = {COUNT + name: torch.tensor(value - before[name]) for name, value in counted(judge).items()}
+        return {"success": outcome.success, "judged": outcome.counted, **told}
+
+
+def counted(judge: Judge) -> dict[str, int]:
+    """What a judge has counted so far, such as goals, of its facts."""
+    return {name: value for name, value in judge.facts().items() if type(value) is int}

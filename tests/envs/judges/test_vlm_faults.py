@@ -47,6 +47,8 @@ def counted(tokens: str) -> str:
         say("<html>gateway</html>"),
         say('{"choices": []}'),
         say('{"choices": [{"message": null}]}'),
+        say('{"choices": [{"message": {"content": null}}]}'),
+        say('{"choices": [{"message": {"content": " \\n"}}]}'),
         say('["not", "an", "object"]'),
         say("[" * 200_000),
         say(counted("1e999")),
@@ -55,7 +57,19 @@ def counted(tokens: str) -> str:
         refuse(503, **{"Retry-After": "Mon, 01 Jan 99999999999999999999 00:00:00 GMT"}),
     ],
     ids=[
-        *("500", "503", "408", "cut", "html", "no choices", "no message", "list", "too deep"),
+        *(
+            "500",
+            "503",
+            "408",
+            "cut",
+            "html",
+            "no choices",
+            "no message",
+            "no content",
+            "blank",
+            "list",
+            "too deep",
+        ),
         *("endless tokens", "too many tokens", "no charset", "no date"),
     ],
 )
@@ -79,7 +93,11 @@ def test_what_the_server_will_never_take_is_not_asked_again(make: Make, server: 
 
 def test_a_refusal_without_words_is_an_unusable_answer(make: Make, server: ChatServer) -> None:
     server.faults.append(
-        say(json.dumps(completion("", (5, 1)) | {"choices": [{"message": {"content": None}}]}))
+        say(
+            json.dumps(
+                completion("", (5, 1)) | {"choices": [{"message": {"content": None, "refusal": "No."}}]}
+            )
+        )
     )
     judge = make(votes={"count": 1})
     assert score(judge, clip(DONE)).status.tolist() == [Status.ABSTAIN.value]

@@ -243,16 +243,6 @@ def test_what_cannot_be_built_is_a_config_error(workers: int) -> None:
         TaskPool({"_target_": "no_such_package.Suite"}, "count", 2, 8, workers)
 
 
-def test_pictures_that_are_not_those_of_the_embodiment_are_refused_before_they_are_recorded() -> None:
-    said = r"Counting\.render gives uint8 \[1, 3, 4, 6\], but its embodiment's .* \[1, 3, 4, 4\]"
-    for ask in (lambda pool: pool.script([(0, 0.0)], 1), lambda pool: pool.reset({0: 0}, False)):
-        pool = pool_of(2, 2, shows=[4, 6])
-        with pytest.raises(ConfigError, match=said):
-            ask(pool)
-        assert not pool.lost
-        pool.close()
-
-
 def test_other_classes_are_no_suites() -> None:
     with pytest.raises(ConfigError, match="TaskSuite"):
         build_suite({"_target_": "fractions.Fraction", "numerator": 1})

@@ -131,7 +131,7 @@ def test_the_first_picture_shows_what_is_there(task: dict[str, Any], suite: Task
         assert (thing & later).sum() > 0.7 * (thing | later).sum()
 
 
-def test_physics_that_diverges_is_an_error_or_changes_nothing(
+def test_physics_that_diverges_is_an_error(
     task: dict[str, Any], suite: TaskSuite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not isinstance(suite, MujocoSuite):
@@ -139,14 +139,9 @@ def test_physics_that_diverges_is_an_error_or_changes_nothing(
     monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log
     for bad in (1e13, np.nan):
         act(suite, task["name"], 1, 0.0, 2)
-        before = suite.observe().state
         suite.world().data.qvel[0] = bad
-        try:
+        with pytest.raises(SimulationDiverged, match=r"BADQ(POS|VEL)"):
             suite.step(suite.observe().command)
-        except SimulationDiverged as error:
-            assert "BADQVEL" in str(error)
-        else:
-            assert np.array_equal(suite.observe().state, before)
     assert not act(suite, task["name"], 1, 0.0, 2)[-1].success  # another episode is as good as before
 
 

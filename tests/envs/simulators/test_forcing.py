@@ -23,6 +23,12 @@ from tests.envs.simulators.test_engines import build_engine, section_of
 SIGMOID = Sigmoid(-3.0, 3.0, 1.0)
 
 
+@pytest.mark.parametrize("ends", [(-3.0, 3.0, 0.0), (-3.0, 3.0, -1.0), (3.0, 3.0, 1.0), (3.0, -3.0, 1.0)])
+def test_no_schedule(ends: tuple[float, float, float]) -> None:
+    with pytest.raises(ValueError, match="end must be above start, and temperature above 0"):
+        Sigmoid(*ends)
+
+
 def make(chunk: int = 4, **options: Any) -> ForcingSimulator:
     """A tiny world of an arm moved by deltas, whose output is not trivial."""
     world = build_engine("forcing_small", world_spec(ARM_DELTAS, chunk=chunk))[0]

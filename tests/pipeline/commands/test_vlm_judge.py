@@ -88,7 +88,8 @@ def test_a_judge_that_can_judge_nothing_is_told_before_rl_drops_every_episode(
 def test_the_study_says_who_is_right_by_what_was_shown_and_what_it_cost(
     words: list[str], server: ChatServer, tmp_path: Path
 ) -> None:
-    cfg = load_config([*words, "judge.pictures.span=clip", "judge.pictures.every=1"])
+    whole = ["judge.pictures.span=clip", "judge.pictures.every=1"]
+    cfg = load_config([*words, *whole])
     selection = Selection.of({"frames": "all,5,ends"})
     head, names, *rows = judge_study(cfg, tmp_path / "run", selection).splitlines()
     assert head == "VLMJudge on 6 recorded episodes (held_out)" and names.split()[:6] == [
@@ -112,9 +113,7 @@ def test_the_study_says_who_is_right_by_what_was_shown_and_what_it_cost(
     assert said.splitlines()[-1].startswith("Judged by metric: NLPD") and "free" in said
     server.answer = lambda asked: "I cannot say."
     assert "calls" not in judge_study(cfg, tmp_path / "run", selection)  # all is remembered
-    other = load_config(
-        [*words, "judge.pictures.span=clip", "judge.chat.max_tokens=7", "judge.asking.stop_after=100"]
-    )
+    other = load_config([*words, *whole, "judge.chat.max_tokens=7", "judge.asking.stop_after=100"])
     last = judge_study(other, tmp_path / "run", selection).splitlines()[-1]
     assert last.split()[2:9] == ["0", "0", "0", "0", "-", "6", "0"]
 
@@ -127,6 +126,9 @@ def test_the_study_says_what_is_missing(words: list[str], tmp_path: Path) -> Non
     ):
         with pytest.raises(ConfigError, match=said):
             Selection.of(bad)
+    for frames in ("ends", "all,4"):  # of which its pictures would leave out some again
+        with pytest.raises(ConfigError, match=r"say judge\.pictures\.span=clip judge\.pictures\.every=1"):
+            judge_study(load_config(words), tmp_path / "run", Selection.of({"frames": frames}))
     learned = [word for word in words if not word.startswith("judge")]
     with pytest.raises(ConfigError, match="has learned nothing yet: first `worldloop stage judge-1`"):
         judge_study(load_config(learned), tmp_path / "run", Selection.of({"split": "all"}))

@@ -297,8 +297,13 @@ def test_masks_of_real_video_come_from_a_file(store: ClipStore, tmp_path: Path) 
     with pytest.raises(ConfigError, match="holds no array '4'"):
         read_labels(tmp_path / "good.npz", store, torch.tensor([4]))
     np.savez(tmp_path / "short.npz", **{"3": good["3"][1:]})
-    with pytest.raises(ConfigError, match=rf"the episode takes \[{length}, 3, h, w\]"):
+    with pytest.raises(ConfigError, match=rf"takes whole numbers \[{length}, 3, h, w\]"):
         read_labels(tmp_path / "short.npz", store, torch.tensor([3]))
+    odd = np.full((length, 3, 16, 16), np.nan, np.float32), good["3"].astype(np.int8) - 1, good["3"] + 0.5
+    for n, array in enumerate(odd):
+        np.savez(tmp_path / f"odd_{n}.npz", **{"3": array})
+        with pytest.raises(ConfigError, match="takes whole numbers"):
+            read_labels(tmp_path / f"odd_{n}.npz", store, torch.tensor([3]))
     whole = (tmp_path / "good.npz").read_bytes()
     np.save(tmp_path / "array.npy", good["3"])
     damaged = {

@@ -151,3 +151,20 @@ def test_instructions_share_the_starts_and_many_are_one_group(
     cfg = {"task": {"name": "recorded"}, "policy_value": {"starts": starts}}
     found = starts_of(cfg, store, torch.arange(12))
     assert {name: len(episodes) for name, episodes in found.items()} == groups
+
+
+def test_goals_are_counted_though_nothing_is_imagined_again(
+    tmp_path: Path, tiny_data: Callable[[Embodiment], Path]
+) -> None:
+    words = ["experiment=smoke", "track=disabled", "task=lerobot", f"task.data=[{tiny_data(ARM_DELTAS)}]"]
+    words += ["task.size=[32,32]", "task.chunk=4", "task.horizon=4", "judge=golden_goal"]
+    words += ["judge.fallback=last_frame", "judge.text_world.ending={threshold: 1.0}"]
+    words += ["policy_value={repeats: 2, starts: 2, noise: [0.5]}"]
+    words += untrained_world(load_config(words), tmp_path)
+    words += [f"policy_value.policies=[{tmp_path / 'policy'}]"]
+    counted = []
+    for _ in range(2):
+        policy_value(load_config(words), tmp_path / "run")
+        said = json.loads(written(tmp_path / "run", "policy-value.json").read_text())["judged_by"]
+        counted.append((said["goals"], said["goals_unfinished"]))
+    assert counted[0] == counted[1] and counted[0][0] >= 2
