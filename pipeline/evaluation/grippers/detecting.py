@@ -128,7 +128,8 @@ def train_detector(
     detector = build_detector(section, len(sights.views), len(sights.ends.arms)).to(device)
     if (folder / WEIGHTS).is_file():
         return load(detector, folder / WEIGHTS).eval()
-    store, config = sights.store, options_of(FitConfig, section["fit"], "ewmbench.detector.fit")
+    key = "ewmbench.detector.fit"
+    store, config = sights.store, options_of(FitConfig, {**section["fit"], "key": key}, key)
     episodes = learned_from(store)
     rows, owner = _shown(store, episodes)
 
