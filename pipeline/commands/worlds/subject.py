@@ -63,9 +63,9 @@ class Subject:
             for role in ("simulator", "state", "judge")
         }
         named = section["simulator"]
-        made_as = stage_of(weights["simulator"]) if named else "student"
-        student = cfg["distill"]["steps"] if made_as != "simulator" else 0
-        if made_as == "student" and named and not student:
+        made_as = stage_of(weights["simulator"]) if named else ""
+        student = 0 if made_as == "simulator" else cfg["distill"]["steps"]
+        if made_as == "student" and not student:
             raise ConfigError(
                 f"imagined.simulator={named} is a few-step student, which distill.steps=0 would sample as its"
                 " teacher; say distill.steps=<as it was distilled>"
