@@ -42,6 +42,7 @@ class Turns(nn.Module):
     @torch.no_grad()
     def fit(self, values: Tensor) -> Tensor:
         """See which orientations values [N, size] bear out; their mean [size], whatever way each is told."""
+        values = values.to(self.turn.device)
         self.turn.zero_()
         for number in self.angles:
             self.turn[number] = _TURN * bool((values[:, number].abs() <= _TURN).all())
