@@ -11,7 +11,7 @@ from typing import Any
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from envs.files import atomic, write_text
+from envs.files import atomic
 from pipeline.graph.code_version import digest
 
 Tensors = dict[str, Tensor]
@@ -39,11 +39,3 @@ class Kept:
         with atomic(path) as part:
             save_file({field: value.contiguous() for field, value in made.items()}, part)
         return made
-
-    def figures(self, name: str, identity: Mapping[str, Any], make: Callable[[], dict[str, Any]]) -> Any:
-        """The same of what JSON holds."""
-        key = digest(json.dumps(identity, sort_keys=True, default=str))
-        path = self.folder / f"{re.sub(_ODD, '_', name)}-{key}.json"
-        if not path.exists():
-            write_text(path, json.dumps(make()))
-        return json.loads(path.read_text())
