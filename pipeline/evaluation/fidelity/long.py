@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,8 @@ from envs.rng import Purpose, episode_seeds
 from envs.simulators.base import Simulator
 from envs.simulators.replay import replay, side_by_side
 from pipeline.evaluation.fidelity.frames import by_frame, frame_errors, psnr
+from pipeline.graph.kept import Tensors
 
-Tensors = dict[str, Tensor]
 Keep = Callable[[list[int], Callable[[], Tensors]], Tensors]
 _TRIES = 4  # scripted episodes for each that is wanted; physics gives some up
 _END = 0.1  # share of an episode's frames that are its end
@@ -154,7 +155,7 @@ def _rolled_out(
 
     out: Tensors = {}
     for some in torch.arange(len(episodes)).split(side_by_side(store, 1 + rows.shape[1])):
-        for name, values in keep(some.tolist(), lambda some=some: measured(some)).items():  # type: ignore[misc]
+        for name, values in keep(some.tolist(), partial(measured, some)).items():
             whole = out.setdefault(name, values.new_zeros(*rows.shape, *values.shape[2:]))
             whole[some, : values.shape[1]] = values
     return out
