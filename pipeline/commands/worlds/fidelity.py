@@ -110,21 +110,17 @@ def fidelity(cfg: Cfg, root: Path) -> str:
 def _labels(cfg: Cfg, subject: Subject, store: ClipStore, episodes: Tensor, kept: Kept) -> Tensor | None:
     """See masks.part_labels; what physics said is kept, for it says the same of every simulator."""
     masks = cfg["fidelity"]["masks"]
-    if masks is not None:
+    if masks is not None or not has_physics(cfg):
         return part_labels(cfg, store, episodes, masks)
 
     def asked() -> Tensors:
         found = part_labels(cfg, store, episodes, None)
         return {} if found is None else {"labels": found}
 
-    suite = {"suite": cfg["task"].get("suite")}
-    about = {
-        "data": subject.data_mark(),
-        "size": list(store.spec.size),
-        "episodes": episodes.tolist(),
-        **suite,
-    }
-    return kept.get("labels", {**about, "code": code_of(part_labels.__module__, suite)}, asked).get("labels")
+    suite = {"suite": cfg["task"]["suite"]}
+    code = code_of(part_labels.__module__, suite)
+    about = {"data": subject.data_mark(), "size": list(store.spec.size), "episodes": episodes.tolist()}
+    return kept.get("labels", {**about, **suite, "code": code}, asked).get("labels")
 
 
 def build_extractors(section: Mapping[str, Any]) -> list[Extractor]:
