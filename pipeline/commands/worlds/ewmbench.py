@@ -5,7 +5,7 @@ the recorded actions of held-out episodes (EWMBench, Genie Envisioner, section 6
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -110,7 +110,8 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
         ruler = gripper_ruler(cfg, store, subject.data, root)
     except EmbodimentError as error:
         notes.append(f"No trajectories (SA, TA, DYN): {error}.")
-    chosen = bench_set(cfg, store, held, ruler)
+    tasks = groups_of_episodes(cfg, store, held)
+    chosen = bench_set(cfg, store, held, tasks, ruler)
     instruments = Instruments(
         extractors.patches,
         extractors.frames,
@@ -141,11 +142,11 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
         extractors.texts,
         () if reader is None else reader.errors,
     )
-    group = dict(zip(held.tolist(), groups_of_episodes(cfg, store, held), strict=True))
+    task_of = dict(zip(held.tolist(), tasks, strict=True))
     rows = [
         {
             "episode": number,
-            "task": group[number],
+            "task": task_of[number],
             "instruction": store.instructions[number],
             **scoring.episode(made[number], true[number], store.instructions[number]),
         }
@@ -195,15 +196,19 @@ def reader_of(cfg: Mapping[str, Any]) -> Reader | None:
     return Reader.of(judge, cfg["ewmbench"]["prompts"])
 
 
-def bench_set(cfg: Mapping[str, Any], store: ClipStore, held: Tensor, ruler: GripperRuler | None) -> BenchSet:
-    """The set out of held-out episodes int64 [N], by paths in space, else in pictures, else by none."""
+def bench_set(
+    cfg: Mapping[str, Any], store: ClipStore, held: Tensor, tasks: Sequence[str], ruler: GripperRuler | None
+) -> BenchSet:
+    """The set out of held-out episodes int64 [N] of `tasks`, by paths in space, else in pictures, else by
+    none.
+    """
     section = cfg["ewmbench"]
     paths: Paths | None
     try:
         paths = in_space(store, known_ends(cfg, store), held)
     except EmbodimentError:
         paths = None if ruler is None else in_pictures(store, ruler, held)
-    return choose(held, groups_of_episodes(cfg, store, held), section["episodes"], section["voxel"], paths)
+    return choose(held, tasks, section["episodes"], section["voxel"], paths)
 
 
 def _identity(
