@@ -103,7 +103,7 @@ def orientations(names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
     place = 0
     while place < len(words):
         group: tuple[int, ...] = ()
-        if words[place][-1:] and words[place][-1] in _ANGLES and not {*words[place]} & {*_JOINTS}:
+        if words[place] and words[place][-1] in _ANGLES and not {*words[place]} & {*_JOINTS}:
             group = (place,)
         for size, kinds in ((3, _VECTORS), (4, _QUATERNIONS)):
             some = words[place : place + size]

@@ -61,6 +61,8 @@ class Turns(nn.Module):
         if self.angles:
             turn = self.turn
             values = values - turn * ((values - to) / torch.where(turn > 0, turn, 1.0)).round()
+        if self.wholes:
+            values = values.clone()
         for group, borne_out in zip(self.wholes, self.borne_out, strict=True):
             some = values[..., group]
             along = (some * to[..., group]).sum(-1, keepdim=True)
@@ -69,7 +71,6 @@ class Turns(nn.Module):
             else:
                 norm = some.norm(dim=-1, keepdim=True).clamp(min=1e-6)
                 factor = 1 - _TURN / norm * ((norm - along / norm) / _TURN).round()
-            values = values.clone()
             values[..., group] = some * torch.where(borne_out, factor, 1.0).to(some)
         return values
 

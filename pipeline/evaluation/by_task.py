@@ -14,7 +14,7 @@ from envs.targets import ConfigError, nearest
 
 T = TypeVar("T")
 _MOST = 8  # instructions that are told apart, where they alone tell tasks apart
-VARIOUS = "various instructions"  # in place of a task, where there are more
+_VARIOUS = "various instructions"  # in place of a task, where there are more
 
 
 def tasks_of_seeds(cfg: Mapping[str, Any], seeds: Iterable[int]) -> list[str]:
@@ -87,7 +87,7 @@ def groups_of_episodes(cfg: Mapping[str, Any], store: ClipStore, episodes: Tenso
     """
     tasks = tasks_of_episodes(cfg, store, episodes)
     many = not cfg["task"].get("suite") and len(set(tasks)) > _MOST
-    return [VARIOUS] * len(tasks) if many else tasks
+    return [_VARIOUS] * len(tasks) if many else tasks
 
 
 def evenly(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor, count: int) -> Tensor:
