@@ -112,6 +112,8 @@ def test_a_text_world_that_never_says_done_is_counted_and_handled_as_asked(fallb
     assert judged.status.tolist() == [status.value] * 2
     assert bool((judged.success == 0).all()) == (fallback == "progress_only")
     assert bool(judged.progress.any())
+    advice = type(judge).remedy({"text_world": {}, "fallback": fallback})
+    assert ("or set judge.fallback=" in advice) == (fallback == "drop")  # which the others have done
 
 
 def test_a_fallback_that_nobody_knows_is_refused() -> None:

@@ -174,6 +174,13 @@ def test_without_physics_nobody_asks_it_unless_told_to(
     assert [list(plan.configs) for plan in plans] == [[*learned, "rule"], learned, ["proxy", "rule"]]
 
 
+def test_a_judge_that_cannot_be_asked_is_told_before_anything_runs(tmp_path: Path) -> None:
+    smoke = ["experiment=smoke", "track=disabled", f"runs={tmp_path}"]
+    with pytest.raises(ConfigError, match=r"judge\.chat\.model is empty"):
+        worlds.rewards([*smoke, "rewards=[learned,vlm]"])
+    assert not (tmp_path / "smoke/stages").exists()
+
+
 def test_episodes_of_unseen_scenes(tmp_path: Path) -> None:
     cfg = load_config(["experiment=smoke", "task=tabletop", "task.name=push", "task.size=[32,32]"])
     graph = Graph(cfg, tmp_path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from pipeline.stages import pace
 from pipeline.study.columns import Measured, Success
 from pipeline.study.curves import SuccessOverTime
 from pipeline.study.judges import FramesShown
+from pipeline.study.show import OVER_SEEDS, markdown
 from pipeline.study.side_by_side import best_of, headlines
 from pipeline.study.worlds import Gain, Gap, Rollout, Speed, Training, Verdicts
 
@@ -218,3 +220,25 @@ def test_rows_are_ranked_on_seeds_that_they_share() -> None:
     assert best_of(table, columns) == ["Best, of what was run: speed: a (seed 0)."]
     cells = [line[1] for line in headlines(table, columns)[1:]]
     assert cells == ["50 frames/s (seeds 0, 1)", "55 frames/s (seed 0)"]
+
+
+def test_tables_are_markdown_whatever_their_headings_are_and_tell_gains_by_seed() -> None:
+    gain = {"gain": 2.0, "episodes": 8, "gained": 3, "lost": 1, "p": 0.6, "by_seed": [1.0, 3.0]}
+    gain["over_seeds"] = {"mean": 2.0, "low": -10.7, "high": 14.7, "p": 0.3}
+    table = {
+        "name": "any",
+        "columns": {"values": {"title": "values", "labels": ["mean |dSR|"]}},
+        "rows": [],
+        "pooled": [{"row": "ppo", "title": "PPO", "seeds": {"values": [0, 1]}, "cells": {"values": {}}}],
+        "comparisons": [
+            {"row": "ppo", "title": "PPO", "other": "imitation", "column": "values", "seeds": [0, 1]}
+            | {"cells": {"mean |dSR|": gain}}
+        ],
+    }
+    said = markdown(table, {"values": Success("values")})
+    assert "mean \\|dSR\\|" in said and OVER_SEEDS in said
+    lines = said.splitlines()
+    for head, line in pairwise(lines):
+        if line.startswith("| ---"):
+            assert head.replace("\\|", "").count("|") == line.count("|")
+    assert "+2.0, p 0.6 (3 won, 1 lost); by seed +1.0, +3.0 [-10.7, +14.7], p 0.3" in said
