@@ -17,6 +17,7 @@ import numpy as np
 from envs.embodiment import ActionKind, Arm, Camera, Embodiment
 from envs.physics.mujoco_suite import MujocoSuite, World, steps_per_frame
 from envs.physics.noisy_oracle import NoisyOracle
+from envs.physics.starts import STARTS, belongs, check_starts
 from envs.physics.suite import (
     Array,
     Expert,
@@ -41,6 +42,7 @@ TASKS = {
     "scene-window": ("scene", "window"),
     "scene-button": ("scene", "button"),
 }
+SLIDES = {"drawer_slide": (-0.16, 0.0), "window_slide": (0.0, 0.2)}  # m, between which OGBench draws them
 _MARK = 0.4  # opacity of the mark where a cube shall go
 _OVER = 0.05  # m by which a cube's target must lie higher to be on top of another
 INSTALL = (
@@ -64,13 +66,15 @@ class OGBench(MujocoSuite):
         size: (height, width) of every picture.
         cameras: names out of CAMERAS, in the views' order.
         calibrated: whether intrinsics and camera poses are told.
+        starts: which of those drawn, by where cubes lie and how far drawer and window are open: all, inner,
+            or outer, unseen where inner ones are learned from; see starts.belongs.
 
     Raises:
         SuiteError: if ogbench is not installed, or an option does not fit.
     """
 
     tasks = tuple(TASKS)
-    offers = MappingProxyType({"cameras": tuple(CAMERAS)})
+    offers = MappingProxyType({"cameras": tuple(CAMERAS), "starts": STARTS})
 
     def __init__(
         self,
@@ -79,6 +83,7 @@ class OGBench(MujocoSuite):
         size: tuple[int, int],
         cameras: tuple[str, ...],
         calibrated: bool,
+        starts: str,
     ):
         try:
             with warnings.catch_warnings():
@@ -87,7 +92,9 @@ class OGBench(MujocoSuite):
         except ImportError as error:
             raise SuiteError(f"task=ogbench needs more packages ({error}): {INSTALL}") from error
         check_cameras(cameras, CAMERAS)
+        check_starts(starts)
         super().__init__(size, cameras)
+        self._starts = starts
         self.substeps = steps_per_frame(control_hz, SIM_HZ)
         self.condition = HeldCondition(hold, control_hz)
         self._envs: dict[str, Any] = {}
@@ -110,6 +117,8 @@ class OGBench(MujocoSuite):
             self._envs[self._scene] = self._open[self._scene]()
         self._env = env = self._envs[self._scene]
         env.reset(seed=seed)
+        while not belongs(self._starts, *_drawn(env, self._scene)):
+            env.reset()  # goes on with what the seed began
         env._model.vis.quality.offsamples = 0
         if self._kind in ("drawer", "window"):
             env._cur_button_states[:] = 1
@@ -223,6 +232,18 @@ class OGBench(MujocoSuite):
             return f"press the {('left', 'right')[env._target_button]} button"
         opened = {"drawer": env._target_drawer_pos < -0.08, "window": env._target_window_pos > 0.1}
         return f"{'open' if opened[self._kind] else 'close'} the {self._kind}"
+
+
+def _drawn(env: Any, scene: str) -> tuple[Array, Array, Array]:
+    """Where cubes lie and how far drawer and window are open, in metres [n], and between what it is drawn."""
+    slides = SLIDES if scene == "scene" else {}
+    places = [env._data.joint(f"object_joint_{k}").qpos[:2] for k in range(env._num_cubes)]
+    drawn = np.concatenate([*places, *(env._data.joint(name).qpos for name in slides)])
+    low, high = (
+        np.concatenate([np.tile(bound, len(places)), [ends[end] for ends in slides.values()]])
+        for end, bound in enumerate(env._object_sampling_bounds)
+    )
+    return drawn, low, high
 
 
 def _package() -> tuple[dict[str, Callable[[], Any]], dict[str, Any]]:

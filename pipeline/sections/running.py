@@ -71,4 +71,5 @@ class Top:
     threads: Count
     runs: Name
     cameras: Literal["all", "main"] | Annotated[Sequence[str], MinLen(1)]
+    starts: Literal["all", "inner", "outer"]
     microbatches: Count

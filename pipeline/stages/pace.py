@@ -56,6 +56,16 @@ def in_time(inputs: Inputs, part: str, fit: FitConfig) -> FitConfig:
     return replace(fit, steps=max(1, round(inputs.settings["seconds"] * speed / fit.batch)))
 
 
+def fits_of(cfg: Cfg) -> dict[str, FitConfig]:
+    """How tokenizer, simulator and state expert of a first world learn."""
+    sections = {
+        "tokenizer": (cfg["tokenizer_fit"], "tokenizer_fit"),
+        "simulator": (cfg["simulator_fit"]["first"]["fit"], "simulator_fit.first.fit"),
+        "state": (cfg["state_fit"]["first"]["fit"], "state_fit.first.fit"),
+    }
+    return {part: fit_options(cfg, *section) for part, section in sections.items()}
+
+
 @stage(reads=(*SIMULATOR, *_FITS, "equal_time.measured"), place=Place.LEARNERS)
 def pace(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Samples per second in which a world's tokenizer, simulator and state expert learn, each for a few steps
@@ -66,12 +76,7 @@ def pace(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     prepare_process(cfg["seed"], cfg["threads"])
     model = build_simulator(cfg)
     decoder = build_state_decoder(cfg, model)
-    first = dict(cfg["simulator_fit"]["first"])
-    fits = {
-        "tokenizer": (cfg["tokenizer_fit"], "tokenizer_fit"),
-        "simulator": (first.pop("fit"), "simulator_fit.first.fit"),
-        "state": (cfg["state_fit"]["first"]["fit"], "state_fit.first.fit"),
-    }
+    first = {key: value for key, value in cfg["simulator_fit"]["first"].items() if key != "fit"}
     how = options(SimulatorFitConfig, first, "simulator_fit.first")
     common = (store, episodes)
     trained: dict[str, Train] = {
@@ -84,11 +89,11 @@ def pace(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         "simulator": learns(model),
         "state": learns(decoder),
     }
-    out = {}
+    fits, out = fits_of(cfg), {}
     for part, train in trained.items():
         if not present[part]:
             continue
-        fit = fit_options(cfg, *fits[part])
+        fit = fits[part]
         train(replace(fit, steps=_WARM_UP), trial / f"{part}-warm-up")
         fit = replace(fit, steps=cfg["equal_time"]["measured"])
         spent = train(fit, trial / part)

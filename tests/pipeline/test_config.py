@@ -375,7 +375,7 @@ def test_an_option_has_one_default(path: Path) -> None:
 
 
 @pytest.mark.parametrize("experiment", ["metaworld5", "aloha", "bench4", "roboscape"])
-@pytest.mark.parametrize("task", ["metaworld", "aloha"])
+@pytest.mark.parametrize("task", ["metaworld", "aloha", "ogbench"])
 def test_what_is_out_of_domain_is_learned_from_in_no_suite(experiment: str, task: str) -> None:
     cfg = read_config([f"experiment={experiment}", f"task={task}"])
     assert cfg["extra_starts"]["variants"] == ["out_of_domain"]

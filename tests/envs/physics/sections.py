@@ -18,8 +18,12 @@ def task_section(choice: str, **changes: Any) -> dict[str, Any]:
     """A task of configs/task, with small pictures and with options of its suite changed."""
     cfg = _load(choice)
     cfg.size = [24, 32]
+    cfg.starts = "all"  # what configs/config.yaml says
     cfg.suite = {**cfg.suite, **changes}
-    return OmegaConf.to_container(cfg, resolve=True)  # type: ignore[return-value]
+    section = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(section, dict)
+    del section["starts"]
+    return section  # type: ignore[return-value]
 
 
 def physical_tasks() -> dict[str, dict[str, Any]]:

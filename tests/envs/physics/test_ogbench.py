@@ -51,6 +51,27 @@ def test_words_say_which_way(suite: OGBench) -> None:
     assert said == {"open the drawer", "close the drawer"}
 
 
+@pytest.mark.parametrize("task", ["cube-double", "scene-drawer"])
+def test_outer_starts_are_none_of_the_inner_ones(task: str) -> None:
+    far = {}
+    for starts in ("inner", "outer"):
+        suite = built(starts=starts)
+        found = []
+        for seed in (*range(12), 3):
+            suite.reset(task, seed)
+            data = suite._env._data
+            cubes = [data.joint(f"object_joint_{k}").qpos[:2].copy() for k in range(suite._env._num_cubes)]
+            (low, high) = suite._env._object_sampling_bounds
+            off = [np.abs(2 * (xy - low) / (high - low) - 1) for xy in cubes]
+            if task.startswith("scene"):
+                off.append(np.abs(2 * -data.joint("drawer_slide").qpos / 0.16 - 1))
+                off.append(np.abs(2 * data.joint("window_slide").qpos / 0.2 - 1))
+            found.append(np.concatenate(off).max())
+        assert found[3] == found.pop()  # a seed is a start
+        far[starts] = found
+    assert max(far["inner"]) < 0.82 and min(far["outer"]) > 0.78  # things settle by millimetres
+
+
 def test_pictures_show_the_mark_but_not_success(suite: OGBench) -> None:
     suite.reset("cube-single", 1)
     env = suite._env

@@ -257,19 +257,11 @@ def test_what_helps_training_that_diverges_is_in_the_config(key: str, tmp_path: 
     assert section["lr"] == 1e-7 and section["bf16"] is False
 
 
-def test_parts_that_are_timed_know_where_their_options_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def train(*args: Any) -> dict[str, float]:
-        known.append(args[-2].key)
-        return {"compute_seconds": 1.0}
-
-    known: list[str] = []
-    for part in ("tokenizer", "simulator", "state"):
-        monkeypatch.setattr(pace, f"train_{part}", train)
-    for name in ("open_store", "learning_episodes", "build_simulator", "build_state_decoder", "learns"):
-        monkeypatch.setattr(pace, name, lambda *_: True)
-    cfg = load_config(["experiment=soak", "simulator=dit_small"])
-    (tmp_path / "trial").mkdir()
-    pace.pace.run(pace.pace.view("pace", cfg, {}), tmp_path, Inputs())
-    assert list(dict.fromkeys(known)) == ["tokenizer_fit", "simulator_fit.first.fit", "state_fit.first.fit"]
+def test_parts_that_are_timed_know_where_their_options_are() -> None:
+    fits = pace.fits_of(load_config(["experiment=soak", "simulator=dit_small", "state_fit.first.fit.lr=0.5"]))
+    assert {part: fit.key for part, fit in fits.items()} == {
+        "tokenizer": "tokenizer_fit",
+        "simulator": "simulator_fit.first.fit",
+        "state": "state_fit.first.fit",
+    }
+    assert fits["state"].lr == 0.5
