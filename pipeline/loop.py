@@ -142,11 +142,10 @@ def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
             policy = graph.add(
                 f"clone-{number}",
                 imitation.clone,
-                {"data": data, "policy": policy, "simulator": made.simulator},
-                number=number,
+                {"data": data, "policy": policy, "known": known, "simulator": made.simulator},
             )
         if with_rl:
-            policy = _learn(graph, cfg, data, made, policy, number, starts)
+            policy = _learn(graph, cfg, data, made, policy, number, starts, known)
     last = last_round(cfg) + 1
     policy, _ = _keep(graph, policy, _deploy(graph, cfg, policy, last), best, known, last)
     before = graph.add("evaluate-before", prove.evaluate_physics, {"policy": first})
@@ -196,7 +195,7 @@ def _data_loop(graph: Graph, cfg: Cfg) -> None:
     first = add_imitation(graph, cfg, data)
     made = add_world(graph, cfg, data, World(), 1)
     starts = _extra_starts(graph, cfg)
-    policy = _learn(graph, cfg, data, made, first, 1, starts, deployed=0)
+    policy = _learn(graph, cfg, data, made, first, 1, starts, known="")
     _conclude(graph, data, made, first, policy, {})
 
 
@@ -249,15 +248,14 @@ def _learn(
     policy: str,
     number: int,
     starts: list[str],
-    deployed: int | None = None,
+    known: str,
 ) -> str:
-    """RL in the imagined world; `deployed` is the round whose successes anchor it, this one by default."""
+    """RL in the imagined world; `known` says how good the policy is, "" if it was not deployed."""
     return graph.add(
         f"rl-{number}",
         rl.rl,
-        {"data": data, "starts": starts, **made.roles(), "policy": policy},
+        {"data": data, "starts": starts, **made.roles(), "policy": policy, "known": known},
         number=number,
-        deployed=number if deployed is None else deployed,
         iterations=of_round(cfg["rounds"]["iterations"], number),
     )
 

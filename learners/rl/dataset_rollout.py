@@ -1,7 +1,9 @@
 """Recorded episodes as a rollout: what a critic can learn of the true world before it judges its first
 imagined one.
 
-Rewards are those that a perfect judge would have given: from the recorded success and time alone.
+Success is the recorded one. Progress is what the judge sees in a frame, as in imagination, and not how soon
+this episode truly succeeds: that depends on what the policy did next, so paying its change takes from an
+action what it achieves itself, and the slower of two successes would be worth more.
 """
 
 from __future__ import annotations
@@ -12,11 +14,12 @@ from tensordict.nn import TensorDictModuleBase
 
 from actors.policies.contract import VISUAL_FEATURES, feature_part, inputs_for, writes_features
 from envs.episodes.clips import ClipStore
-from envs.judges.labels import progress_to_success
-from envs.specs import IMAGE, INSTRUCTION_UTF8, STATE, Rewards
+from envs.judges.base import Judge
+from envs.specs import IMAGE, INSTRUCTION_UTF8, STATE, Rewards, Status
 from learners.stages.observed import observe
 
 _AT_ONCE = 512  # frames per pass
+_SIDE_BY_SIDE = 32  # episodes that a judge is shown
 
 
 @torch.no_grad()
@@ -25,14 +28,18 @@ def dataset_rollout(
     store: ClipStore,
     episodes: torch.Tensor,
     rewards: Rewards,
-    discount: float,
+    judge: Judge | None = None,
+    features: torch.Tensor | None = None,
 ) -> TensorDict:
     """Episodes of a store, decision by decision, as a rollout that GAE reads.
 
     Args:
         policy: whose visual features the critic reads; of one that writes none, pictures and text are given.
         episodes: labelled ones, int64 [N].
-        discount: per frame, of progress towards success; the judge's, if it learns progress by one.
+        judge: says how far the task is wherever a decision is taken; where the record says success, progress
+            is 1. None, and where progress is worth nothing: success alone is paid.
+        features: float32 [N, 1 + C, D] of a judge that reads them: of the first frame, while nothing is done,
+            then of the C chunks of the longest episode; see simulators.features.
 
     Returns:
         TensorDict [N, T] with what critics read of each decision and of what followed, reward, ends, `row`
@@ -49,25 +56,58 @@ def dataset_rollout(
     at = torch.minimum(torch.arange(steps + 1) * chunk, last[:, None])  # past the end the last frame stays
     rows = store.start[episodes][:, None] + at
     seen = _observed(policy, store, rows)
-    success, progress = _labels(store, episodes, discount)
-    success, progress = success.gather(1, at), progress.gather(1, at)
     over = at[:, 1:] == last[:, None]
-    won = (success[:, 1:] > 0.5) & over
+    won = (store.arrays["success"][rows[:, 1:]] > 0.5) & over
+    progress = torch.zeros(at.shape)
+    if judge is not None and rewards.progress:
+        progress = _seen_progress(judge, store, episodes, at, features)
+    after = torch.where(won, float(judge is not None and rewards.progress > 0), progress[:, 1:])
     out = seen[:, :-1].copy()
     out["row"], out["valid"] = rows[:, :-1], at[:, :-1] < last[:, None]
     out["whole"] = at[:, :-1] + chunk <= last[:, None]
     out["next"] = seen[:, 1:].copy()
-    out["next", "reward"] = rewards(progress[:, :-1, None], progress[:, 1:, None], won[..., None])
+    out["next", "reward"] = rewards(progress[:, :-1, None], after[..., None], won[..., None])
     out["next", "done"], out["next", "terminated"] = over[..., None], won[..., None]
     return out
 
 
-def _labels(store: ClipStore, episodes: torch.Tensor, discount: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Success and progress of every frame, float32 [N, longest], the last one repeated."""
-    length = store.length[episodes]
-    frame = torch.minimum(torch.arange(int(length.max())), length[:, None] - 1)
-    success = store.arrays["success"][store.start[episodes][:, None] + frame].float()
-    return success, progress_to_success(success, discount)
+def _seen_progress(
+    judge: Judge, store: ClipStore, episodes: torch.Tensor, at: torch.Tensor, features: torch.Tensor | None
+) -> torch.Tensor:
+    """Progress float32 [N, T] that a judge sees in frames `at` int64 [N, T] of episodes; where it knows
+    nothing it stays what it was, 0 at first.
+    """
+    parts = []
+    for some in torch.arange(len(episodes)).split(_SIDE_BY_SIDE):
+        mine, when, opening = episodes[some], at[some], store.start[episodes[some]][:, None]
+        if features is None:
+            parts.append(_told(judge, store, mine, opening + when))
+            continue
+        read = features[some]  # of whole chunks, all frames of which are shown
+        first = _told(judge, store, mine, opening, read[:, :1])
+        others = _told(judge, store, mine, store.whole(mine)[0], read[:, 1:])
+        parts.append(torch.cat((first, others), 1).gather(1, when))
+    out = torch.cat(parts)
+    out[:, 0] = torch.nan_to_num(out[:, 0])
+    for t in range(1, out.shape[1]):
+        out[:, t] = torch.where(torch.isfinite(out[:, t]), out[:, t], out[:, t - 1])
+    return out
+
+
+def _told(
+    judge: Judge,
+    store: ClipStore,
+    episodes: torch.Tensor,
+    rows: torch.Tensor,
+    features: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """Progress float32 [N, T] in recorded frames `rows` [N, T]; NaN where the judge does not know."""
+    device = judge.threshold.device
+    first, texts = store.frames(store.start[episodes]), [store.instructions[n] for n in episodes.tolist()]
+    read = () if features is None else (features.to(device),)  # others' judges need not know the word
+    said = judge.score(store.frames(rows).to(device), first.to(device), texts, *read)
+    known = (said.status == Status.OK.value)[:, None].cpu() & store.arrays["present"][rows]
+    return torch.where(known, said.progress.float().cpu(), torch.nan)
 
 
 def _observed(policy: TensorDictModuleBase, store: ClipStore, rows: torch.Tensor) -> TensorDict:

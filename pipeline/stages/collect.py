@@ -206,6 +206,7 @@ def deploy(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     write_splits(data, counts)
     success = torch.tensor(won)
     return {
+        "round": number,
         "episodes": len(success),
         "dropped": episodes - len(success),
         "held_out": counts["held_out"],

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from actors.factory import build_judge, build_simulator, build_state_decoder, build_world, open_clips
 from envs.episodes.clips import ClipStore
 from envs.initial_states import InitialStates
+from envs.manifest import read_manifest
 from envs.specs import ActionMode
 from envs.targets import ConfigError, options
 from learners.rl.algorithm import RLConfig
@@ -119,6 +120,17 @@ def demonstrations(cfg: Cfg, store: ClipStore) -> Tensor:
             " say \"imitation.sources=['*']\" for all or name others, lower imitation.demos, or collect more"
         )
     return chosen
+
+
+def deployed_in(inputs: Inputs, role: str) -> int:
+    """The round in which a policy was deployed, by the role of what says how good it is, that deployment or a
+    comparison that it stood; 0 if nobody plays it. Where a newer policy got worse that is no newer round.
+    """
+    if role not in inputs.found:
+        return 0
+    manifest = read_manifest(inputs.folder(role))
+    assert manifest is not None, "a role is played by finished stages"
+    return int(manifest["result"]["round"])
 
 
 def successful_episodes(cfg: Cfg, store: ClipStore, number: int) -> Tensor:

@@ -21,6 +21,7 @@ from pipeline.stages.given import (
     SIMULATOR,
     Cfg,
     demonstrations,
+    deployed_in,
     fit_options,
     learning_episodes,
     mode_of,
@@ -53,14 +54,12 @@ def imitation(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 @stage(reads=(*SIMULATOR, "policy", "imitation", "clone"), place=Place.LEARNERS)
 def clone(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """The deployed policy, perception and all, learns from what worked in physics, and to see generated
-    pictures as it sees true ones.
-
-    Settings: number of the round.
+    pictures as it sees true ones; the role `known` says in which round it was deployed.
     """
     store, section = open_store(cfg, inputs), cfg["clone"]
     prepare_process(cfg["seed"], cfg["threads"])
     policy = build_policy(cfg, inputs.weights("policy"))
-    episodes = successful_episodes(cfg, store, inputs.settings["number"])
+    episodes = successful_episodes(cfg, store, deployed_in(inputs, "known"))
     own = store.select(["policy-*"])
     own = own[torch.isin(own, learning_episodes(store))].flip(0)[: section["imagined"]]  # the newest first
     simulator = build_simulator(cfg, inputs.weights("simulator"))

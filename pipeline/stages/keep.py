@@ -14,7 +14,7 @@ from typing import Any
 from envs.files import atomic
 from envs.manifest import read_manifest
 from pipeline.graph.stage import Inputs, stage
-from pipeline.stages.given import Cfg
+from pipeline.stages.given import Cfg, deployed_in
 
 _WEIGHTS = "weights.safetensors"
 # By how many standard errors the newer policy must have succeeded less often. Deployments are short and RL
@@ -28,15 +28,16 @@ def keep(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     error of the difference, by their deployments `tried` and `known`.
 
     Returns:
-        Whether the candidate was kept, how often it succeeded (candidate) and the kept one (success), and in
-        how many episodes the kept one was tried.
+        Whether the candidate was kept, how often it succeeded (candidate) and the kept one (success), in how
+        many episodes the kept one was tried, and in which round.
     """
     tried, known = (_deployment(inputs.folder(role)) for role in ("tried", "known"))
     kept = not got_worse(tried, known)
     with atomic(folder / _WEIGHTS) as part:
         shutil.copyfile(inputs.folder("candidate" if kept else "incumbent") / _WEIGHTS, part)
     success, episodes = tried if kept else known
-    return {"kept": kept, "success": success, "episodes": episodes, "candidate": tried[0]}
+    found = {"kept": kept, "success": success, "episodes": episodes, "candidate": tried[0]}
+    return {**found, "round": deployed_in(inputs, "tried" if kept else "known")}
 
 
 def got_worse(tried: tuple[float, int], known: tuple[float, int]) -> bool:

@@ -9,7 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from actors.factory import build_algorithm, build_policy, open_clips
+from actors.factory import (
+    build_algorithm,
+    build_judge,
+    build_policy,
+    build_simulator,
+    build_state_decoder,
+    open_clips,
+)
 from actors.fleets.fleet import Fleet, FleetError
 from actors.fleets.launch import build_fleet
 from actors.policies.contract import action_key, freeze_perception, rl_rate
@@ -19,7 +26,9 @@ from actors.world_config import rewards_of
 from envs.episodes.clips import ClipStore
 from envs.episodes.key_frames import key_points
 from envs.initial_states import decision_points, shared_out
+from envs.judges.base import Judge
 from envs.rng import Purpose, episode_seeds
+from envs.simulators.features import features_of_chunks, features_of_episodes
 from envs.specs import CHUNK
 from envs.targets import target
 from learners.rl.algorithm import Algorithm
@@ -37,6 +46,7 @@ from pipeline.stages.given import (
     WORLD,
     Cfg,
     datasets,
+    deployed_in,
     imagined_chunks,
     learning_episodes,
     mode_of,
@@ -57,13 +67,15 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Reinforcement learning inside the simulator; the role `starts`, if somebody plays it, holds first
     frames that nothing more was recorded of.
 
-    Settings: number of the round, iterations; deployed, the round whose true successes anchor the policy (0:
-    demonstrations alone).
+    The role `known` says in which round the policy was deployed, whose true decisions are learned from and
+    whose successes anchor it; without one demonstrations alone anchor it.
+
+    Settings: number of the round, iterations.
 
     Raises:
         FleetError: if too many episodes are lost; also what to change, where the judge lost most of them.
     """
-    number, deployed = inputs.settings["number"], inputs.settings["deployed"]
+    number, deployed = inputs.settings["number"], deployed_in(inputs, "known")
     prepare_process(cfg["seed"], cfg["threads"])
     store = open_store(cfg, inputs)
     policy = build_policy(cfg, inputs.weights("policy"))
@@ -79,7 +91,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     inside = None if settings.starts == "first" else newest_episodes(store, inputs, learning_episodes(store))
     data, more = (datasets(inputs.folders(role)) for role in ("data", "starts"))
     extra = range(len(store), len(store) + (len(open_clips(cfg, more)) if more else 0))
-    knew, decisions = _warm_up(cfg, policy, algorithm, store, settings.seed, number)
+    knew, decisions = _warm_up(cfg, inputs, policy, algorithm, store, settings.seed)
     recipe = Recipe(
         config=cfg.plain(),
         episodes=settings.envs // settings.shards,
@@ -138,25 +150,41 @@ def what_the_judge_needs(cfg: Cfg, fleet: Fleet | None) -> str:
 
 
 def _warm_up(
-    cfg: Cfg, policy: Any, algorithm: Algorithm, store: ClipStore, seed: int, number: int
+    cfg: Cfg, inputs: Inputs, policy: Any, algorithm: Algorithm, store: ClipStore, seed: int
 ) -> tuple[dict[str, float], RecordedDecisions | None]:
     """Let a critic, if the algorithm has one, learn from the deployed policy's true episodes first; one that
     begins from nothing spoils the first iterations. What it says of their decisions RL learns from, too.
     """
-    past = store.select([f"policy-{number}"])
+    past = store.select([f"policy-{deployed_in(inputs, 'known')}"])
     past = past[torch.isin(past, learning_episodes(store)) & store.arrays["labelled"][past]]
     if not hasattr(algorithm, "warm_up") or not len(past):
         return {}, None
-    # A judge that is not taught by it measures progress otherwise, and it is 1 where the task is done all the
-    # same: for what physics has told, the discounted time that perception learns stands in.
-    discount = cfg["judge"].get("discount", cfg["imitation"]["discount"])
-    rollout = dataset_rollout(policy, store, past, rewards_of(cfg), discount)
+    rewards, judge, features = rewards_of(cfg), None, None
+    if rewards.progress:  # to some judges every question costs
+        judge, features = _judge_of_recordings(cfg, inputs, store, past)
+    rollout = dataset_rollout(policy, store, past, rewards, judge, features)
     rollout, knew = algorithm.warm_up(rollout, seed)
     if action_key(policy) != CHUNK:
         return {"critic_knew": knew}, None
     decisions = RecordedDecisions(policy, store, rollout, mode_of(cfg))
     figures = {"critic_knew": knew, "recorded_decisions": float(len(decisions))}
     return figures, decisions if len(decisions) else None
+
+
+def _judge_of_recordings(
+    cfg: Cfg, inputs: Inputs, store: ClipStore, episodes: Tensor
+) -> tuple[Judge, Tensor | None]:
+    """The judge that rewards imagined episodes, and the features that it reads of recorded ones, if any; see
+    dataset_rollout.
+    """
+    judge = build_judge(cfg, inputs.weights("judge")).eval()
+    if not judge.reads_features:
+        return judge, None
+    simulator, bf16 = build_simulator(cfg, inputs.weights("simulator")), cfg["simulator"]["bf16"]
+    build_state_decoder(cfg, simulator, inputs.weights("state"))  # it may mix the simulator's features
+    begin = torch.zeros_like(episodes)
+    still = features_of_chunks(simulator, store, episodes, begin, bf16, still=True)
+    return judge, torch.cat((still[:, None], features_of_episodes(simulator, store, episodes, bf16)), 1)
 
 
 @stage(reads=(*PHYSICS, *LEARNING))

@@ -39,7 +39,7 @@ KEYS = ("advantage", "value_target", "state_value")
 def known(store: ClipStore, policy: TensorDictModuleBase) -> tuple[Algorithm, RecordedDecisions]:
     """PPO whose critic has seen all labelled episodes, and their decisions."""
     ppo = algorithm_of("ppo", policy, store.spec)
-    rollout = dataset_rollout(policy, store, _labelled(store), Rewards(1.0, 1.0), 0.9)
+    rollout = dataset_rollout(policy, store, _labelled(store), Rewards(1.0, 1.0))
     rollout, _ = ppo.warm_up(rollout, 0)  # type: ignore[attr-defined]
     return ppo, RecordedDecisions(policy, store, rollout, ActionMode.ABSOLUTE)
 
@@ -156,7 +156,7 @@ def test_updates_learn_from_both_and_without_imagination_from_true_ones_alone(
     def learned(count: int, flip: float) -> tuple[torch.Tensor, dict[str, float]]:
         policy = policy_of("chunk_gaussian", store.spec, ActionMode.ABSOLUTE)
         ppo, decisions = known(store, policy)
-        batch = dataset_rollout(policy, store, _labelled(store), Rewards(1.0, 1.0), 0.9)
+        batch = dataset_rollout(policy, store, _labelled(store), Rewards(1.0, 1.0))
         batch["next", "reward"] *= flip
         rows = batch["row"].flatten()
         batch[IMAGE] = store.frames(rows).unflatten(0, batch.shape)

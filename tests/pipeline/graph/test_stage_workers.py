@@ -57,7 +57,7 @@ def test_two_learners_and_an_evaluator_do_what_one_process_does(cluster: None, t
             ("judge", recipe.judge),
         )
     }
-    settings = {"number": 1, "deployed": 0, "iterations": 1}
+    settings = {"number": 1, "iterations": 1}
     inputs = Inputs({**folders, "data": (Path(recipe.data[0]).parent,)}, settings)
     alone, both = tmp_path / "alone", tmp_path / "both"
     for folder in (alone, both):

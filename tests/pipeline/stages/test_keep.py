@@ -15,7 +15,7 @@ from pipeline.stages.keep import got_worse, keep
 
 @stage(reads=())
 def deployed(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """A policy that was deployed. Settings: success, episodes."""
+    """A policy that was deployed. Settings: success, episodes, round."""
     (folder / "weights.safetensors").write_text(str(inputs.settings["success"]))
     return dict(inputs.settings)
 
@@ -43,8 +43,8 @@ def test_the_stage_hands_on_the_policy_and_what_is_known_of_it(
     success: float, kept: bool, tmp_path: Path
 ) -> None:
     graph = Graph({"launch": {}}, tmp_path)
-    new = graph.add("new", deployed, success=success, episodes=400)
-    old = graph.add("old", deployed, success=0.44, episodes=800)
+    new = graph.add("new", deployed, success=success, episodes=400, round=2)
+    old = graph.add("old", deployed, success=0.44, episodes=800, round=1)
     roles = {"candidate": new, "tried": new, "incumbent": old, "known": old}
     first = graph.add("keep-2", keep, roles)
     # What was kept is known by the deployment that it had.
@@ -55,7 +55,8 @@ def test_the_stage_hands_on_the_policy_and_what_is_known_of_it(
         "success": success if kept else 0.44,
         "episodes": 400 if kept else 800,
         "candidate": success,
+        "round": 2 if kept else 1,  # whose episodes RL goes on with
     }
-    assert results["keep-3"]["kept"]
+    assert results["keep-3"]["kept"] and results["keep-3"]["round"] == 1
     chosen = (graph.folder(first) / "weights.safetensors").read_text()
     assert chosen == str(success if kept else 0.44)

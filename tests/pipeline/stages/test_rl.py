@@ -10,27 +10,34 @@ import torch
 
 from actors.factory import build_algorithm, build_policy, open_clips
 from envs.embodiment import Embodiment
+from envs.manifest import write_manifest
 from pipeline.config import load_config
+from pipeline.graph.stage import Inputs
 from pipeline.stages import rl as stages
 from tests.embodiments import ARM_DELTAS
 
 SQUARE = ("task=lerobot", "task.size=[32,32]", "task.chunk=4", "task.horizon=12", "task.mode=absolute")
 
 
-@pytest.mark.parametrize("judge", ["learned", "golden_goal", "vlm"])
-def test_true_decisions_are_learned_from_whether_a_judge_learns_by_a_discount_or_not(
-    judge: str, tiny_data: Callable[[Embodiment], Path]
+@pytest.mark.parametrize("judge", ["learned", "golden_goal", "embedding", "vlm"])
+def test_true_decisions_are_learned_from_whatever_measures_progress(
+    judge: str, tiny_data: Callable[[Embodiment], Path], tmp_path: Path
 ) -> None:
     data = tiny_data(ARM_DELTAS)
     words = ("experiment=smoke", f"judge={judge}", "algorithm=ppo", *SQUARE, f"task.data=[{data}]")
     cfg = load_config([*words, "launch.device=cpu"])
     view = stages.rl.view("rl-1", cfg, {"number": 1})
     store = open_clips(view, [data])
-    for row in store.episodes:
-        row["source"] = "policy-1"
+    for number, row in enumerate(store.episodes):
+        row["source"] = f"policy-{1 + number // 2 % 2}"
     torch.manual_seed(0)
     policy = build_policy(view)
     algorithm = build_algorithm(view, policy)
-    figures, decisions = stages._warm_up(view, policy, algorithm, store, 0, 1)
+    manifest = {"stage": "keep", "result": {"round": 1}}
+    write_manifest(tmp_path, manifest)  # the policy of round 2 got worse
+    inputs = Inputs({"known": tmp_path}, {"number": 2})
+    figures, decisions = stages._warm_up(view, inputs, policy, algorithm, store, 0)
     assert decisions is not None and figures["recorded_decisions"] == len(decisions) > 10
     assert "critic_knew" in figures and float(decisions.known["advantage"].std()) > 0.05
+    played = torch.searchsorted(store.start, decisions.known["row"], right=True) - 1
+    assert {store.episodes[number]["source"] for number in played.tolist()} == {"policy-1"}
