@@ -36,7 +36,7 @@ from envs.manifest import check_part
 from envs.specs import WorldSpec
 
 log = logging.getLogger(__name__)
-_FORM = "7"  # changes when what a cache holds does
+_FORM = "8"  # changes when what a cache holds does
 
 
 @dataclass

@@ -25,7 +25,7 @@ def column_array(table: pa.Table, name: str) -> NDArray[Any]:
     """A column of numbers or of lists of numbers, however nested, as [rows, n].
 
     Raises:
-        EpisodeError: if something is missing in it.
+        EpisodeError: if something is missing in it, or it holds no numbers.
     """
     values = table[name].combine_chunks()
     if isinstance(values, pa.ChunkedArray):
@@ -39,6 +39,8 @@ def column_array(table: pa.Table, name: str) -> NDArray[Any]:
     if values.null_count:
         raise EpisodeError(f"column {name} misses values; what is unknown is left out as a whole")
     flat = values.to_numpy(zero_copy_only=False)
+    if flat.dtype == object:
+        raise EpisodeError(f"column {name} holds {values.type} where numbers should be")
     return flat.reshape(len(table), -1)
 
 

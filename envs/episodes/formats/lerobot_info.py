@@ -109,6 +109,11 @@ def _robot(
     return Robot(model, tuple(map(tuple, joints)), tuple(flanges), held or {})
 
 
+def described_here(features: Mapping[str, Any]) -> bool:
+    """Whether a data set carries our description, and so may have columns of ours."""
+    return INFO_KEY in (features["action"].get("info") or {})
+
+
 def camera_features(features: Mapping[str, Any]) -> dict[str, str]:
     """The feature of each camera by the camera's name, in order: every feature of images or video but depth.
 

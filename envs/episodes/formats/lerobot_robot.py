@@ -9,7 +9,7 @@ import numpy as np
 
 from envs.embodiment import Embodiment, EmbodimentError
 from envs.episodes.formats import lerobot_columns as names
-from envs.episodes.formats.lerobot_info import INFO_KEY, from_info
+from envs.episodes.formats.lerobot_info import described_here, from_info
 
 
 def agreed_robot(info: dict[str, Any], given: Embodiment | None = None) -> Embodiment:
@@ -25,7 +25,7 @@ def agreed_robot(info: dict[str, Any], given: Embodiment | None = None) -> Embod
     if given is None:
         return recorded
     known = recorded
-    if INFO_KEY not in (info["features"]["action"].get("info") or {}):
+    if not described_here(info["features"]):
         known = replace(recorded, action_kind=given.action_kind, delta=given.delta)
         for field in ("action_names", "state_names"):
             unnamed = tuple(str(k) for k in range(len(getattr(recorded, field))))
