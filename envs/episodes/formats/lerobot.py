@@ -7,6 +7,7 @@ info.json and the file indices and timestamps of meta/episodes, so episodes may 
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -31,12 +32,15 @@ from envs.episodes.formats.lerobot_files import (
     read_tasks,
     stored_picture,
 )
-from envs.episodes.formats.lerobot_info import camera_features
+from envs.episodes.formats.lerobot_info import camera_features, depth_features
 from envs.episodes.formats.lerobot_numbers import is_read, numbers_of, seed_of, shape_of, source_of
 from envs.episodes.formats.lerobot_robot import agreed_robot
 from envs.episodes.pictures import resize_picture
 from envs.episodes.video import read_clip
 from envs.machine import available_cores
+
+log = logging.getLogger(__name__)
+_DRIFT = 0.02  # of an episode's length, by which its video may be longer or shorter
 
 
 class LeRobotDataset:
@@ -82,10 +86,47 @@ class LeRobotDataset:
         self.recorded = recorded
         self.size: tuple[int, int] = size or next(iter(sizes.values()))
         self.embodiment = recorded.at(self.size)
+        self._cameras = camera_features(self.features)
         self.rows = read_episode_rows(self.root)
+        self._check_rate()
+        self._warn()
         self._tasks = {index: task for task, index in read_tasks(self.root).items()}
         self._cached: tuple[Path, pa.Table] | None = None
         self._reading = Lock()  # of what is cached
+
+    def _check_rate(self) -> None:
+        """See that videos are as long as their episodes at the rate that info.json says: at another one all
+        pictures but the first would be those of other moments.
+        """
+        videos = [key for key in self._cameras.values() if self.features[key]["dtype"] == "video"]
+        for row in self.rows:
+            for key in videos:
+                begin, end = row.get(f"videos/{key}/from_timestamp"), row.get(f"videos/{key}/to_timestamp")
+                if begin is None or end is None or not end > begin:  # said of the episode when it is read
+                    continue
+                length, seconds = int(row["length"]), float(end) - float(begin)
+                if abs(seconds * self.fps - length) > max(1.5, _DRIFT * length):
+                    raise EpisodeError(
+                        f"{self.root / 'meta/info.json'}: fps is {self.fps:g}, but meta/episodes gives the"
+                        f" {length} frames of episode {row['episode_index']} {seconds:.4g} s of {key}, which"
+                        f" is {length / seconds:.4g} a second; correct fps, or to_timestamp in meta/episodes"
+                    )
+
+    def _warn(self) -> None:
+        """Say what is there and not used."""
+        if depth := depth_features(self.features):
+            log.warning(
+                "%s: %s are left out as depth, having one channel or more than 8 bits; pictures to learn from"
+                " have three channels of 8 bits",
+                *(self.root, depth),
+            )
+        several = sum(len(row.get("tasks") or ()) > 1 for row in self.rows)
+        if several:
+            log.warning(
+                "%s: %d of %d episodes have several instructions, of which only the one of their first frame"
+                " is used; divide them into episodes of one each",
+                *(self.root, several, len(self.rows)),
+            )
 
     @property
     def fps(self) -> float:
@@ -117,12 +158,11 @@ class LeRobotDataset:
         """
         row = self.rows[number]
         table, path = self._table(row)
-        cameras = camera_features(self.features)
         try:
             known = numbers_of(table, self.embodiment, self.recorded, self.features)
             present = known["present"]
             frames = np.stack(
-                [self._pictures(key, row, path, len(table)) for key in cameras.values()], axis=1
+                [self._pictures(key, row, path, len(table)) for key in self._cameras.values()], axis=1
             )
             if present is not None:
                 frames[~present] = 0
@@ -193,7 +233,7 @@ class LeRobotDataset:
 
     def _read(self, path: Path) -> pa.Table:
         """All columns of a data file but pictures and what is not asked for."""
-        pictures = set(camera_features(self.features).values())
+        pictures = set(self._cameras.values())
         file = open_parquet(path)
         columns = [
             name

@@ -60,7 +60,7 @@ def stored_picture(root: Path, name: str, cell: Mapping[str, Any] | None) -> NDA
     """A picture uint8 [H, W, 3] of a column's cell {bytes, path}.
 
     Raises:
-        EpisodeError: if it cannot be decoded.
+        EpisodeError: if it cannot be decoded, or is one of depths.
     """
     cell = cell or {}
     stored = cell.get("bytes")
@@ -68,9 +68,16 @@ def stored_picture(root: Path, name: str, cell: Mapping[str, Any] | None) -> NDA
         beside = root / cell["path"]
         stored = beside.read_bytes() if beside.exists() else None
     flat = np.frombuffer(stored or b"", np.uint8)
-    picture = cv2.imdecode(flat, cv2.IMREAD_COLOR_RGB) if len(flat) else None
+    picture = cv2.imdecode(flat, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH) if len(flat) else None
     if picture is None:
         raise EpisodeError(f"column {name} holds no readable picture ({cell.get('path')})")
+    if picture.dtype != np.uint8:
+        if np.ndim(cv2.imdecode(flat, cv2.IMREAD_UNCHANGED)) == 2:
+            raise EpisodeError(
+                f"column {name} holds {picture.dtype} of one channel, which are depths; they are left out"
+                f' where features.{name} of meta/info.json says "info": {{"is_depth_map": true}}'
+            )
+        picture = cv2.imdecode(flat, cv2.IMREAD_COLOR_RGB)
     return np.asarray(picture, np.uint8)
 
 
@@ -94,6 +101,10 @@ def read_info(root: Path) -> dict[str, Any]:
         raise EpisodeError(
             f"{path}: {error}; {root} is not a LeRobot data set, or its collection never finished a shard"
         ) from error
+    if not isinstance(info, dict):
+        raise EpisodeError(
+            f"{path}: holds {type(info).__name__} instead of a dictionary; the file is damaged"
+        )
     if info.get("codebase_version") != VERSION:
         raise EpisodeError(
             f"{path}: codebase_version {info.get('codebase_version')} is not {VERSION}; convert the data set"

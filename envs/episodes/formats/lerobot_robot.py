@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import prod
 from typing import Any
-
-import numpy as np
 
 from envs.embodiment import Embodiment, EmbodimentError
 from envs.episodes.formats import lerobot_columns as names
-from envs.episodes.formats.lerobot_info import described_here, from_info
+from envs.episodes.formats.lerobot_info import described_here, from_info, shape_in
 
 
 def agreed_robot(info: dict[str, Any], given: Embodiment | None = None) -> Embodiment:
@@ -68,7 +67,7 @@ def _known_cameras(robot: Embodiment, features: dict[str, Any]) -> Embodiment:
     if names.C2W not in features or names.INTRINSIC not in features:
         cameras = tuple(replace(camera, calibrated=False) for camera in robot.cameras)
         return replace(robot, cameras=cameras)
-    count = int(np.prod(features[names.C2W]["shape"])) // 16
+    count = prod(shape_in(features, names.C2W)) // 16
     if count == len(robot.calibrated_views):
         return robot
     if count == len(robot.cameras):

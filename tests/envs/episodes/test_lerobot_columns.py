@@ -7,7 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from envs.embodiment import ActionKind, Arm
@@ -127,3 +130,55 @@ def test_the_source_of_a_set_is_the_name_of_its_folder_by_any_path(tmp_path: Pat
     write_set(tmp_path / "set", SETS["labelled"])
     (tmp_path / "link").symlink_to(tmp_path / "set")
     assert {episode.source for episode in LeRobotDataset(tmp_path / "link")} == {"set"}
+
+
+# -- rates, depth and instructions
+def test_a_rate_that_is_not_the_videos_is_named_before_anything_is_read(tmp_path: Path) -> None:
+    write_set(tmp_path, SETS["labelled"])
+    change_info(tmp_path, lambda info: info.update(fps=30))
+    with pytest.raises(
+        EpisodeError, match=r"info\.json: fps is 30, but .* 9 frames of episode 0 0\.9 s .* is 10 a sec"
+    ):
+        LeRobotDataset(tmp_path)
+    change_info(tmp_path, lambda info: info.update(fps=10.2))  # a fifth of a frame
+    assert len(list(LeRobotDataset(tmp_path))) == len(LENGTHS)
+
+
+def depths(kind: type[np.generic]) -> list[dict[str, Any]]:
+    """Cells of a picture column of one channel."""
+    rows = [np.full((48, 64), 1500 if kind is np.uint16 else 90, kind) for _ in OF]
+    return [{"bytes": cv2.imencode(".png", row)[1].tobytes(), "path": "deep.png"} for row in rows]
+
+
+def test_depth_without_a_mark_is_left_out_and_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_set(tmp_path, SETS["images"])
+    set_column(tmp_path, "observation.images.deep", depths(np.uint16))
+    deep = {"dtype": "image", "shape": [48, 64, 1], "names": ["height", "width", "channels"]}
+    change_info(tmp_path, lambda info: info["features"].update({"observation.images.deep": deep}))
+    data = LeRobotDataset(tmp_path)
+    assert data.embodiment.views == ("front",) and data.episode(0).frames.shape[1] == 1
+    (said,) = caplog.messages
+    assert "['observation.images.deep'] are left out as depth" in said
+
+
+def test_depth_that_is_said_to_be_in_colour_is_refused(tmp_path: Path) -> None:
+    write_set(tmp_path, SETS["images"])
+    name = "observation.images.front"
+    set_column(tmp_path, name, depths(np.uint8))
+    assert (LeRobotDataset(tmp_path).episode(0).frames == 90).all()  # grey, which is a picture
+    set_column(tmp_path, name, depths(np.uint16))
+    with pytest.raises(EpisodeError, match=rf"{name} holds uint16 of one channel.*is_depth_map"):
+        LeRobotDataset(tmp_path).episode(0)
+
+
+def test_several_instructions_in_an_episode_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_set(tmp_path, SETS["labelled"])
+    path = tmp_path / "meta/episodes/chunk-000/file-000.parquet"
+    rows = pq.read_table(path).to_pylist()
+    rows[1]["tasks"] = ["task 1", "task 0"]
+    pq.write_table(pa.Table.from_pylist(rows), path)
+    assert LeRobotDataset(tmp_path).episode(1).instruction == "task 1"
+    (said,) = caplog.messages
+    assert "1 of 4 episodes have several instructions" in said
