@@ -12,8 +12,6 @@ import torch
 
 from envs.conditioning import PoseMapStyle
 from envs.embodiment import Embodiment, EmbodimentError, Robot
-from envs.episodes.episode import EpisodeError
-from envs.episodes.formats.lerobot_files import read_info
 from envs.episodes.formats.lerobot_info import arms_are_said
 from envs.episodes.formats.lerobot_robot import agreed_robot, alike_calibrated
 from envs.geometry.kinematics import Kinematics, KinematicsError
@@ -185,11 +183,9 @@ def _recorded_robot(folder: Path) -> tuple[Embodiment, bool]:
     if not path.is_file():
         raise ConfigError(f"task.data: {path} does not exist; name folders of LeRobot v3.0 data sets")
     try:
-        info = read_info(folder)
+        info = json.loads(path.read_text())
         return agreed_robot(info), arms_are_said(info["features"])
-    except EpisodeError as error:
-        raise ConfigError(f"task.data: {error}") from error
-    except EmbodimentError as error:
+    except ValueError as error:
         raise ConfigError(f"task.data: {path}: {error}") from error
 
 

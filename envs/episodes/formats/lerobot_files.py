@@ -72,7 +72,8 @@ def stored_picture(root: Path, name: str, cell: Mapping[str, Any] | None) -> NDA
     if picture is None:
         raise EpisodeError(f"column {name} holds no readable picture ({cell.get('path')})")
     if picture.dtype != np.uint8:
-        if np.ndim(cv2.imdecode(flat, cv2.IMREAD_UNCHANGED)) == 2:
+        plain = cv2.imdecode(flat, cv2.IMREAD_UNCHANGED)
+        if plain is None or plain.ndim == 2:
             raise EpisodeError(
                 f"column {name} holds {picture.dtype} of one channel, which are depths; they are left out"
                 f' where features.{name} of meta/info.json says "info": {{"is_depth_map": true}}'

@@ -64,6 +64,8 @@ def from_info(info: Mapping[str, Any]) -> Embodiment:
     Raises:
         EmbodimentError: naming the key or feature that is missing or cannot be.
     """
+    if not isinstance(info, Mapping):
+        raise EmbodimentError("info.json holds no dictionary; the file is damaged")
     features, fps = info.get("features"), info.get("fps")
     if not isinstance(features, Mapping) or not all(isinstance(one, Mapping) for one in features.values()):
         raise EmbodimentError(f"features={features!r} should hold a dictionary for each feature by its name")
