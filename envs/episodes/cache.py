@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from envs.conditioning import PoseMapStyle, end_effector_poses, render_pose_map
-from envs.episodes.angles import check_radians, turned_steadily
+from envs.embodiment import ActionKind
+from envs.episodes.angles import check_poses, check_radians, turned_steadily
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.episodes.formats.lerobot_robot import cameras_without_columns
@@ -256,8 +257,9 @@ class _Builder:
             return torch.from_numpy(episode.poses)
         if not self.spec.embodiment.commands_poses:
             return None
-        if self.kinematics is not None:
-            check_radians(self.spec.embodiment, episode.commands, self.data.root)
+        joints = self.spec.embodiment.action_kind is ActionKind.JOINTS
+        check = check_radians if joints else check_poses
+        check(self.spec.embodiment, episode.commands, self.data.root)
         return end_effector_poses(self.spec.embodiment, torch.from_numpy(episode.commands), self.kinematics)
 
     def _cameras(self, episode: Episode) -> Tensor:

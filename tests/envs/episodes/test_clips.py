@@ -160,6 +160,27 @@ def test_joints_in_degrees_are_refused_where_kinematics_take_radians() -> None:
         check_radians(ARM_JOINTS, commands, Path("set"))
 
 
+@pytest.mark.parametrize(
+    ("number", "factor", "match"),
+    [
+        (1, 1000.0, "left_y is commanded to 900.*millimetres"),
+        (10, 57.3, "right_roll.*convert degrees"),
+    ],
+)
+def test_poses_in_millimetres_or_degrees_are_refused_where_cameras_are_calibrated(
+    number: int, factor: float, match: str, tmp_path: Path
+) -> None:
+    robot = BIMANUAL_POSES.at(SIZE)
+    made = moving_square(robot, 0)
+    made.commands[:, number] = np.linspace(0, 0.9, len(made.commands))
+    LeRobotWriter(tmp_path / "right", robot).write([made])
+    assert len(ClipStore([tmp_path / "right"], SPEC)) == 1
+    made.commands[:, number] *= factor
+    LeRobotWriter(tmp_path / "set", robot).write([made])
+    with pytest.raises(EpisodeError, match=f"set: .*{match}"):
+        ClipStore([tmp_path / "set"], SPEC)
+
+
 def test_angles_that_pass_pi_do_not_jump(tmp_path: Path) -> None:
     robot = BIMANUAL_POSES.at(SIZE)
     turning = moving_square(robot, 0)
