@@ -64,6 +64,41 @@ def from_info(info: Mapping[str, Any]) -> Embodiment:
     Raises:
         EmbodimentError: naming the key or feature that is missing or cannot be.
     """
+    features, cameras = _checked_features(info)
+    action, state = (feature_names(features[name]) for name in ("action", "observation.state"))
+    guessed, changes = guess_action(action)
+    own = _own_section(features)
+    if unknown := sorted(own.cameras.keys() - cameras.keys()):
+        raise EmbodimentError(f"{_OWN}.cameras names {unknown}, but the data show {sorted(cameras)}")
+    seen = {
+        name: _options(CameraDescription, one, f"{_OWN}.cameras.{name}") for name, one in own.cameras.items()
+    }
+    kind = guessed if own.action_kind is None else ActionKind(own.action_kind)
+    return Embodiment(
+        robot=str(info.get("robot_type") or "unknown"),
+        action_names=action,
+        action_kind=kind,
+        delta=changes if own.delta is None else own.delta,
+        arms=guess_arms(action, kind)
+        if own.arms is None
+        else tuple(_options(Arm, arm, f"{_OWN}.arms.{k}") for k, arm in enumerate(own.arms)),
+        state_names=state,
+        cameras=tuple(
+            Camera(name, _layout(features[key])[:2], **asdict(seen.get(name, CameraDescription())))
+            for name, key in cameras.items()
+        ),
+        fps=float(info["fps"]),
+        main_camera=own.main_camera or "",
+        kinematics=None if own.kinematics is None else _robot(own.kinematics),
+    )
+
+
+def _checked_features(info: Any) -> tuple[Mapping[str, Any], dict[str, str]]:
+    """The features of info.json and its cameras, where the robot can be made of them.
+
+    Raises:
+        EmbodimentError: see from_info.
+    """
     if not isinstance(info, Mapping):
         raise EmbodimentError("info.json holds no dictionary; the file is damaged")
     features, fps = info.get("features"), info.get("fps")
@@ -87,32 +122,7 @@ def from_info(info: Mapping[str, Any]) -> Embodiment:
         raise EmbodimentError(f"fps={fps!r} should be the number of frames per second, above 0")
     for name in ("action", "observation.state"):
         shape_in(features, name)
-    action, state = (feature_names(features[name]) for name in ("action", "observation.state"))
-    guessed, changes = guess_action(action)
-    own = _own_section(features)
-    if unknown := sorted(own.cameras.keys() - cameras.keys()):
-        raise EmbodimentError(f"{_OWN}.cameras names {unknown}, but the data show {sorted(cameras)}")
-    seen = {
-        name: _options(CameraDescription, one, f"{_OWN}.cameras.{name}") for name, one in own.cameras.items()
-    }
-    kind = guessed if own.action_kind is None else ActionKind(own.action_kind)
-    return Embodiment(
-        robot=str(info.get("robot_type") or "unknown"),
-        action_names=action,
-        action_kind=kind,
-        delta=changes if own.delta is None else own.delta,
-        arms=guess_arms(action, kind)
-        if own.arms is None
-        else tuple(_options(Arm, arm, f"{_OWN}.arms.{k}") for k, arm in enumerate(own.arms)),
-        state_names=state,
-        cameras=tuple(
-            Camera(name, _layout(features[key])[:2], **asdict(seen.get(name, CameraDescription())))
-            for name, key in cameras.items()
-        ),
-        fps=float(fps),
-        main_camera=own.main_camera or "",
-        kinematics=None if own.kinematics is None else _robot(own.kinematics),
-    )
+    return features, cameras
 
 
 def arms_are_said(features: Mapping[str, Any]) -> bool:
