@@ -12,6 +12,7 @@ import torch
 
 from envs.conditioning import PoseMapStyle
 from envs.embodiment import Embodiment, EmbodimentError, Robot
+from envs.episodes.formats.lerobot_info import arms_are_said
 from envs.episodes.formats.lerobot_robot import agreed_robot, alike_calibrated
 from envs.geometry.kinematics import Kinematics, KinematicsError
 from envs.physics.suite import SuiteError, build_suite, check_task, task_names
@@ -36,12 +37,19 @@ def embodiment_of(cfg: Mapping[str, Any]) -> Embodiment:
             "task.suite and task.data are both empty, so no robot is known; choose task=push or another"
             " suite, or name LeRobot data sets by task.data=[folder]"
         )
-    robots = [(str(folder), _recorded_robot(Path(folder))) for folder in task["data"]]
-    first, robot = robots[0]
-    for folder, other in robots[1:]:
+    robots = [(str(folder), *_recorded_robot(Path(folder))) for folder in task["data"]]
+    first, robot, _ = robots[0]
+    for folder, other, _ in robots[1:]:
         if difference := robot.differs(other):
             raise ConfigError(f"task.data: {first} and {folder} are of different robots: {difference}")
         robot = alike_calibrated(robot, other)
+    said = [(folder, other.arms) for folder, other, says in robots if says]
+    for folder, arms in said:
+        if arms != said[0][1]:
+            raise ConfigError(
+                f"task.data: {said[0][0]} and {folder} are of different robots: arms are {said[0][1]}, but"
+                f" {arms}; correct features.action.info.worldloop.arms in one of their meta/info.json"
+            )
     return robot
 
 
@@ -169,13 +177,15 @@ def check_state_expert(cfg: Mapping[str, Any]) -> None:
         raise ConfigError(f"simulator.state_expert: {error}") from error
 
 
-def _recorded_robot(folder: Path) -> Embodiment:
+def _recorded_robot(folder: Path) -> tuple[Embodiment, bool]:
+    """The robot of a data set, and whether the set says itself which numbers are an arm's."""
     path = folder / "meta" / "info.json"
     if not path.is_file():
         raise ConfigError(f"task.data: {path} does not exist; name folders of LeRobot v3.0 data sets")
     try:
-        return agreed_robot(json.loads(path.read_text()))
-    except (EmbodimentError, KeyError, ValueError) as error:
+        info = json.loads(path.read_text())
+        return agreed_robot(info), arms_are_said(info["features"])
+    except ValueError as error:
         raise ConfigError(f"task.data: {path}: {error}") from error
 
 

@@ -139,7 +139,7 @@ class Embodiment:
         kinematics: of the robot, if known; makes end-effector poses of joint commands.
 
     Raises:
-        EmbodimentError: if positions lie outside the action, or names are unknown or doubled.
+        EmbodimentError: if positions lie outside the action, or positions or names are unknown or doubled.
     """
 
     robot: str
@@ -166,12 +166,24 @@ class Embodiment:
                     f"{self.robot}: camera {camera.name} is on the wrist of {camera.wrist!r};"
                     f" arms are {known}"
                 )
+        if len(known) < len(self.arms):
+            raise EmbodimentError(
+                f"{self.robot}: arms {[arm.name for arm in self.arms]} need different names"
+            )
+        taken: dict[int, str] = {}
         for arm in self.arms:
             used = [*arm.numbers, *([] if arm.gripper is None else [arm.gripper])]
             if any(not 0 <= number < self.action_dim for number in used):
                 raise EmbodimentError(
                     f"{self.robot}: arm {arm.name} uses numbers {used} of an action of {self.action_dim}"
                 )
+            for number in used:
+                if number in taken:
+                    raise EmbodimentError(
+                        f"{self.robot}: number {number} of the action is of arm {taken[number]} and again of"
+                        f" arm {arm.name} (numbers {list(arm.numbers)}, gripper {arm.gripper}); each is one's"
+                    )
+                taken[number] = arm.name
             if arm.gripper_range[0] == arm.gripper_range[1]:
                 raise EmbodimentError(
                     f"{self.robot}: arm {arm.name} has gripper_range={arm.gripper_range}, which is empty"

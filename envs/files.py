@@ -97,6 +97,23 @@ def put(part: Path, path: Path, stands: Callable[[], bool]) -> None:
     part.rename(path)
 
 
+def files_below(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
+    """The files of a folder and of those in it, in the order of their paths; links are followed, but not back
+    into the folders that they stand in. None where there is no folder.
+
+    Args:
+        above: real paths of the folders that this one is in.
+    """
+    real = folder.resolve()
+    if real in above or not real.is_dir():
+        return
+    for path in sorted(folder.iterdir()):
+        if path.is_dir():
+            yield from files_below(path, (*above, real))
+        elif path.is_file():
+            yield path
+
+
 def remove(path: Path) -> None:
     """Remove a file or a folder, if it is there."""
     if path.is_dir() and not path.is_symlink():

@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 
 from envs.embodiment import PYTHON
 from envs.episodes.formats.lerobot_info import INFO_KEY
+from envs.files import files_below
 from envs.manifest import digest_of, hashes, mark_of
 from envs.targets import ConfigError, target
 from pipeline.graph.code_version import code_of, digest
@@ -131,7 +132,7 @@ def _described(info: Path) -> str:
 def _recorded(folder: Path) -> Iterator[Path]:
     """The files of a data set."""
     for part in _DATA:
-        yield from (path for path in sorted((folder / part).rglob("*")) if path.is_file())
+        yield from files_below(folder / part)
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""Angles of recorded commands as networks and kinematics take them."""
+"""Angles and units of recorded commands as networks, kinematics and pose maps take them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from envs.conditioning.turns import Turns
 from envs.embodiment import Embodiment
 from envs.episodes.episode import EpisodeError
 
-_TURNS = 4 * math.pi  # of a joint commanded in radians, at most
+_TURNS = 4 * math.pi  # of a joint or an angle commanded in radians, at most
+_REACH = 10.0  # metres from the origin, at most
 
 
 def turned_steadily(robot: Embodiment, commands: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -47,3 +48,23 @@ def check_radians(robot: Embodiment, commands: NDArray[np.float32], where: Path)
             f"{where}: a joint is commanded to {most:.4g}, which is no angle in radians, as kinematics take"
             " it; convert degrees before, or leave kinematics out"
         )
+
+
+def check_poses(robot: Embodiment, commands: NDArray[np.float32], where: Path) -> None:
+    """See that commanded flange poses [T, A] may be metres and radians, as pose maps and wrist cameras take
+    them.
+
+    Raises:
+        EpisodeError: if one is too large for that; names the data set, `where`.
+    """
+    kinds = (("metres", "millimetres", 0, _REACH), ("radians", "degrees", 3, _TURNS))
+    for unit, other, first, limit in kinds:
+        numbers = [number for arm in robot.arms for number in arm.numbers[first : first + 3]]
+        most = np.abs(commands[:, numbers]).max(0)
+        if (most > limit).any():
+            far = int(most.argmax())
+            raise EpisodeError(
+                f"{where}: {robot.action_names[numbers[far]]} is commanded to {most[far]:.4g}, which is not"
+                f" in {unit}, as poses of calibrated cameras take it; convert {other} before, say"
+                ' "action_kind": "other" in features.action.info.worldloop, or leave calibration.* out'
+            )

@@ -25,18 +25,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from envs.conditioning import PoseMapStyle, end_effector_poses, render_pose_map
-from envs.episodes.angles import check_radians, turned_steadily
+from envs.embodiment import ActionKind
+from envs.episodes.angles import check_poses, check_radians, turned_steadily
 from envs.episodes.episode import Episode, EpisodeError
 from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.episodes.formats.lerobot_robot import cameras_without_columns
-from envs.files import new_neighbour, put
+from envs.files import files_below, new_neighbour, put
 from envs.geometry.cameras import follow_wrists
 from envs.geometry.kinematics import Kinematics
 from envs.manifest import check_part
 from envs.specs import WorldSpec
 
 log = logging.getLogger(__name__)
-_FORM = "7"  # changes when what a cache holds does
+_FORM = "8"  # changes when what a cache holds does
 
 
 @dataclass
@@ -114,13 +115,14 @@ def _places(folder: Path, chosen: Path | None) -> list[Path]:
 def _stamp(folder: Path) -> str:
     """Changes whenever a file of the data set does."""
     digest = hashlib.sha256((folder / "meta/info.json").read_bytes())
-    for kind in ("meta/episodes", "meta/tasks.parquet", "data", "videos"):
-        root = folder / kind
-        for path in sorted(root.rglob("*")) if root.is_dir() else [root]:
-            if path.is_file():
-                about = path.stat()
-                key = f"{path.relative_to(folder)} {about.st_size} {about.st_mtime_ns}"
-                digest.update(key.encode())
+    tasks = folder / "meta/tasks.parquet"
+    found = [*files_below(folder / "meta/episodes"), *([tasks] if tasks.is_file() else [])]
+    for kind in ("data", "videos", "images"):
+        found += files_below(folder / kind)
+    for path in found:
+        about = path.stat()
+        key = f"{path.relative_to(folder)} {about.st_size} {about.st_mtime_ns}"
+        digest.update(key.encode())
     return digest.hexdigest()
 
 
@@ -255,8 +257,9 @@ class _Builder:
             return torch.from_numpy(episode.poses)
         if not self.spec.embodiment.commands_poses:
             return None
-        if self.kinematics is not None:
-            check_radians(self.spec.embodiment, episode.commands, self.data.root)
+        joints = self.spec.embodiment.action_kind is ActionKind.JOINTS
+        check = check_radians if joints else check_poses
+        check(self.spec.embodiment, episode.commands, self.data.root)
         return end_effector_poses(self.spec.embodiment, torch.from_numpy(episode.commands), self.kinematics)
 
     def _cameras(self, episode: Episode) -> Tensor:

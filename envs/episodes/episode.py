@@ -31,7 +31,7 @@ class Episode:
     Args:
         frames: uint8 [T, V, 3, H, W] RGB.
         commands: float32 [T, A], row t the action that led to frame t; row 0 is the command in force at the
-            start, zeros for actions that are changes.
+            start, of changes zeros but for grippers.
         states: float32 [T, S], LeRobot's observation.state.
         instruction: the task in words; "" if nobody said it.
         embodiment: the robot and its cameras.

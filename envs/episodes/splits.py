@@ -2,8 +2,8 @@
 
 A data set says it in LeRobot's own field, info.json's `splits`: a name and a range of episodes, such as
 {"train": "0:40,56:60", "held_out": "40:48", "calibration": "48:56"}; more than one range where episodes were
-appended later. A set that knows only "train", as LeRobot writes it, is divided by episode number: of every
-eight one is held out and two calibrate.
+appended later. A set that knows only "train", as LeRobot writes it, is divided by episode number, as far as
+that names episodes: of every eight one is held out and two calibrate.
 """
 
 from __future__ import annotations
@@ -27,16 +27,19 @@ def range_of(splits: Mapping[str, str], name: str, count: int, folder: Path) -> 
     Raises:
         EpisodeError: if its splits lack the name, or say no range.
     """
-    if name in NAMES and not set(splits) - {TRAIN}:
+    divided = name in NAMES and not set(splits) - {TRAIN}
+    if divided and not splits:
         return [number for number in range(count) if _by_number(number) == name]
+    key = TRAIN if divided else name
     try:
-        ranges = [tuple(int(end) for end in part.split(":")) for part in splits[name].split(",")]
-        return sorted({number for begin, end in ranges for number in range(begin, min(end, count))})
-    except (KeyError, ValueError) as error:
+        ranges = [tuple(int(end) for end in part.split(":")) for part in splits[key].split(",")]
+        named = sorted({number for begin, end in ranges for number in range(begin, min(end, count))})
+    except (KeyError, ValueError, AttributeError) as error:
         raise EpisodeError(
-            f"{folder / 'meta/info.json'}: splits are {dict(splits)}; {name!r} must be among them, as"
+            f"{folder / 'meta/info.json'}: splits are {dict(splits)}; {key!r} must be among them, as"
             ' "first:end" or "first:end,first:end"'
         ) from error
+    return [number for number in named if not divided or _by_number(number) == name]
 
 
 def write_splits(root: Path, sizes: Mapping[str, int]) -> None:
@@ -63,7 +66,7 @@ def write_splits(root: Path, sizes: Mapping[str, int]) -> None:
 def read_splits(root: Path) -> dict[str, list[int]]:
     """The episodes of each of NAMES in a data set, by number."""
     info = read_info(root)
-    return {name: range_of(info["splits"], name, info["total_episodes"], root) for name in NAMES}
+    return {name: range_of(info.get("splits") or {}, name, info["total_episodes"], root) for name in NAMES}
 
 
 def keep_in_splits(root: Path, kept: Mapping[str, Iterable[int]]) -> None:

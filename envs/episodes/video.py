@@ -103,7 +103,8 @@ def read_clip(
     if out is None or not found.all():
         raise EpisodeError(
             f"{path}: holds {int(found.sum())} of the {length} frames from {start:.3f} s on at {fps:g} Hz;"
-            " the file is truncated; restore it or collect its episodes again"
+            " the file is truncated: restore it or collect its episodes again; or fps of meta/info.json is"
+            " not that of the video"
         )
     return out
 

@@ -66,6 +66,21 @@ def config(*folders: Path, **simulator: Any) -> dict[str, Any]:
     }
 
 
+def test_sets_that_contradict_each_other_about_arms_are_refused(tmp_path: Path) -> None:
+    folders = [recorded(ARM_JOINTS, tmp_path / name) for name in ("a", "b", "c")]
+    assert world_spec(config(*folders)).embodiment == ARM_JOINTS
+    for folder, arms in zip(folders, ({"gripper_range": [100, 0]}, None, {}), strict=True):
+        info = json.loads((folder / "meta/info.json").read_text())
+        own = info["features"]["action"]["info"][INFO_KEY]
+        own["arms"] = None if arms is None else [{**own["arms"][0], **arms}]
+        (folder / "meta/info.json").write_text(json.dumps(info))
+    a, b, c = folders
+    # b says nothing, so its names do: 100 open .. 0 closed
+    assert world_spec(config(c, b)).embodiment.arms[0].gripper_range == (0, 100)
+    with pytest.raises(ConfigError, match=r"task\.data: .*a and .*c are of different robots: arms are .*100"):
+        world_spec(config(b, a, c))
+
+
 @pytest.mark.parametrize(
     ("robot", "pose_map", "ray_map"),
     [(BIMANUAL_POSES, True, True), (BIMANUAL_JOINTS, False, True), (ARM_DELTAS, False, False)],

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from envs.files import atomic, new_neighbour, put, write_json, write_text
+from envs.files import atomic, files_below, new_neighbour, put, write_json, write_text
 
 
 def test_what_stood_there_stays_until_the_new_file_is_whole(tmp_path: Path) -> None:
@@ -48,3 +48,14 @@ def test_the_first_of_several_that_make_the_same_folder_wins(tmp_path: Path) -> 
         put(part, path, lambda: (path / "stamp").read_text() == "new")
     assert (path / "stamp").read_text() == "new"  # the old one had to go, the second new one was too late
     assert [part.exists() for part in parts] == [False, False, True]
+
+
+def test_files_below_are_found_behind_links_without_going_round(tmp_path: Path) -> None:
+    folder, bulk = tmp_path / "folder", tmp_path / "bulk"
+    for path in (folder / "a.txt", folder / "deep/b.txt", bulk / "c.txt"):
+        write_text(path, "")
+    (folder / "link").symlink_to(bulk)
+    (bulk / "back").symlink_to(folder)
+    (folder / "nowhere").symlink_to(tmp_path / "gone")
+    found = [path.relative_to(folder).as_posix() for path in files_below(folder)]
+    assert found == ["a.txt", "deep/b.txt", "link/c.txt"] and not list(files_below(tmp_path / "gone"))

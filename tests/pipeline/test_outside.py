@@ -69,6 +69,20 @@ def test_recordings_are_known_by_what_they_hold(change: Callable[[Path], None], 
     assert fingerprint([str(first)]) != fingerprint([str(second)])
 
 
+def test_recordings_behind_links_are_known_by_what_they_hold(tmp_path: Path) -> None:
+    root, bulk = tmp_path / "set", tmp_path / "bulk"
+    write_set(root, SETS["pusht"])
+    whole = fingerprint([str(root)])
+    (root / "data/chunk-000").rename(bulk)
+    (root / "data/chunk-000").symlink_to(bulk)
+    assert fingerprint([str(root)]) == whole
+    (path,) = bulk.glob("*.parquet")
+    table = pq.read_table(path)
+    at = table.column_names.index(SUCCESS)
+    pq.write_table(table.set_column(at, SUCCESS, pa.array([False] * len(table))), path)
+    assert fingerprint([str(root)]) != whole
+
+
 def test_of_large_tables_with_pictures_the_numbers_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

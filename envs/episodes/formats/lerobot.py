@@ -7,6 +7,7 @@ info.json and the file indices and timestamps of meta/episodes, so episodes may 
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -31,11 +32,15 @@ from envs.episodes.formats.lerobot_files import (
     read_tasks,
     stored_picture,
 )
-from envs.episodes.formats.lerobot_info import INFO_KEY, camera_features
+from envs.episodes.formats.lerobot_info import camera_features, depth_features
+from envs.episodes.formats.lerobot_numbers import is_read, numbers_of, seed_of, shape_of, source_of
 from envs.episodes.formats.lerobot_robot import agreed_robot
-from envs.episodes.pictures import resize_intrinsics, resize_picture
+from envs.episodes.pictures import resize_picture
 from envs.episodes.video import read_clip
 from envs.machine import available_cores
+
+log = logging.getLogger(__name__)
+_DRIFT = 0.02  # of an episode's length, by which its video may be longer or shorter
 
 
 class LeRobotDataset:
@@ -81,10 +86,47 @@ class LeRobotDataset:
         self.recorded = recorded
         self.size: tuple[int, int] = size or next(iter(sizes.values()))
         self.embodiment = recorded.at(self.size)
+        self._cameras = camera_features(self.features)
         self.rows = read_episode_rows(self.root)
+        self._check_rate()
+        self._warn()
         self._tasks = {index: task for task, index in read_tasks(self.root).items()}
         self._cached: tuple[Path, pa.Table] | None = None
         self._reading = Lock()  # of what is cached
+
+    def _check_rate(self) -> None:
+        """See that videos are as long as their episodes at the rate that info.json says: at another one all
+        pictures but the first would be those of other moments.
+        """
+        videos = [key for key in self._cameras.values() if self.features[key]["dtype"] == "video"]
+        for row in self.rows:
+            for key in videos:
+                begin, end = row.get(f"videos/{key}/from_timestamp"), row.get(f"videos/{key}/to_timestamp")
+                if begin is None or end is None or not end > begin:  # said of the episode when it is read
+                    continue
+                length, seconds = int(row["length"]), float(end) - float(begin)
+                if abs(seconds * self.fps - length) > max(1.5, _DRIFT * length):
+                    raise EpisodeError(
+                        f"{self.root / 'meta/info.json'}: fps is {self.fps:g}, but meta/episodes gives the"
+                        f" {length} frames of episode {row['episode_index']} {seconds:.4g} s of {key}, which"
+                        f" is {length / seconds:.4g} a second; correct fps, or to_timestamp in meta/episodes"
+                    )
+
+    def _warn(self) -> None:
+        """Say what is there and not used."""
+        if depth := depth_features(self.features):
+            log.warning(
+                "%s: %s are left out as depth, having one channel or more than 8 bits; pictures to learn from"
+                " have three channels of 8 bits",
+                *(self.root, depth),
+            )
+        several = sum(len(row.get("tasks") or ()) > 1 for row in self.rows)
+        if several:
+            log.warning(
+                "%s: %d of %d episodes have several instructions, of which only the one of their first frame"
+                " is used; divide them into episodes of one each",
+                *(self.root, several, len(self.rows)),
+            )
 
     @property
     def fps(self) -> float:
@@ -116,12 +158,11 @@ class LeRobotDataset:
         """
         row = self.rows[number]
         table, path = self._table(row)
-        cameras = camera_features(self.features)
         try:
-            known = self._known(table)
+            known = numbers_of(table, self.embodiment, self.recorded, self.features)
             present = known["present"]
             frames = np.stack(
-                [self._pictures(key, row, path, len(table)) for key in cameras.values()], axis=1
+                [self._pictures(key, row, path, len(table)) for key in self._cameras.values()], axis=1
             )
             if present is not None:
                 frames[~present] = 0
@@ -129,10 +170,8 @@ class LeRobotDataset:
                 frames=frames,
                 instruction=self._instruction(row, table),
                 embodiment=self.embodiment,
-                seed=int(table[names.SEED][0].as_py()) if names.SEED in table.column_names else number,
-                source=str(table[names.SOURCE][0].as_py())
-                if names.SOURCE in table.column_names
-                else self.root.name,
+                seed=seed_of(table, number),
+                source=source_of(table, self.root.resolve().name),
                 **known,
             )
         except (EpisodeError, ValueError, pa.ArrowInvalid) as error:
@@ -158,7 +197,7 @@ class LeRobotDataset:
                     f"{self.root}: there is no column {name}; record it, or ask for one of"
                     f" {table.column_names}"
                 )
-            parts.append(column_array(table, name).reshape(len(table), *self._shape(name)))
+            parts.append(column_array(table, name).reshape(len(table), *shape_of(name, self.features)))
         return np.concatenate(parts)
 
     # -- numbers
@@ -194,15 +233,12 @@ class LeRobotDataset:
 
     def _read(self, path: Path) -> pa.Table:
         """All columns of a data file but pictures and what is not asked for."""
-        pictures = set(camera_features(self.features).values())
-        wanted = {"action", "observation.state", "episode_index", "task_index", names.COMMAND, names.C2W}
-        wanted |= {names.INTRINSIC, names.POSES, names.PRESENT, names.SOURCE, names.SEED}
-        wanted |= {names.SUCCESS, names.REWARD}
+        pictures = set(self._cameras.values())
         file = open_parquet(path)
         columns = [
             name
             for name in file.schema_arrow.names
-            if name not in pictures and (name in wanted or (self.privileged and name.startswith(PRIVILEGED)))
+            if name not in pictures and is_read(name, self.features, self.privileged)
         ]
         missing = {"action", "observation.state", "episode_index"} - set(columns)
         if missing:
@@ -211,62 +247,6 @@ class LeRobotDataset:
             return file.read(columns=columns)
         except (OSError, pa.ArrowInvalid) as error:
             raise EpisodeError(f"{path}: {error}; restore the file") from error
-
-    def _known(self, table: pa.Table) -> dict[str, Any]:
-        """All fields of the episode that are numbers."""
-        robot, length = self.embodiment, len(table)
-
-        def read(name: str) -> NDArray[Any] | None:
-            return column_array(table, name) if name in table.column_names else None
-
-        action, states = read("action"), read("observation.state")
-        assert action is not None and states is not None
-        command, success, reward = read(names.COMMAND), read(names.SUCCESS), read(names.REWARD)
-        c2w, intrinsic, poses = read(names.C2W), read(names.INTRINSIC), read(names.POSES)
-        present = read(names.PRESENT)
-        first = _first_command(robot, action, states) if command is None else command[0]
-        known: dict[str, Any] = {
-            "commands": np.concatenate([first[None], action[:-1]]).astype(np.float32),
-            "states": states.astype(np.float32),
-            "present": None if present is None else present[:, 0].astype(bool),
-            "success": None,
-            "reward": None,
-        }
-        if success is not None:
-            # Row t says what the action taken there led to; the last row's belongs to the last frame seen.
-            done = success[:, 0].astype(bool)
-            # What was done stays done, also where a suite says it of each step by itself.
-            known["success"] = np.logical_or.accumulate(np.concatenate([[False], done[:-1]]))
-            known["success"][-1] |= done[-1]
-        if reward is not None:
-            known["reward"] = np.concatenate([[0.0], reward[:-1, 0]]).astype(np.float32)
-            known["reward"][-1] += reward[-1, 0]
-        cameras = list(robot.calibrated_views)
-        if cameras and c2w is not None and intrinsic is not None:
-            views = len(robot.cameras)
-            known["c2w"] = np.full((length, views, 4, 4), np.nan, np.float32)
-            known["c2w"][:, cameras] = c2w.reshape(length, -1, 4, 4)
-            known["intrinsic"] = np.full((views, 3, 3), np.nan, np.float32)
-            known["intrinsic"][cameras] = intrinsic[0].reshape(-1, 3, 3)
-            for view in cameras:
-                known["intrinsic"][view] = resize_intrinsics(
-                    known["intrinsic"][view], self.recorded.cameras[view].size, self.size
-                )
-        if poses is not None and robot.arms:
-            known["poses"] = poses.reshape(length, -1, 7).astype(np.float32)
-        known["privileged"] = {
-            name[len(PRIVILEGED) :]: column_array(table, name)
-            .reshape(length, *self._shape(name))
-            .astype(np.float32)
-            for name in table.column_names
-            if name.startswith(PRIVILEGED)
-        }
-        return known
-
-    def _shape(self, name: str) -> list[int]:
-        about: dict[str, Any] = self.features.get(name, {}).get("info") or {}
-        shape: list[int] = about.get(INFO_KEY, {}).get("shape", [-1])
-        return shape
 
     def _instruction(self, row: dict[str, Any], table: pa.Table) -> str:
         tasks = row.get("tasks")
@@ -290,11 +270,3 @@ class LeRobotDataset:
             raise EpisodeError(f"{path}: {error}; restore the file") from error
         pictures = [stored_picture(self.root, key, cell) for cell in part[key].to_pylist()]
         return np.stack([resize_picture(picture, self.size).transpose(2, 0, 1) for picture in pictures])
-
-
-def _first_command(robot: Embodiment, action: NDArray[Any], states: NDArray[Any]) -> NDArray[Any]:
-    """The command in force at the start, where no column says it."""
-    if robot.delta:
-        return np.zeros_like(action[0])
-    same = robot.state_names == robot.action_names
-    return states[0].astype(action.dtype) if same else action[0]

@@ -1,9 +1,10 @@
 """Which columns of a LeRobot data set hold what of an Episode.
 
 LeRobot's own: action, observation.state, observation.images.*, next.success, next.reward, next.done,
-timestamp and the indices. Ours, each of which may be missing: command, calibration.c2w,
-calibration.intrinsic, end_effector.command, present, source, seed, privileged.*. None of ours begins with
-"observation" or "action", which LeRobot would show to policies.
+timestamp and the indices. Ours, each of which may be missing: calibration.c2w, calibration.intrinsic, source
+and seed, which any set may have; command, end_effector.command, present and privileged.*, which are read from
+sets with our description alone. None of ours begins with "observation" or "action", which LeRobot would show
+to policies.
 """
 
 from __future__ import annotations

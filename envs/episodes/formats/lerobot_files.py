@@ -25,7 +25,7 @@ def column_array(table: pa.Table, name: str) -> NDArray[Any]:
     """A column of numbers or of lists of numbers, however nested, as [rows, n].
 
     Raises:
-        EpisodeError: if something is missing in it.
+        EpisodeError: if something is missing in it, or it holds no numbers.
     """
     values = table[name].combine_chunks()
     if isinstance(values, pa.ChunkedArray):
@@ -39,6 +39,8 @@ def column_array(table: pa.Table, name: str) -> NDArray[Any]:
     if values.null_count:
         raise EpisodeError(f"column {name} misses values; what is unknown is left out as a whole")
     flat = values.to_numpy(zero_copy_only=False)
+    if flat.dtype == object:
+        raise EpisodeError(f"column {name} holds {values.type} where numbers should be")
     return flat.reshape(len(table), -1)
 
 
@@ -58,7 +60,7 @@ def stored_picture(root: Path, name: str, cell: Mapping[str, Any] | None) -> NDA
     """A picture uint8 [H, W, 3] of a column's cell {bytes, path}.
 
     Raises:
-        EpisodeError: if it cannot be decoded.
+        EpisodeError: if it cannot be decoded, or is one of depths.
     """
     cell = cell or {}
     stored = cell.get("bytes")
@@ -66,9 +68,17 @@ def stored_picture(root: Path, name: str, cell: Mapping[str, Any] | None) -> NDA
         beside = root / cell["path"]
         stored = beside.read_bytes() if beside.exists() else None
     flat = np.frombuffer(stored or b"", np.uint8)
-    picture = cv2.imdecode(flat, cv2.IMREAD_COLOR_RGB) if len(flat) else None
+    picture = cv2.imdecode(flat, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH) if len(flat) else None
     if picture is None:
         raise EpisodeError(f"column {name} holds no readable picture ({cell.get('path')})")
+    if picture.dtype != np.uint8:
+        plain = cv2.imdecode(flat, cv2.IMREAD_UNCHANGED)
+        if plain is None or plain.ndim == 2:
+            raise EpisodeError(
+                f"column {name} holds {picture.dtype} of one channel, which are depths; they are left out"
+                f' where features.{name} of meta/info.json says "info": {{"is_depth_map": true}}'
+            )
+        picture = cv2.imdecode(flat, cv2.IMREAD_COLOR_RGB)
     return np.asarray(picture, np.uint8)
 
 
@@ -92,6 +102,10 @@ def read_info(root: Path) -> dict[str, Any]:
         raise EpisodeError(
             f"{path}: {error}; {root} is not a LeRobot data set, or its collection never finished a shard"
         ) from error
+    if not isinstance(info, dict):
+        raise EpisodeError(
+            f"{path}: holds {type(info).__name__} instead of a dictionary; the file is damaged"
+        )
     if info.get("codebase_version") != VERSION:
         raise EpisodeError(
             f"{path}: codebase_version {info.get('codebase_version')} is not {VERSION}; convert the data set"

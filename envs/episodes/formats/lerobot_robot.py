@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import prod
 from typing import Any
-
-import numpy as np
 
 from envs.embodiment import Embodiment, EmbodimentError
 from envs.episodes.formats import lerobot_columns as names
-from envs.episodes.formats.lerobot_info import INFO_KEY, from_info
+from envs.episodes.formats.lerobot_info import described_here, from_info, shape_in
 
 
 def agreed_robot(info: dict[str, Any], given: Embodiment | None = None) -> Embodiment:
@@ -25,7 +24,7 @@ def agreed_robot(info: dict[str, Any], given: Embodiment | None = None) -> Embod
     if given is None:
         return recorded
     known = recorded
-    if INFO_KEY not in (info["features"]["action"].get("info") or {}):
+    if not described_here(info["features"]):
         known = replace(recorded, action_kind=given.action_kind, delta=given.delta)
         for field in ("action_names", "state_names"):
             unnamed = tuple(str(k) for k in range(len(getattr(recorded, field))))
@@ -68,7 +67,7 @@ def _known_cameras(robot: Embodiment, features: dict[str, Any]) -> Embodiment:
     if names.C2W not in features or names.INTRINSIC not in features:
         cameras = tuple(replace(camera, calibrated=False) for camera in robot.cameras)
         return replace(robot, cameras=cameras)
-    count = int(np.prod(features[names.C2W]["shape"])) // 16
+    count = prod(shape_in(features, names.C2W)) // 16
     if count == len(robot.calibrated_views):
         return robot
     if count == len(robot.cameras):

@@ -45,7 +45,7 @@ from envs.episodes.formats.lerobot_robot import agreed_robot
 from envs.episodes.formats.lerobot_stats import column_stats, merge_stats, picture_stats
 from envs.episodes.splits import TRAIN, extend_splits
 from envs.episodes.video import write_video
-from envs.files import write_atomically
+from envs.files import files_below, write_atomically
 
 _JOURNAL = "meta/worldloop.writing.json"
 _FILE = re.compile(r"chunk-(\d+)/file-(\d+)\.")
@@ -101,7 +101,8 @@ class LeRobotWriter:
     def shard_files(self) -> list[Path]:
         """The files of finished shards, which nothing writes again."""
         kinds = ("data", "videos", "meta/episodes")
-        return [path for kind in kinds for path in sorted((self.root / kind).rglob("file-*.*"))]
+        found = [path for kind in kinds for path in files_below(self.root / kind)]
+        return [path for path in found if path.match("file-*.*")]
 
     def write(self, episodes: Sequence[Episode], split: str = TRAIN) -> None:
         """Add one shard; afterwards the data set on disk is complete and consistent.

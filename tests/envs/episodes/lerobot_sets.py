@@ -8,7 +8,7 @@ chunks.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -145,6 +145,23 @@ def write_set(root: Path, about: FakeSet) -> list[FakeEpisode]:
     pq.write_table(tasks, root / "meta/tasks.parquet")
     (root / "meta/info.json").write_text(json.dumps(_info(about, len(rows), first), indent=4))
     return episodes
+
+
+def change_info(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change info.json in place."""
+    path = root / "meta/info.json"
+    info = json.loads(path.read_text())
+    change(info)
+    path.write_text(json.dumps(info))
+
+
+def set_column(root: Path, name: str, values: Sequence[Any]) -> None:
+    """Add a column to the rows of a set in one file, or exchange it."""
+    path = root / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    if name in table.column_names:
+        table = table.drop_columns([name])
+    pq.write_table(table.append_column(name, pa.array(values)), path)
 
 
 def _pictures(length: int, height: int, width: int, seed: int) -> NDArray[np.uint8]:

@@ -160,6 +160,27 @@ def test_joints_in_degrees_are_refused_where_kinematics_take_radians() -> None:
         check_radians(ARM_JOINTS, commands, Path("set"))
 
 
+@pytest.mark.parametrize(
+    ("number", "factor", "match"),
+    [
+        (1, 1000.0, "left_y is commanded to 900.*millimetres"),
+        (10, 57.3, "right_roll.*convert degrees"),
+    ],
+)
+def test_poses_in_millimetres_or_degrees_are_refused_where_cameras_are_calibrated(
+    number: int, factor: float, match: str, tmp_path: Path
+) -> None:
+    robot = BIMANUAL_POSES.at(SIZE)
+    made = moving_square(robot, 0)
+    made.commands[:, number] = np.linspace(0, 0.9, len(made.commands))
+    LeRobotWriter(tmp_path / "right", robot).write([made])
+    assert len(ClipStore([tmp_path / "right"], SPEC)) == 1
+    made.commands[:, number] *= factor
+    LeRobotWriter(tmp_path / "set", robot).write([made])
+    with pytest.raises(EpisodeError, match=f"set: .*{match}"):
+        ClipStore([tmp_path / "set"], SPEC)
+
+
 def test_angles_that_pass_pi_do_not_jump(tmp_path: Path) -> None:
     robot = BIMANUAL_POSES.at(SIZE)
     turning = moving_square(robot, 0)
@@ -228,6 +249,17 @@ def test_tasks_that_were_recorded_by_turns_are_in_every_split() -> None:
             assert {number % tasks for number in mine} == set(range(tasks)), (tasks, name)
 
 
+def test_episodes_that_train_does_not_name_are_in_no_split() -> None:
+    names = ("train", "held_out", "calibration")
+    for said, used in (("0:8", range(8)), ("2:5,8:12", [2, 3, 4, 8, 9, 10, 11]), ("0:99", range(16))):
+        parts = [range_of({"train": said}, name, 16, Path("set")) for name in names]
+        assert sorted(number for part in parts for number in part) == list(used)
+        whole = [range_of({}, name, 16, Path("set")) for name in names]
+        assert all({*part} <= {*every} for part, every in zip(parts, whole, strict=True))
+    with pytest.raises(EpisodeError, match="'train' must be among them, as"):
+        range_of({"train": "all"}, "held_out", 16, Path("set"))
+
+
 def test_splits_are_those_of_each_data_set(dataset: Path, tmp_path: Path) -> None:
     root = tmp_path / "set"
     shutil.copytree(dataset, root)
@@ -254,6 +286,28 @@ def test_a_cache_is_made_once_and_again_when_the_data_change(dataset: Path, tmp_
     assert len(ClipStore([root], SPEC, cache)) == 21
     assert held.frames(torch.tensor([0])).any()  # whoever had the old one open keeps it
     assert len(list(cache.glob("*/*"))) == 1 and not list(cache.glob("*/.*"))
+
+
+def test_a_cache_sees_rows_behind_links_and_pictures_beside_them(tmp_path: Path) -> None:
+    root, bulk, cache = tmp_path / "set", tmp_path / "bulk", tmp_path / "cache"
+    LeRobotWriter(root, ARM_DELTAS.at(SIZE)).write([moving_square(ARM_DELTAS, 0)])
+    spec = world_spec(ARM_DELTAS.at(SIZE), SIZE)
+    (root / "data/chunk-000").rename(bulk)
+    (root / "data/chunk-000").symlink_to(bulk)
+    (bulk / "round").symlink_to(root / "data")  # as endless as it looks
+    assert ClipStore([root], spec, cache).episodes[0]["success"]
+    (path,) = bulk.glob("*.parquet")
+    table = pq.read_table(path)
+    at = table.column_names.index("next.success")
+    never = pa.array([False] * len(table))
+    pq.write_table(table.set_column(at, "next.success", never), path)
+    assert ClipStore([root], spec, cache).episodes[0]["success"] is False
+    (made,) = cache.glob("*/*/info.json")
+    before = made.stat().st_ino
+    (root / "images").mkdir()
+    (root / "images/frame-000000.png").write_bytes(b"new")
+    ClipStore([root], spec, cache)
+    assert made.stat().st_ino != before
 
 
 def test_a_half_made_cache_is_not_used(dataset: Path, tmp_path: Path) -> None:

@@ -359,6 +359,19 @@ def test_appending_leaves_splits_as_they_are(tmp_path: Path) -> None:
     assert members("calibration") == [3] and members("mine") == [8]
 
 
+def test_appending_leaves_files_behind_links_as_they_are(tmp_path: Path) -> None:
+    root, robot, bulk = tmp_path / "set", ARM_DELTAS.at(SIZE), tmp_path / "bulk"
+    LeRobotWriter(root, robot).write([moving_square(ARM_DELTAS, 0)])
+    for number, folder in enumerate(sorted(root.rglob("chunk-000"))):
+        bulk.mkdir(exist_ok=True)
+        folder.rename(bulk / f"{number}")
+        folder.symlink_to(bulk / f"{number}")
+    before = {path: path.read_bytes() for path in bulk.rglob("*.*")}
+    LeRobotWriter(root, robot).write([moving_square(ARM_DELTAS, 1)])
+    assert all(path.read_bytes() == content for path, content in before.items())
+    assert [episode.seed for episode in LeRobotDataset(root)] == [0, 1]
+
+
 def test_an_interrupted_description_knows_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root, robot = tmp_path / "set", ARM_DELTAS.at(SIZE)
     writer = LeRobotWriter(root, robot)
