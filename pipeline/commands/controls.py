@@ -24,7 +24,7 @@ from envs.files import write_text
 from envs.targets import ConfigError
 from pipeline.evaluation.report import build_report
 from pipeline.evaluation.result import outcomes
-from pipeline.evaluation.statistics import mcnemar, rate, rate_entry, rate_line
+from pipeline.evaluation.statistics import mcnemar, points_line, rate_entry, rate_line, rise
 from pipeline.graph.graph import Graph
 from pipeline.loop import build_loop, has_physics, last_round
 from pipeline.stages import controls as only_here
@@ -61,8 +61,8 @@ def run_controls(cfg: Cfg, root: Path, tracker: Tracker | None = None) -> dict[s
     run's report hold those that are finished by then.
 
     Returns:
-        Rows by title: a rate entry, gain in points, paired (McNemar against the policy before),
-        physics_episodes, and note where there is one.
+        Rows by title: a rate entry, gain in points (None where no episode counts), paired (McNemar against
+        the policy before), physics_episodes, and note where there is one.
 
     Raises:
         ConfigError: if the run is not finished, or has no physics.
@@ -123,9 +123,10 @@ def control_table(loop: Graph, rows: list[Row]) -> dict[str, Any]:
     for row in rows:
         after = row.graph.folder(row.node)
         entry = rate_entry(outcomes(after)[1][0])
+        gain = rise(start, entry)
         table[row.title] = {
             **entry,
-            "gain": 100 * (rate(entry) - rate(start)),
+            "gain": None if gain is None else 100 * gain,
             "paired": mcnemar(*outcomes(before, after)[1]),
             "physics_episodes": sum(row.graph.result(name)["episodes"] for name in row.learned),
             **({"note": row.note} if row.note else {}),
@@ -141,7 +142,8 @@ def table_text(table: Mapping[str, Any]) -> str:
         gain = ""
         if paired:
             flips = f"gained {paired['gained']} lost {paired['lost']} p {paired['p']:.2g}"
-            gain = f", {row['gain']:+.1f} points, {flips}"
+            points = points_line(None if row["gain"] is None else row["gain"] / 100)
+            gain = f", {points} points, {flips}"
         note = f"  ({row['note']})" if row.get("note") else ""
         lines.append(f"{title:<30} {rate_line(row)}{gain}{note}")
     return "\n".join(lines)
