@@ -91,7 +91,7 @@ _ROWS: tuple[tuple[str, Callable[[Result], str]], ...] = (
     ),
     ("recorded episodes learned from", lambda r: str(r["episodes_used"])),
     (
-        "imagined episodes learned from, by round",
+        "imagined episodes played, by round",
         lambda r: ", ".join(str(n) for n in r["imagined_episodes_used"]),
     ),
     ("minutes in all", _minutes("")),

@@ -63,7 +63,7 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         "rounds": [entry["result"] for name, entry in finished.items() if name.startswith("gap-")],
         "episodes_used": sum(entry["episodes"] - entry.get("held_out", 0) for entry in gathered),
         "episodes_held_out": sum(entry.get("held_out", 0) for entry in gathered),
-        "imagined_episodes_used": [entry["result"]["ledger"]["learned"] for entry in learned],
+        "imagined_episodes_used": [entry["result"]["episodes"] for entry in learned],
         "stage_seconds": {name: entry["seconds"] for name, entry in finished.items()},
         "training": _training(finished),
         "judge_cost": _judge_cost(finished),
