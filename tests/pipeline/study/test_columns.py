@@ -192,9 +192,9 @@ def test_seconds_are_shared_out_among_the_parts_that_there_are(
 def test_a_state_expert_takes_the_steps_that_fit_with_its_features(tmp_path: Path) -> None:
     measured = {"state_sample_seconds": 0.001, "state_clip_seconds": 0.01, "state_clip_bytes": 10}
     folder = finished(tmp_path, "pace", {**measured, "simulator_speed": 40.0})
-    inputs, fit = Inputs({"pace": folder}, {"seconds": 100.0}), FitConfig(steps=1, batch=50, lr=1e-3)
-    assert pace.in_time(inputs, "simulator", fit).steps == 80
-    assert pace.in_time(inputs, "state", fit).steps == (100 - 60) / 0.05  # 6000 clips are looked at
+    inputs, fit = Inputs({"pace": folder}, {"seconds": 200.01}), FitConfig(steps=1, batch=50, lr=1e-3)
+    assert pace.in_time(inputs, "simulator", fit).steps == 160
+    assert pace.in_time(inputs, "state", fit).steps == (200 - 60) / 0.05  # 6000 clips are looked at
     assert pace.in_time(inputs, "tokenizer", fit) == fit
 
 
