@@ -4,7 +4,6 @@ episodes.
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -30,7 +29,7 @@ from envs.specs import (
 class ChunkedEnv(EnvBase):
     """Base of PhysicsEnv and WorldEnv: a batched environment with the same specs in truth and in imagination.
 
-    Every episode has a seed. Seeds come from the queue filled by `schedule`, and when it is empty from a
+    Every episode has a seed. Seeds come by turns from the queue filled by `schedule`, and before that from a
     stream of their own; what happens in an episode depends on its seed and on the actions only.
 
     Args:
@@ -126,12 +125,9 @@ class ChunkedEnv(EnvBase):
     def schedule(self, seeds: Iterable[int]) -> None:
         """Queue episode seeds; resets take them in order, lowest slot first. Replaces what was queued.
 
-        Once they are used up, further ones are drawn, and they too depend on nothing but `seeds`.
+        Once they are used up, they come again from the first; where none were given, others are drawn.
         """
         self._queue = deque(int(seed) for seed in seeds)
-        if self._queue:
-            digest = hashlib.sha256(repr(tuple(self._queue)).encode()).digest()
-            self._stream = episode_stream(int.from_bytes(digest[:6], "big"))
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
@@ -146,7 +142,8 @@ class ChunkedEnv(EnvBase):
     def _next_seeds(self, mask: torch.Tensor) -> torch.Tensor:
         for slot in mask.nonzero().flatten().tolist():
             if self._queue:
-                self._seeds[slot] = self._queue.popleft()
+                self._seeds[slot] = self._queue[0]
+                self._queue.rotate(-1)
             else:
                 self._seeds[slot] = int(torch.randint(2**40, (1,), generator=self._stream))
         return self._seeds

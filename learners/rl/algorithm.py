@@ -161,7 +161,8 @@ def clip_bounds(low: float, high: float, numbers: int | None, spec: WorldSpec) -
     Args:
         low, high: bounds for chunks of `numbers` numbers, low below one.
         numbers: see there; None: the bounds are for chunks as they are.
-        spec: of the world that is acted in; its chunks have K A numbers.
+        spec: of the world that is acted in; its chunks count as K A numbers, of all policies alike, also
+            where a policy's density has fewer (ChunkGaussian: its knots, of the numbers that vary).
     """
     if numbers is None:
         return low, high

@@ -118,8 +118,9 @@ class GRPO:
         mean = (groups * there).sum(1, keepdim=True) / count
         spread = (((groups - mean).square() * there).sum(1, keepdim=True) / count).sqrt()
         advantage = (groups - mean) / (spread + 1e-2) if self.config.normalise else groups - mean
-        total = reward.sum(1).unflatten(0, (-1, size))
-        alike = (total.amax(1) - total.amin(1)) < 1e-4
+        total, lived = reward.sum(1).unflatten(0, (-1, size)), mine.any(1).unflatten(0, (-1, size))
+        highest = total.masked_fill(~lived, -torch.inf).amax(1)
+        alike = highest - total.masked_fill(~lived, torch.inf).amin(1) < 1e-4  # so is a group of none
         keep = (
             mine & (~alike).repeat_interleave(size)[:, None] & (there.sum(1) > 1).repeat_interleave(size, 0)
         )

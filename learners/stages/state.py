@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import time
+from bisect import bisect_right
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +31,65 @@ _CLIPS, _AT_ONCE, _VISITS, _KEPT = 6000, 50, 16, 2 * 2**30
 _AT_HAND = 2**20
 
 
+def clips_kept(options: FitConfig, clip_bytes: int) -> int:
+    """How many clips' features training computes once and keeps; 0 where it computes them anew at every step.
+
+    Args:
+        clip_bytes: of a clip's features.
+    """
+    count = min(_CLIPS, options.steps * options.batch // _VISITS, _KEPT // max(1, clip_bytes))
+    return -(-count // _AT_ONCE) * _AT_ONCE if count >= options.part else 0
+
+
+@dataclass(frozen=True)
+class StatePace:
+    """What training a state expert costs.
+
+    Args:
+        sample_seconds: of a step, for each sample of its batch; features that are computed anew included.
+        clip_seconds: of a clip whose features are kept; 0 if none are.
+        clip_bytes: of a clip's features.
+    """
+
+    sample_seconds: float
+    clip_seconds: float
+    clip_bytes: int
+
+    @classmethod
+    def of(cls, options: FitConfig, stats: Mapping[str, float]) -> StatePace:
+        """As a training showed that train_state reports so."""
+        samples, clips = options.steps * options.batch, stats["features_clips"]
+        return cls(
+            (stats["data_seconds"] + stats["compute_seconds"]) / samples,
+            stats["features_seconds"] / clips if clips else 0.0,
+            int(stats["features_bytes"]),
+        )
+
+    def seconds(self, options: FitConfig) -> float:
+        """Of a training, features included."""
+        samples = options.steps * options.batch
+        looked_at = clips_kept(options, self.clip_bytes) or samples
+        return looked_at * self.clip_seconds + samples * self.sample_seconds
+
+    def steps(self, seconds: float, options: FitConfig) -> int:
+        """As many steps as take so many seconds, one at least."""
+
+        def cost(steps: int) -> float:
+            return self.seconds(replace(options, steps=steps))
+
+        most = int(seconds / (options.batch * self.sample_seconds))  # if features cost nothing
+        # Below _VISITS steps features may not be kept, and more steps may take less time.
+        for some in (range(_VISITS, most + 1), range(1, _VISITS)):
+            if fitting := bisect_right(some, seconds, key=cost):
+                return some[fitting - 1]
+        return 1
+
+
+def shortest_kept(options: FitConfig) -> FitConfig:
+    """`options` with steps enough that features are kept, if they fit."""
+    return replace(options, steps=max(options.steps, _VISITS))
+
+
 def train_state(
     decoder: StateDecoder,
     simulator: Simulator,
@@ -51,7 +113,8 @@ def train_state(
             unless they came with released weights.
 
     Returns:
-        What `fit` does, and features_seconds, what was spent before on features that are kept.
+        What `fit` does, and features_seconds, what was spent before on features that are kept;
+        features_clips, of how many clips (see clips_kept), and features_bytes, of each.
 
     Raises:
         ValueError: if lora is asked of a decoder without projections to adapt.
@@ -64,8 +127,8 @@ def train_state(
     drawn = step_generator(options.seed, options.steps)
     one = clips.sample(1, drawn)
     began = time.perf_counter()
-    count = min(_CLIPS, options.steps * options.batch // _VISITS, _KEPT // max(1, one["shown"].nbytes))
-    kept = _Kept(clips.many(count, drawn), options.part) if count >= options.part else None
+    count = clips_kept(options, one["shown"].nbytes)
+    kept = _Kept(clips.many(count, drawn), options.part) if count else None
     ahead = time.perf_counter() - began
 
     def sample(step: int, generator: torch.Generator) -> TensorDict:
@@ -80,7 +143,8 @@ def train_state(
         stats = fit("state", decoder, kept or sample, loss, options, folder)
     for name, parameter in simulator.named_parameters():
         parameter.requires_grad_(wanted[name])
-    return {**stats, "features_seconds": ahead}
+    features = {"seconds": ahead, "clips": float(count), "bytes": float(one["shown"].nbytes)}
+    return {**stats, **{f"features_{key}": value for key, value in features.items()}}
 
 
 class _Kept:
@@ -135,9 +199,9 @@ class _Features:
             return self.of(clip.to(device), generator).cpu()
 
     def many(self, count: int, generator: torch.Generator) -> TensorDict:
-        """`sample` of at least `count` clips, in batches."""
+        """`sample` of `count` clips, in whole batches."""
         batches = tqdm(
-            range(-(-count // _AT_ONCE)),
+            range(count // _AT_ONCE),
             desc="state: features",
             unit="batch",
             dynamic_ncols=True,

@@ -80,7 +80,7 @@ def experts(cfg: dict[str, Any]) -> None:
             entry = rate_entry(torch.tensor(outcomes.success))
             actions = f", {np.median(outcomes.actions):.0f} actions" if outcomes.actions else ""
             print(f"  {name:<24} {rate_line(entry)}, {outcomes.dropped} dropped{actions}", flush=True)
-            if level == 0.0 and rate(entry) < LEAST:
+            if level == 0.0 and (rate(entry) or 0.0) < LEAST:
                 wrong.append(_complaint(f"{title}: {name}", outcomes, cfg))
     if wrong:
         raise ExpertFails("; ".join(wrong))

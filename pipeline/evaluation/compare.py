@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from envs.targets import ConfigError
-from pipeline.evaluation.statistics import points_line, rate, rate_line
+from pipeline.evaluation.statistics import percent_line, points_line, rate_line, rise
 
 Result = Mapping[str, Any]
 
@@ -32,10 +32,6 @@ def compare(folders: list[Path]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _percent(entry: Result) -> str:
-    return f"{100 * rate(entry):.1f}%"
-
-
 def _rate(key: str) -> Callable[[Result], str]:
     return lambda r: rate_line(r[key]) if r[key] else "-"
 
@@ -43,7 +39,7 @@ def _rate(key: str) -> Callable[[Result], str]:
 def _gain(result: Result) -> str:
     if not result["physics_before"]:
         return "-"
-    return f"**{100 * (rate(result['physics_after']) - rate(result['physics_before'])):+.1f}** points"
+    return f"**{points_line(rise(result['physics_before'], result['physics_after']))}** points"
 
 
 def _paired(result: Result) -> str:
@@ -87,7 +83,7 @@ _ROWS: tuple[tuple[str, Callable[[Result], str]], ...] = (
     ("gained / lost, McNemar p", _paired),
     (
         "imagined before → after",
-        lambda r: f"{_percent(r['imagined_before'])} → {_percent(r['imagined_after'])}",
+        lambda r: f"{percent_line(r['imagined_before'])} → {percent_line(r['imagined_after'])}",
     ),
     (
         "gap imagined - true, by round",
@@ -95,7 +91,7 @@ _ROWS: tuple[tuple[str, Callable[[Result], str]], ...] = (
     ),
     ("recorded episodes learned from", lambda r: str(r["episodes_used"])),
     (
-        "imagined episodes learned from, by round",
+        "imagined episodes played, by round",
         lambda r: ", ".join(str(n) for n in r["imagined_episodes_used"]),
     ),
     ("minutes in all", _minutes("")),

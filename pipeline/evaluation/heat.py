@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.evaluation.statistics import rate
+from pipeline.evaluation.statistics import rate, rise
 
 Entry = Mapping[str, Any]
 _FEW = 10  # scenes whose cells are wide enough for numbers
@@ -91,9 +91,10 @@ def _where(cell: Entry) -> str:
 
 def _rate(cell: Entry, key: str) -> Cell | None:
     entry = cell.get(key)
-    if not entry or not entry["episodes"]:
+    known = rate(entry) if entry else None
+    if not entry or known is None:
         return None
-    share = 100 * rate(entry)
+    share = 100 * known
     interval = f"95% [{100 * entry['low']:.0f}, {100 * entry['high']:.0f}]"
     title = f"{_where(cell)}: {entry['successes']} of {entry['episodes']}, {interval}"
     return Cell(_mixed("--blue", 8 + 0.72 * share), f"{share:.0f}", title)
@@ -101,9 +102,10 @@ def _rate(cell: Entry, key: str) -> Cell | None:
 
 def _gap(cell: Entry) -> Cell | None:
     true, imagined = cell.get("physics_after"), cell.get("imagined_after")
-    if not true or not imagined or not true["episodes"] or not imagined["episodes"]:
+    apart = rise(true, imagined) if true and imagined else None
+    if not true or apart is None:
         return None
-    points = 100 * (rate(imagined) - rate(true))
+    points = 100 * apart
     kind = "--bad" if points > 0 else "--cold"
     title = f"{_where(cell)}: imagined {points:+.0f} points from {true['episodes']} true episodes"
     return Cell(_mixed(kind, min(80.0, abs(points))), f"{points:+.0f}", title)

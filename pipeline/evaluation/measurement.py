@@ -13,7 +13,7 @@ from envs.episodes.clips import ClipStore
 from envs.simulators.base import Simulator
 from envs.simulators.replay import SIDE_BY_SIDE, Replay, replay, side_by_side
 from pipeline.evaluation.objects.error import object_error
-from pipeline.evaluation.quantiles import quantiles
+from pipeline.evaluation.statistics import quantiles
 
 _LAST = 4  # frames at the end of an episode
 _CHUNKS = 10  # of an episode at most, by which speed is measured

@@ -15,7 +15,7 @@ from pipeline.evaluation.charts import Curve, line_chart, progress_chart
 from pipeline.evaluation.heat import heat_maps
 from pipeline.evaluation.media import inline, smooth
 from pipeline.evaluation.result import manifests
-from pipeline.evaluation.statistics import points_line, rate
+from pipeline.evaluation.statistics import percent_line, points_line, rate, rise
 from pipeline.graph.stage import Inputs
 from pipeline.track import read_metrics
 
@@ -78,7 +78,13 @@ def templates() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    page.globals |= {"rate": rate, "points": points_line, "progress_chart": progress_chart}
+    page.globals |= {
+        "rate": rate,
+        "rise": rise,
+        "percent": percent_line,
+        "points": points_line,
+        "progress_chart": progress_chart,
+    }
     return page
 
 

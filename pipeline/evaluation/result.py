@@ -1,4 +1,4 @@
-"""result.json: the figures of a finished run, and the one sentence that they come to."""
+"""result.json: the figures of a finished run."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torch
 
 from envs.manifest import read_manifest
 from envs.physics.suite import task_names
+from envs.targets import target
 from pipeline.evaluation.by_task import by_scene, by_task, scenes_of_seeds, tasks_of_seeds
-from pipeline.evaluation.statistics import mcnemar, rate, rate_entry
+from pipeline.evaluation.statistics import mcnemar, rate_entry
+from pipeline.evaluation.verdict import IMAGINED, verdict
 from pipeline.graph.stage import Inputs
 
-_BLIND = 0.3  # imagined minus true success from which on imagination says nothing of the truth
-_CHANCE = 0.05  # below it a difference is more than that
 _ENTRY = ("successes", "episodes", "low", "high")
 
 
@@ -63,11 +63,11 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         "rounds": [entry["result"] for name, entry in finished.items() if name.startswith("gap-")],
         "episodes_used": sum(entry["episodes"] - entry.get("held_out", 0) for entry in gathered),
         "episodes_held_out": sum(entry.get("held_out", 0) for entry in gathered),
-        "imagined_episodes_used": [entry["result"]["ledger"]["learned"] for entry in learned],
+        "imagined_episodes_used": [entry["result"]["episodes"] for entry in learned],
         "stage_seconds": {name: entry["seconds"] for name, entry in finished.items()},
         "training": _training(finished),
         "judge_cost": _judge_cost(finished),
-        "alarms": _alarms(finished),
+        "alarms": [*_alarms(finished), *unjudged(cfg, imagined["after"])],
     }
     result["verdict"] = verdict(result)
     return result
@@ -93,74 +93,6 @@ def outcomes(*folders: Path) -> tuple[list[int], list[torch.Tensor]]:
     kept = [torch.load(folder / "outcomes.pt", weights_only=True) for folder in folders]
     counted = torch.stack([one["counted"] for one in kept]).all(0)
     return kept[0]["seeds"][counted].tolist(), [one["success"][counted] for one in kept]
-
-
-def verdict(result: Mapping[str, Any]) -> str:
-    """One sentence: gain or none, and in the latter case what the figures say of why."""
-    imagined = 100 * (rate(result["imagined_after"]) - rate(result["imagined_before"]))
-    if result["physics_before"] is None:
-        return (
-            f"imagined success moved by {imagined:+.1f} points; without physics nobody knows what that is"
-            " worth: try the policy on the robot"
-        )
-    before, after, paired = result["physics_before"], result["physics_after"], result["paired"]
-    points = 100 * (rate(after) - rate(before))
-    head = (
-        f"true success {before['successes']}/{before['episodes']} -> {after['successes']}/{after['episodes']}"
-        f" ({points:+.1f} points, McNemar p = {paired['p']:.2g})"
-    )
-    if points > 0 and paired["p"] < 0.01:
-        return f"gain: {head}"
-    return f"no gain: {head}. {_why(result, points, imagined)}"
-
-
-def _why(result: Mapping[str, Any], points: float, imagined: float) -> str:
-    """What the figures say of why true success did not rise by enough."""
-    gap = result["rounds"][-1]["gap"] if result["rounds"] else None
-    if min(points, imagined) > 0 and imagined - points < 5:
-        return (
-            f"true success rose as imagined success did ({imagined:+.0f} points), but too little to tell from"
-            " chance; give RL more iterations (rounds.iterations) or evaluate on more episodes"
-        )
-    if imagined > 5:
-        now, true = (100 * rate(result[key]) for key in ("imagined_after", "physics_after"))
-        rose = (
-            f"imagined success rose by {imagined:.0f} points to {now:.0f}%, and true success did not follow"
-        )
-        if now > true:
-            return f"{rose}: the policy exploits the simulator; deploy more episodes per round"
-        return (
-            f"{rose}, which is higher: the imagined world is too bleak, and RL may have learned what it alone"
-            " asks for; see by the judge's table whether simulator or judge misses successes, and train it"
-            " longer"
-        )
-    if gap is not None and gap > _BLIND:
-        true, predicted = (100 * rate(result["rounds"][-1][key]) for key in ("true", "imagined"))
-        return (
-            f"the imagined world is no guide: in the last round it says {predicted:.0f}% of a policy that"
-            f" succeeds in {true:.0f}%, so RL has little to learn from; see by `worldloop trust` and"
-            " the judge's table whether simulator or judge mistakes failures for successes, and train it"
-            " longer"
-        )
-    tried = ("physics_before", "physics_after", "imagined_before", "imagined_after")
-    if not any(result[key]["successes"] for key in tried):
-        return (
-            "no policy succeeded even once, in truth or in imagination, so RL had nothing to go on; give"
-            " imitation more demonstrations (imitation.demos) or steps (imitation.fit.steps)"
-        )
-    alarms = [text for text in result["alarms"] if text.startswith("rl-")]
-    if imagined > -2 and alarms:
-        return f"RL did not improve even imagined success; {alarms[0]}"
-    if points < 0 and result["paired"]["p"] < _CHANCE:
-        return (
-            f"the policy got worse, and imagined success moved by {imagined:+.0f} points only: RL followed"
-            " noise or forgot; give it shorter steps (rl.lr), more episodes an iteration (rl.envs) or a"
-            " stronger hold on what worked (rl.anchor), and look whether cloning did it (rounds.clone=0)"
-        )
-    return (
-        f"RL moved imagined success by {imagined:+.0f} points only; give it more iterations"
-        " (rounds.iterations) or a higher rl.lr"
-    )
 
 
 def _physics(inputs: Inputs) -> dict[str, Any]:
@@ -224,6 +156,19 @@ def _alarms(finished: Mapping[str, Mapping[str, Any]]) -> list[str]:
         texts = [*made.get("alarms", []), made.get("alarm", ""), made.get("tokenizer_alarm", "")]
         out += [f"{name}: {text}" for text in texts if text]
     return out
+
+
+def unjudged(cfg: Mapping[str, Any], imagined: Mapping[str, Any]) -> list[str]:
+    """What to change in a judge that gave no judgement on most of the imagined evaluation episodes."""
+    dropped = imagined["dropped"]
+    asked = dropped + imagined["episodes"]
+    if 2 * dropped <= asked:
+        return []
+    kind: Any = target(cfg["judge"], "judge")
+    return [
+        f"{IMAGINED}: the judge gave no judgement on {dropped} of {asked} imagined episodes."
+        f" {kind.__name__}: {kind.remedy(cfg['judge'])}"
+    ]
 
 
 def _training(finished: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, float]]:

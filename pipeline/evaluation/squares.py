@@ -12,7 +12,7 @@ from envs.episodes.privileged import read_privileged
 from envs.physics.gridworld import COLOURS, EDGE, SIDE
 from envs.simulators.replay import Replay
 from pipeline.evaluation.objects.error import POSES
-from pipeline.evaluation.quantiles import quantiles
+from pipeline.evaluation.statistics import quantiles
 
 _NEAR = 90.0  # grey levels by which a pixel may differ from a square's colour, in its worst channel
 _HIDDEN = 0.35  # share of a square's area below which it is not counted as seen

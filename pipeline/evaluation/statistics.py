@@ -1,12 +1,17 @@
-"""Honest numbers: Wilson intervals, the exact McNemar test, Student's t over seeds, confusion tables."""
+"""Honest numbers: Wilson intervals, the exact McNemar test, Student's t over seeds, confusion tables,
+quantiles of errors.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
 from scipy.stats import binomtest, ttest_1samp
 from torch import Tensor
+
+_MOST = 1_000_000  # values looked at; torch.quantile takes 16 M, and a million says the same
 
 
 def wilson(successes: int, episodes: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -24,15 +29,31 @@ def rate_entry(success: Tensor) -> dict[str, Any]:
     return {"successes": successes, "episodes": episodes, "low": round(low, 4), "high": round(high, 4)}
 
 
-def rate(entry: Mapping[str, Any]) -> float:
-    """The share of successes in a `rate_entry`, 0 without episodes."""
-    return float(entry["successes"] / max(1, entry["episodes"]))
+def rate(entry: Mapping[str, Any]) -> float | None:
+    """The share of successes in a `rate_entry`; None without episodes, of which nothing is known."""
+    return float(entry["successes"] / entry["episodes"]) if entry["episodes"] else None
+
+
+def rise(before: Mapping[str, Any], after: Mapping[str, Any]) -> float | None:
+    """The difference of two `rate_entry`s' rates; None where one of them has no episodes."""
+    low, high = rate(before), rate(after)
+    return None if low is None or high is None else high - low
+
+
+def percent_line(entry: Mapping[str, Any], digits: int = 1) -> str:
+    """The rate of a `rate_entry` in percent, or that nothing was judged."""
+    share = rate(entry)
+    return "not judged" if share is None else f"{100 * share:.{digits}f}%"
 
 
 def rate_line(entry: Mapping[str, Any]) -> str:
-    """A `rate_entry` in words: successes of episodes, the rate in percent, and its interval."""
+    """A `rate_entry` in words: successes of episodes, the rate in percent, and its interval; or that nothing
+    was judged.
+    """
+    if not entry["episodes"]:
+        return percent_line(entry)
     return (
-        f"{entry['successes']}/{entry['episodes']} = {100 * rate(entry):.1f}%"
+        f"{entry['successes']}/{entry['episodes']} = {percent_line(entry)}"
         f" [{100 * entry['low']:.1f}, {100 * entry['high']:.1f}]"
     )
 
@@ -69,3 +90,12 @@ def confusion(predicted: Tensor, truth: Tensor) -> dict[str, Any]:
     fn, tn = int((~predicted & truth).sum()), int((~predicted & ~truth).sum())
     accuracy = round((tp + tn) / len(truth), 4) if len(truth) else None
     return {"tp": tp, "fp": fp, "fn": fn, "tn": tn, "accuracy": accuracy}
+
+
+def quantiles(values: Tensor) -> dict[str, float]:
+    """{"median", "p90"} of the finite values [N], NaN where there is none."""
+    values = values[torch.isfinite(values)]
+    if not len(values):
+        return {"median": float("nan"), "p90": float("nan")}
+    values = values[:: len(values) // _MOST + 1]
+    return {"median": float(values.median()), "p90": float(values.quantile(0.9))}

@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from actors.factory import build_policy, build_simulator
 from actors.process import prepare_process
 from actors.world_config import build_kinematics, pose_style
+from envs.episodes.clips import ClipStore
 from learners.stages.generated import generated_frames
 from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.perception import train_perception
@@ -35,6 +37,13 @@ def imitation(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Behaviour cloning of demonstrations (imitation.sources, imitation.demos)."""
     store = open_store(cfg, inputs)
     demos = demonstrations(cfg, store)
+    return {**cloned(cfg, folder, store, demos), "demos": len(demos)}
+
+
+def cloned(cfg: Cfg, folder: Path, store: ClipStore, episodes: Tensor) -> dict[str, float]:
+    """Leave a policy from nothing in a stage's folder: its perception learns on all that may be learned from,
+    then it clones `episodes`, int64 [N]. Returns what training says of itself.
+    """
     prepare_process(cfg["seed"], cfg["threads"])
     policy = build_policy(cfg)
     section, mode = cfg["imitation"], mode_of(cfg)
@@ -46,9 +55,9 @@ def imitation(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     )
     fit = fit_options(cfg, section["fit"], "imitation.fit")
     # Perception has taken its units from all frames; demonstrations must not change them again.
-    stats = train_imitation(Cloning(policy, store, demos, mode), fit, folder, fresh=not seen)
+    stats = train_imitation(Cloning(policy, store, episodes, mode), fit, folder, fresh=not seen)
     save_weights(policy, folder)
-    return {**_both(stats, seen), "demos": len(demos)}
+    return _both(stats, seen)
 
 
 @stage(reads=(*SIMULATOR, "policy", "imitation", "clone"), place=Place.LEARNERS)

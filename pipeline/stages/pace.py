@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from actors.process import prepare_process
 from envs.manifest import read_manifest
 from envs.targets import options
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
-from learners.stages.state import train_state
+from learners.stages.state import StatePace, shortest_kept, train_state
 from learners.stages.tokenizer import train_tokenizer
 from learners.training.fit import FitConfig
 from learners.training.parallel import leads
@@ -50,10 +50,14 @@ def in_time(inputs: Inputs, part: str, fit: FitConfig) -> FitConfig:
         return fit
     manifest = read_manifest(inputs.folder("pace"))
     assert manifest is not None, "a role is played by finished stages"
-    speed = manifest["result"].get(f"{part}_speed")
+    seconds, found = inputs.settings["seconds"], manifest["result"]
+    if part == "state" and "state_sample_seconds" in found:
+        cost = StatePace(**{one.name: found[f"state_{one.name}"] for one in fields(StatePace)})
+        return replace(fit, steps=cost.steps(seconds, fit))
+    speed = found.get(f"{part}_speed")
     if speed is None:  # of what learns nothing
         return fit
-    return replace(fit, steps=max(1, round(inputs.settings["seconds"] * speed / fit.batch)))
+    return replace(fit, steps=max(1, round(seconds * speed / fit.batch)))
 
 
 def fits_of(cfg: Cfg) -> dict[str, FitConfig]:
@@ -68,8 +72,8 @@ def fits_of(cfg: Cfg) -> dict[str, FitConfig]:
 
 @stage(reads=(*SIMULATOR, *_FITS, "equal_time.measured"), place=Place.LEARNERS)
 def pace(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """Samples per second in which a world's tokenizer, simulator and state expert learn, each for a few steps
-    on parts that are thrown away; of those that learn.
+    """Samples per second in which a world's tokenizer and simulator learn, and what its state expert costs
+    (see StatePace), each for a few steps on parts that are thrown away; of those that learn.
     """
     store, trial = open_store(cfg, inputs), folder / "trial"
     episodes = learning_episodes(store)
@@ -89,16 +93,20 @@ def pace(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         "simulator": learns(model),
         "state": learns(decoder),
     }
-    fits, out = fits_of(cfg), {}
+    fits, out = fits_of(cfg), dict[str, float]()
     for part, train in trained.items():
         if not present[part]:
             continue
         fit = fits[part]
         train(replace(fit, steps=_WARM_UP), trial / f"{part}-warm-up")
         fit = replace(fit, steps=cfg["equal_time"]["measured"])
-        spent = train(fit, trial / part)
-        seconds = sum(spent.get(f"{kind}_seconds", 0.0) for kind in ("data", "compute", "features"))
-        out[f"{part}_speed"] = fit.steps * fit.batch / seconds
+        if part == "state":
+            fit = shortest_kept(fit)
+            cost = StatePace.of(fit, train(fit, trial / part))
+            out |= {f"state_{key}": value for key, value in asdict(cost).items()}
+        else:
+            spent = train(fit, trial / part)
+            out[f"{part}_speed"] = fit.steps * fit.batch / (spent["data_seconds"] + spent["compute_seconds"])
     if leads():
         shutil.rmtree(trial)
     return out

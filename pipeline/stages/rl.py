@@ -31,7 +31,7 @@ from envs.rng import Purpose, episode_seeds
 from envs.simulators.features import features_of_chunks, features_of_episodes
 from envs.specs import CHUNK
 from envs.targets import target
-from learners.rl.algorithm import Algorithm
+from learners.rl.algorithm import Algorithm, RLConfig
 from learners.rl.dataset_rollout import dataset_rollout
 from learners.rl.loop import train_rl
 from learners.rl.recorded import RecordedDecisions, TrueExperience
@@ -113,6 +113,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         true = TrueExperience(anchor, decisions)
         watch = true_success(cfg, settings, inputs.weights("policy"))
         stats = train_rl(fleet, policy, algorithm, settings, folder, starts, true=true, watch=watch)
+        stats["alarms"] = [*stats["alarms"], *nothing_left(settings, decisions)]
     except FleetError as error:
         raise FleetError(f"{error}{what_the_judge_needs(cfg, fleet)}") from error
     finally:
@@ -147,6 +148,17 @@ def what_the_judge_needs(cfg: Cfg, fleet: Fleet | None) -> str:
         return ""
     kind: Any = target(cfg["judge"], "judge")
     return f". {kind.__name__}: {kind.remedy(cfg['judge'])}"
+
+
+def nothing_left(settings: RLConfig, decisions: RecordedDecisions | None) -> list[str]:
+    """An alarm where the algorithm's loss is on nothing, neither imagined nor recorded."""
+    if settings.imagined or (decisions is not None and settings.recorded):
+        return []
+    return [
+        "nothing but the anchor was learned from: rl.imagined=0 leaves imagined decisions out, and"
+        " recorded ones need rl.recorded above 0, an algorithm with a critic (algorithm=ppo), a policy that"
+        " is not scored on tokens, and labelled episodes of the deployed policy"
+    ]
 
 
 def _warm_up(
@@ -201,7 +213,7 @@ def rl_in_physics(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, An
     limits = {"iterations": iterations, "episodes": episodes}
     policy = build_policy(cfg, inputs.weights("policy"))
     lr = rl_rate(policy, cfg["rl"]["lr"])
-    settings = rl_options(cfg, **limits, anchor=0.0, seed=cfg["seed"] * 100, lr=lr)
+    settings = rl_options(cfg, **limits, anchor=0.0, imagined=1.0, seed=cfg["seed"] * 100, lr=lr)
     if settings.freeze_perception:
         freeze_perception(policy)
     algorithm = build_algorithm(cfg, policy)

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 from annotated_types import Gt, Le
 
 from actors.world_config import rewards_of
-from envs.targets import ConfigError
+from envs.targets import ConfigError, target
 from pipeline.acting import acting
 from pipeline.graph.graph import Graph, Names
 from pipeline.graph.stage import Stage
@@ -189,7 +189,10 @@ def add_rl_in_physics(graph: Graph, cfg: Cfg, equal: Equal) -> str:
 def privileged_note(cfg: Cfg) -> str:
     """What RL in physics is rewarded by, and how else it differs from the loop's."""
     rewarded = "progress and success" if rewards_of(cfg).progress else "success"
-    return (
+    note = (
         f"rewarded by the suite's true {rewarded}, which are privileged, not by a judge; it has no anchor to"
         " cloned episodes (rl.anchor)"
     )
+    if hasattr(target(cfg["algorithm"], "algorithm"), "warm_up"):
+        note += ", its critic is not warmed up, and no recorded decisions are learned from (rl.recorded)"
+    return note

@@ -16,6 +16,7 @@ OVER_SEEDS = (
     " for these policies. What other seeds may bring is told by the gains by seed, with Student's interval at"
     " 95% and p, which take a seed for one observation."
 )
+_NONE = "no episode"  # of a task, in a column that was run
 Lines = list[list[str]]
 Columns = Mapping[str, Column]
 
@@ -96,7 +97,9 @@ def _comparisons(table: Mapping[str, Any]) -> list[tuple[str, Lines]]:
 def _cell(column: Column, cells: Mapping[str, Any], label: str) -> str:
     if label not in cells:  # of other rows
         return ""
-    return NOT_RUN if cells[label] is None else column.text(cells[label])
+    if cells[label] is None:
+        return NOT_RUN if all(cell is None for cell in cells.values()) else _NONE
+    return column.text(cells[label])
 
 
 def _gain(cell: Mapping[str, Any] | None) -> str:

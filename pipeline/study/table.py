@@ -1,5 +1,5 @@
 """The table of a study: what columns found of rows, what each row cost, and paired comparisons; None where a
-cell was not run.
+cell was not run, or where a column that was run has no episode of a task.
 """
 
 from __future__ import annotations

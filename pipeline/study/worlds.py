@@ -180,12 +180,14 @@ class Gap(Column):
         cells = {}
         for label, folder in zip(self.labels(cfg), folders, strict=True):
             found = result_of(folder)
-            true, imagined = rate(found["true"]), rate(found["imagined"])
-            cells[label] = {"gap": found["gap"], "true": true, "imagined": imagined}
+            sides = {side: rate(found[side]) for side in ("true", "imagined")}
+            cells[label] = {"gap": found["gap"], **sides}
         return Measured(cells)
 
     def text(self, cell: Cell) -> str:
         """See Column.text."""
+        if cell["gap"] is None:
+            return "not judged"
         sides = f"{100 * cell['imagined']:.0f}% imagined, {100 * cell['true']:.0f}% true"
         return f"{points_line(cell['gap'])} points ({sides})"
 

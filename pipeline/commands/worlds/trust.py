@@ -50,6 +50,12 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
     cfg = graph.cfg  # of the world that is acted in
     if f"gap-{number}" not in graph.nodes:
         raise ConfigError(f"round={number}: the rounds of this run are 1 to {cfg['rounds']['count']}")
+    missing = [name for name in graph.nodes[f"gap-{number}"].parents if not graph.finished(name)]
+    if missing:
+        raise ConfigError(
+            f"{root} has not come to round {number} with this config: {', '.join(missing)} are not finished"
+            " (`worldloop stages` says what differs); first `worldloop run` with the same options"
+        )
     inputs = graph.inputs(f"gap-{number}")
     store = open_store(cfg, inputs)
     held = store.split("held_out")

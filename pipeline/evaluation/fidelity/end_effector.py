@@ -22,7 +22,7 @@ from envs.simulators.replay import Replay
 from pipeline.evaluation.grippers.end_effectors import EndEffectors, true_end_effectors
 from pipeline.evaluation.grippers.ruler import GripperRuler, gripper_ruler
 from pipeline.evaluation.objects.rays import nearest_on_ray, rays, triangulate
-from pipeline.evaluation.quantiles import quantiles
+from pipeline.evaluation.statistics import quantiles
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from envs.targets import options as options_of
 from learners.training.fit import FitConfig, fit
 from pipeline.evaluation.grippers.detector import GripperDetector
 from pipeline.evaluation.grippers.end_effectors import EndEffectors
-from pipeline.evaluation.quantiles import quantiles
+from pipeline.evaluation.statistics import quantiles
 from pipeline.graph.artefact import save_weights
 
 WEIGHTS = "weights.safetensors"

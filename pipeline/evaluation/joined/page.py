@@ -76,9 +76,10 @@ _PARTS = (
 
 
 def _video(found: Found) -> Iterator[Row]:
+    sides = (found["overall"], found["held"]["first frame held"])
     for key, title, form in FIDELITY:
-        value = found["overall"].get(key)
-        yield Row(f"{title} {_BETTER[key]}", MISSING if value is None else form.format(value))
+        made, still = ("" if one.get(key) is None else form.format(one[key]) for one in sides)
+        yield Row(f"{title} {_BETTER[key]}", made or MISSING, still=still)
     for one in found["frechet"]:
         text = MISSING if one["value"] is None else f"{one['value']:.4g}"
         yield Row(f"Frechet distance, {one['extractor']}, {one['samples']} samples ↓", text)

@@ -16,7 +16,7 @@ from envs.geometry.cameras import project
 from envs.simulators.replay import Replay
 from pipeline.evaluation.objects.locator import follow
 from pipeline.evaluation.objects.rays import on_plane
-from pipeline.evaluation.quantiles import quantiles
+from pipeline.evaluation.statistics import quantiles
 
 POSES = "object_poses"  # privileged: [O, n], for every object x, y, z in metres and what else a suite knows
 _NAMES = (("pixels", "cm"), ("locator_px", "locator_cm"))  # of errors in generated and in true video

@@ -10,7 +10,7 @@ from markupsafe import Markup
 from pipeline.evaluation.charts import Point, agreement_chart
 from pipeline.evaluation.judging import cost_text, facts_text
 from pipeline.evaluation.report import templates
-from pipeline.evaluation.statistics import rate
+from pipeline.evaluation.statistics import percent_line
 from pipeline.evaluation.value.agreement import ALL
 
 _SERIES = ("in distribution", "out of distribution")
@@ -123,7 +123,7 @@ def _cell_text(cell: Mapping[str, Any]) -> str:
     value, error = cell["estimated"], cell["standard_error"]
     estimated = "nothing judged" if value is None else f"{100 * value:.0f}"
     spread = "" if error is None or value is None else f" +- {100 * error:.1f}"
-    true = f"{100 * rate(cell['true']):.0f} -> " if "true" in cell else ""
+    true = f"{percent_line(cell['true'], 0).rstrip('%')} -> " if "true" in cell else ""
     return f"{true}{estimated}{spread}"
 
 

@@ -110,7 +110,11 @@ def kept(rates: Rates, mode: Rates) -> float:
     """The share of its mode's successes that a policy keeps, 0..1, as the mean over those tasks in which the
     mode succeeds at all: what a hard task loses must not be made up for by an easy one.
     """
-    shares = [min(1.0, rate(rates[task]) / rate(mode[task])) for task in mode if mode[task]["successes"]]
+    shares = [
+        min(1.0, (rate(rates[task]) or 0.0) / (rate(mode[task]) or 1.0))
+        for task in mode
+        if mode[task]["successes"]
+    ]
     return sum(shares) / len(shares)
 
 

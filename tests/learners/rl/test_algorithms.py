@@ -18,7 +18,17 @@ from actors.policies.contract import action_key, distribution, freeze_perception
 from actors.policies.safe import SafePolicyWrapper
 from actors.rollouts.host import Host, Job, Weights
 from envs.physics.toy_tracking import ToyTrackingEnv
-from envs.specs import EPISODE, IMAGE, INSTRUCTION_UTF8, LOG_PROB, SUCCESS, ActionMode, WorldSpec
+from envs.specs import (
+    EPISODE,
+    IMAGE,
+    INSTRUCTION_UTF8,
+    JUDGE_STATUS,
+    LOG_PROB,
+    SUCCESS,
+    ActionMode,
+    Status,
+    WorldSpec,
+)
 from envs.targets import build, options
 from learners.rl.algorithm import Algorithm, RLConfig
 from learners.rl.loop import train_rl
@@ -167,6 +177,19 @@ def test_grpo_compares_within_groups_and_drops_equal_ones() -> None:
     assert data["advantage"].flatten().tolist() == [0.5, 0.5, -0.5, -0.5]
     with pytest.raises(ValueError, match=r"algorithm\.group"):
         algorithm.seeds(5, 3, torch.Generator())
+
+
+def test_grpo_drops_groups_whose_living_are_alike() -> None:
+    spec = world_spec(ARM_DELTAS)
+    policy = policy_of("chunk_gaussian", spec)
+    algorithm = algorithm_of("grpo", policy, spec, group=4, shaped=False)
+    data = rollout(policy, spec, [[0.0, 1.0]] * 4 + [[0.0, 1.0]] + [[0.0, 0.0]] * 3)
+    status = torch.zeros(8, 2, 1, dtype=torch.int64)
+    status[0, 1] = Status.ERROR.value  # whose return counts for nothing
+    data["next", JUDGE_STATUS] = status
+    transitions, figures = algorithm.prepare(data)
+    assert figures["groups_dropped"] == 0.5 and len(transitions) == 8
+    assert bool(transitions["advantage"].abs().min() > 0)
 
 
 def test_grpo_compares_whole_returns_also_with_episodes_that_have_ended() -> None:

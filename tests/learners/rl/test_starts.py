@@ -72,3 +72,10 @@ def test_a_group_that_was_torn_apart_is_found() -> None:
     for starts in (Starts(range(5), 5), Starts(range(5))):
         with pytest.raises(AssertionError, match="different starts"):
             starts.check_groups(rollout([1, 1, 2, 3]), 2)
+
+
+def test_what_goes_on_after_early_endings_begins_where_episodes_may() -> None:
+    env = ToyTrackingEnv(2, actions=1, tolerance=0.15, starts=100)
+    env.schedule([3, 7, 11])
+    begun = [env.reset()[EPISODE].flatten().tolist() for _ in range(4)]
+    assert begun == [[3, 7], [11, 3], [7, 11], [3, 7]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
-from learners.stages.state import _Kept, train_state
+from learners.stages.state import StatePace, _Kept, clips_kept, train_state
 from learners.training.fit import FitConfig
 from tests.embodiments import ARM_JOINTS, EMBODIMENTS
 from tests.learners.models import decoder_of, simulator_of
@@ -48,13 +49,39 @@ def test_features_are_computed_once_unless_they_are_too_large(
 
     monkeypatch.setattr(simulator, "features", counted)
     every, options = torch.arange(len(store)), FitConfig(steps=100, batch=32, lr=1e-3, bf16=False)
-    train_state(decoder_of("unet_small", simulator), simulator, store, every, options, tmp_path)
+    told = train_state(decoder_of("unet_small", simulator), simulator, store, every, options, tmp_path)
+    assert told["features_clips"] == clips_kept(options, int(told["features_bytes"])) == 200
     assert sum(shown) == 1 + 200  # one to know its size; of the 3200 clips that were learned from
     monkeypatch.setattr("learners.stages.state._KEPT", 1000)  # bytes
     shown.clear()
     options = FitConfig(steps=3, batch=32, lr=1e-3, bf16=False)
     train_state(decoder_of("unet_small", simulator), simulator, store, every, options, tmp_path / "anew")
     assert sum(shown) == 1 + 3 * 32
+
+
+@pytest.mark.parametrize(
+    ("sample_ms", "clip_ms", "kept"),
+    [(0.5, 1.0, True), (0.6, 5.0, True), (12.0, 330.0, True), (12.0, 0.0, False)],
+)
+@pytest.mark.parametrize("seconds", [0.001, 2.0, 54.0, 600.0])
+def test_as_many_steps_as_fit_into_the_time_are_taken(
+    sample_ms: float, clip_ms: float, kept: bool, seconds: float
+) -> None:
+    """Features are computed of 6000 clips at most, so they cost many steps less than few."""
+    cost = StatePace(sample_ms / 1000, clip_ms / 1000, 10 if kept else 2**32)
+    options = FitConfig(steps=20, batch=48, lr=1e-3)
+
+    def taken(steps: int) -> float:
+        looked_at = clips_kept(replace(options, steps=steps), cost.clip_bytes)
+        assert kept or not looked_at
+        return (looked_at or 48 * steps) * cost.clip_seconds + 48 * steps * cost.sample_seconds
+
+    steps = cost.steps(seconds, options)
+    assert steps == 1 or taken(steps) <= seconds
+    assert all(taken(steps + more) > seconds for more in (1, 16, 50))
+    measured = {"features_clips": 100, "features_seconds": 2.0, "features_bytes": 10}
+    spent = {"data_seconds": 1.0, "compute_seconds": 8.6}
+    assert StatePace.of(options, {**measured, **spent}) == StatePace(0.01, 0.02, 10)
 
 
 @pytest.mark.parametrize(("features", "at_hand"), [(4, True), (100_000, False)])

@@ -11,11 +11,13 @@ from typing import Any
 
 import pytest
 
+from pipeline.config import load_config
 from pipeline.evaluation.charts import Curve, line_chart
 from pipeline.evaluation.compare import compare
 from pipeline.evaluation.heat import heat_maps
 from pipeline.evaluation.report import build_report
-from pipeline.evaluation.result import verdict
+from pipeline.evaluation.result import unjudged
+from pipeline.evaluation.verdict import verdict
 from pipeline.graph.stage import Inputs
 
 
@@ -126,6 +128,34 @@ def test_the_verdict_can_say_no_and_why() -> None:
     assert "followed noise" in worse and "rl.lr" in worse and "higher" not in worse
     alone = verdict(result(physics_before=None, physics_after=None, paired=None))
     assert "without physics" in alone
+
+
+NOTHING = {"successes": 0, "episodes": 0, "low": 0.0, "high": 1.0, "dropped": 16}
+
+
+def test_what_was_not_judged_is_not_a_failure(inputs: Inputs, tmp_path: Path) -> None:
+    none = {"imagined_before": NOTHING, "imagined_after": NOTHING}
+    small = {"paired": {"gained": 1, "lost": 1, "p": 0.9}, "physics_after": entry(41)}
+    alarms = unjudged(load_config(["experiment=smoke"]), NOTHING)
+    assert "16 of 16 imagined episodes" in alarms[0] and "judge." in alarms[0]
+    assert not unjudged(load_config(["experiment=smoke"]), {**NOTHING, "episodes": 16})
+    flat = verdict(result(**none, **small, alarms=alarms))
+    assert "16 of 16" in flat and "+0 points" not in flat and "rl.lr" not in flat
+    assert verdict(result(**none)).startswith("gain: ")
+    alone = {"physics_before": None, "physics_after": None, "paired": None}
+    blind = verdict(result(**none, **alone, alarms=alarms))
+    assert blind.startswith("nobody knows") and "16 of 16" in blind and "+0.0" not in blind
+    assert "choose another" in verdict(result(**none, **alone))
+    crashed = verdict(result(physics_after=NOTHING))
+    assert crashed.startswith("nobody knows") and "task.suite" in crashed
+    told = result(**none, tasks={"push": {**alone, **none}}, verdict="-")
+    told["rounds"][0] |= {"true": NOTHING, "imagined": NOTHING, "gap": None}
+    page = build_report({}, inputs, told)
+    assert page.count("<td>not judged</td>") == 4 and page.count("<b>not judged</b>") == 2
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one/result.json").write_text(json.dumps(told))
+    table = compare([tmp_path / "one"])
+    assert "| imagined before → after | not judged → not judged |" in table
 
 
 @pytest.fixture

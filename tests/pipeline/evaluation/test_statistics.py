@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from pipeline.evaluation.by_task import by_task
-from pipeline.evaluation.quantiles import quantiles
-from pipeline.evaluation.statistics import confusion, mcnemar, over_seeds, rate_entry, wilson
+from pipeline.evaluation.statistics import confusion, mcnemar, over_seeds, quantiles, rate_entry, wilson
 
 
 def test_wilson_matches_published_values() -> None:

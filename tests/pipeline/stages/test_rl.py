@@ -14,8 +14,10 @@ from envs.manifest import write_manifest
 from pipeline.config import load_config
 from pipeline.graph.stage import Inputs
 from pipeline.stages import rl as stages
+from pipeline.stages.given import rl_options
 from tests.embodiments import ARM_DELTAS
 
+SETTINGS = {"imagined": 0.0, "iterations": 1, "seed": 0, "lr": 1e-4}
 SQUARE = ("task=lerobot", "task.size=[32,32]", "task.chunk=4", "task.horizon=12", "task.mode=absolute")
 
 
@@ -41,3 +43,10 @@ def test_true_decisions_are_learned_from_whatever_measures_progress(
     assert "critic_knew" in figures and float(decisions.known["advantage"].std()) > 0.05
     played = torch.searchsorted(store.start, decisions.known["row"], right=True) - 1
     assert {store.episodes[number]["source"] for number in played.tolist()} == {"policy-1"}
+    learning = rl_options(cfg, **SETTINGS)
+    assert not stages.nothing_left(learning, decisions)
+    (alarm,) = stages.nothing_left(
+        rl_options({**cfg, "rl": {**cfg["rl"], "recorded": 0}}, **SETTINGS), decisions
+    )
+    assert "nothing but the anchor" in alarm and stages.nothing_left(learning, None) == [alarm]
+    assert not stages.nothing_left(rl_options(cfg, **{**SETTINGS, "imagined": 1.0}), None)

@@ -14,7 +14,9 @@ import torch
 from envs.manifest import write_manifest
 from envs.physics.suite import build_suite
 from envs.targets import ConfigError
+from learners.training.fit import FitConfig
 from pipeline.config import load_config
+from pipeline.graph.stage import Inputs
 from pipeline.stages import pace
 from pipeline.study.columns import Measured, Success
 from pipeline.study.curves import SuccessOverTime
@@ -185,6 +187,37 @@ def test_seconds_are_shared_out_among_the_parts_that_there_are(
     assert pace.seconds_of(load_config(["experiment=soak"]), "state", "first") == {}
     with pytest.raises(ConfigError, match=r"equal_time\.tokenizer=0\.9 and equal_time\.state=0\.15"):
         load_config(["equal_time.tokenizer=0.9"])
+
+
+def test_a_state_expert_takes_the_steps_that_fit_with_its_features(tmp_path: Path) -> None:
+    measured = {"state_sample_seconds": 0.001, "state_clip_seconds": 0.01, "state_clip_bytes": 10}
+    folder = finished(tmp_path, "pace", {**measured, "simulator_speed": 40.0})
+    inputs, fit = Inputs({"pace": folder}, {"seconds": 200.01}), FitConfig(steps=1, batch=50, lr=1e-3)
+    assert pace.in_time(inputs, "simulator", fit).steps == 160
+    assert pace.in_time(inputs, "state", fit).steps == (200 - 60) / 0.05  # 6000 clips are looked at
+    assert pace.in_time(inputs, "tokenizer", fit) == fit
+
+
+def test_a_task_without_episodes_is_not_called_not_run() -> None:
+    whole = {"successes": 1, "episodes": 2, "low": 0.1, "high": 0.9}
+    row = {"row": "mine", "place": "", "seed": 0, "note": "", "physics_episodes": {}, "minutes": 1.0}
+    cells = {"push": whole, "pull": None, "all": whole}
+    table = {
+        "name": "study",
+        "columns": {"success": {"title": "success", "labels": list(cells)}},
+        "rows": [
+            {**row, "title": "mine", "cells": {"success": cells}},
+            {**row, "title": "other", "cells": {"success": dict.fromkeys(cells)}},
+        ],
+        "pooled": [],
+        "comparisons": [],
+    }
+    lines = markdown(table, {"success": Success("success")}).splitlines()
+    (mine,), (other,) = (
+        [line for line in lines if line.startswith(f"| {name} |")] for name in ("mine", "other")
+    )
+    assert mine.count("no episode") == 1 and "not run" not in mine
+    assert other.count("not run") == 3 and "no episode" not in other
 
 
 def test_success_is_drawn_by_task_and_scene_of_a_variant(tmp_path: Path, cfg: dict[str, Any]) -> None:
