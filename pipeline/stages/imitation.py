@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tqdm import tqdm
 
 from actors.factory import build_policy, build_simulator
 from actors.process import prepare_process
@@ -14,6 +15,7 @@ from learners.stages.generated import generated_frames
 from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.perception import train_perception
 from learners.stages.traces import Hands
+from learners.training.parallel import leads
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import (
@@ -47,7 +49,10 @@ def imitation(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     # Perception has taken its units from all frames; demonstrations must not change them again.
     stats = train_imitation(Cloning(policy, store, demos, mode), fit, folder, fresh=not seen)
     save_weights(policy, folder)
-    return {**_both(stats, seen), "demos": len(demos)}
+    constant = list(getattr(policy, "constants", ()))
+    if constant and leads():
+        tqdm.write(f"imitation: the policy holds constant, as demonstrations do: {', '.join(constant)}")
+    return {**_both(stats, seen), "demos": len(demos), "constant": constant}
 
 
 @stage(reads=(*SIMULATOR, "policy", "imitation", "clone"), place=Place.LEARNERS)
