@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from actors.recorded_grippers import with_recorded_grippers
 from envs.conditioning import PoseMapStyle
 from envs.embodiment import Embodiment, EmbodimentError, Robot
 from envs.episodes.formats.lerobot_robot import agreed_robot, alike_calibrated
@@ -42,7 +43,7 @@ def embodiment_of(cfg: Mapping[str, Any]) -> Embodiment:
         if difference := robot.differs(other):
             raise ConfigError(f"task.data: {first} and {folder} are of different robots: {difference}")
         robot = alike_calibrated(robot, other)
-    return robot
+    return with_recorded_grippers(robot, [Path(folder) for folder in task["data"]])
 
 
 def _suite(section: Mapping[str, Any]) -> tuple[Embodiment, tuple[str, ...]]:
