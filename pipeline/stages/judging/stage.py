@@ -23,6 +23,7 @@ from learners.stages.generated import generated_frames, recorded_features
 from learners.stages.judge import calibrate, judge_recordings, train_judge
 from learners.stages.text_world import calibrate_ending, train_text_world
 from pipeline.evaluation.judging import episode_success, labelled
+from pipeline.evaluation.measurement import followed
 from pipeline.evaluation.rewards.figures import auc
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
@@ -151,7 +152,7 @@ def _calibrate(cfg: Cfg, model: Judge, store: ClipStore, world: Simulator, bf16:
     """
     if not model.calibrates:
         return {}
-    unseen = labelled(store, store.split("calibration"))
+    unseen = labelled(store, followed(store, store.split("calibration")))
     if not len(unseen):
         return {}
     features = features_of_episodes(world, store, unseen, bf16) if model.reads_features else None
