@@ -168,12 +168,15 @@ def _calibrate(cfg: Cfg, model: Judge, store: ClipStore, world: Simulator, bf16:
         if blank == len(unseen):  # nor would it on generated ones, which RL would drop one after the other
             raise ConfigError(why)
         tqdm.write(why)
-    if not calibrate(model, score, succeeded):
-        tqdm.write(
-            f"judge: {int(succeeded.sum())} of {len(succeeded)} calibration episodes succeeded, and its"
-            f" scores do not tell which; threshold left at {float(model.threshold):.3f}"
-        )
     won, sure = succeeded[judged], model.confidence(score[judged].double())
+    if not calibrate(model, score, succeeded):
+        why = "its scores do not tell which"
+        if won.all() or not won.any():
+            why = f"one that {'failed' if won.all() else 'succeeded'} is needed beside them; record some"
+        tqdm.write(
+            f"judge: {int(won.sum())} of {len(won)} calibration episodes succeeded, and {why}; threshold"
+            f" left at {float(model.threshold):.3f}"
+        )
     if won.all() or not won.any():
         return {}
     return {
