@@ -119,9 +119,8 @@ def _travels(chunks: Tensor, robot: Embodiment) -> Tensor:
     past an episode's end, tell nothing.
     """
     path = chunks.to(torch.float64, copy=True)
-    if robot.delta:
-        changes = [number for number in range(robot.action_dim) if number not in robot.grippers]
-        path[..., changes] = path[..., changes].cumsum(1)
+    changes = list(robot.changes)
+    path[..., changes] = path[..., changes].cumsum(1)
     steps = path.diff(dim=1)
     steps = steps[(steps != 0).any(-1)]
     square = steps.square().sum(0) / max(1, len(steps))
