@@ -35,19 +35,19 @@ def with_recorded_grippers(robot: Embodiment, folders: Sequence[Path]) -> Embodi
     """
     if not robot.grippers or _says_arms(folders[0]):
         return robot
-    bounds = [found for folder in folders if (found := _bounds(folder, robot.action_dim)) is not None]
+    bounds = [one for folder in folders if (one := _bounds(folder, robot.action_dim)) is not None]
     if not bounds:
         return robot
-    low, high = np.min([one for one, _ in bounds], 0), np.max([other for _, other in bounds], 0)
+    low, high = np.min([least for least, _ in bounds], 0), np.max([most for _, most in bounds], 0)
     arms = []
     for arm in robot.arms:
         if arm.gripper is not None:
             least, most = float(low[arm.gripper]), float(high[arm.gripper])
             if not _goes_with(arm.gripper_range, least, most):
                 opened, closed = arm.gripper_range
-                found = (least, most) if opened < closed else (most, least)
-                _warn(str(folders[0]), robot.action_names[arm.gripper], arm.gripper_range, found)
-                arm = replace(arm, gripper_range=found)
+                recorded = (least, most) if opened < closed else (most, least)
+                _warn(str(folders[0]), robot.action_names[arm.gripper], arm.gripper_range, recorded)
+                arm = replace(arm, gripper_range=recorded)
         arms.append(arm)
     return replace(robot, arms=tuple(arms))
 
