@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from actors.recorded_grippers import with_recorded_grippers
 from envs.conditioning import PoseMapStyle
 from envs.embodiment import Embodiment, EmbodimentError, Robot
 from envs.episodes.formats.lerobot_info import arms_are_said
@@ -50,7 +51,7 @@ def embodiment_of(cfg: Mapping[str, Any]) -> Embodiment:
                 f"task.data: {said[0][0]} and {folder} are of different robots: arms are {said[0][1]}, but"
                 f" {arms}; correct features.action.info.worldloop.arms in one of their meta/info.json"
             )
-    return robot
+    return with_recorded_grippers(robot, [Path(folder) for folder in task["data"]])
 
 
 def _suite(section: Mapping[str, Any]) -> tuple[Embodiment, tuple[str, ...]]:

@@ -239,6 +239,16 @@ class Embodiment:
         return tuple(arm.gripper for arm in self.arms if arm.gripper is not None)
 
     @property
+    def changes(self) -> tuple[int, ...]:
+        """Positions of an action's numbers that are 0 while the robot stays as it is: of changes all but
+        grippers, else velocities by their names, such as x.vel of a base beside positions of an arm.
+        """
+        if self.delta:
+            return tuple(number for number in range(self.action_dim) if number not in self.grippers)
+        words = [{*re.split(r"[^a-z]+", name.lower())} for name in self.action_names]
+        return tuple(number for number, some in enumerate(words) if some & {"vel", "velocity"})
+
+    @property
     def action_rotations(self) -> tuple[tuple[int, ...], ...]:
         """Positions of an action's orientations: of commanded poses and by names, as `orientations` finds
         them; () where it commands changes.

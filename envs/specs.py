@@ -142,12 +142,10 @@ def to_chunk(commands: Tensor, command: Tensor, mode: ActionMode) -> Tensor:
 
 def at_rest(commands: Tensor, embodiment: Embodiment) -> Tensor:
     """Commands [..., A] by which a robot whose last ones these were stays as it is: absolute ones are held,
-    of changes only grippers are.
+    changes and velocities are 0 (Embodiment.changes).
     """
-    if not embodiment.delta:
-        return commands
-    moves = torch.ones(embodiment.action_dim, dtype=torch.bool, device=commands.device)
-    moves[list(embodiment.grippers)] = False
+    moves = torch.zeros(embodiment.action_dim, dtype=torch.bool, device=commands.device)
+    moves[list(embodiment.changes)] = True
     return torch.where(moves, 0.0, commands)
 
 

@@ -19,6 +19,7 @@ from envs.targets import ConfigError, nearest
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 IF_CHOSEN = "if_chosen"  # options by group and choice, which count where that is what was chosen
+_DATA = ("task", "extra_starts", "finetune", "imagined")  # sections whose `data` are folders
 _SECTIONS = {"distiller": "distill"}  # of groups whose choices fill a part of one
 
 
@@ -79,7 +80,9 @@ def offered(group: str, choice: str, overrides: Sequence[str]) -> bool:
 
 
 def composed(overrides: Sequence[str]) -> dict[str, Any]:
-    """The resolved config, unchecked; an experiment's options of what was chosen are put in."""
+    """The resolved config, unchecked; an experiment's options of what was chosen are put in, and a folder of
+    data is a list of one.
+    """
     words = [part for word in overrides for part in _replacing(word)]
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
         made = compose("config", words, return_hydra_config=True)
@@ -99,6 +102,9 @@ def composed(overrides: Sequence[str]) -> dict[str, Any]:
             ) from error
     plain = OmegaConf.to_container(made, resolve=True)
     assert isinstance(plain, dict)
+    for name in _DATA:
+        if isinstance(plain[name], dict) and isinstance(folder := plain[name].get("data"), str):
+            plain[name]["data"] = [folder] if folder else []  # as is said for one
     return {str(key): value for key, value in plain.items()}
 
 

@@ -27,7 +27,8 @@ class Channel:
         name: as in the embodiment.
         number: its position in the action.
         arm: position of the arm that it belongs to.
-        rate: by how much a held key moves it in a second; of delta actions, its value while the key is held.
+        rate: by how much a held key moves it in a second; of changes and velocities, its value while the key
+            is held.
         raises, lowers: keys that do so while its arm is chosen, "" for none.
         limits: least and greatest value, None if they are the robot's affair.
     """
@@ -69,7 +70,7 @@ class Controls:
         if rest:
             self._group(len(self.arms), sorted(rest))
             self.arms.append("other" if self.arms else robot.robot)
-        self._grippers = {arm.gripper for arm in robot.arms}
+        self._changes = {*robot.changes}
 
     def _group(self, arm: int, numbers: Any) -> None:
         for place, number in enumerate(numbers):
@@ -85,10 +86,12 @@ class Controls:
         return _RADIANS if self.robot.action_kind is ActionKind.JOINTS else _OTHER
 
     def start(self, command: NDArray[Any]) -> NDArray[np.float64]:
-        """The command [A] to begin from: the one in force; of delta actions no motion, and open grippers."""
+        """The command [A] to begin from: the one in force, but for changes and velocities, which are 0; of
+        delta actions open grippers.
+        """
         out = np.array(command, dtype=np.float64)
+        out[list(self._changes)] = 0.0
         if self.robot.delta:
-            out[:] = 0.0
             for arm in self.robot.arms:
                 if arm.gripper is not None:
                     out[arm.gripper] = arm.gripper_range[0]
@@ -100,15 +103,15 @@ class Controls:
         """The next action [A] after `command` [A].
 
         Args:
-            held: how far each number is pushed, -1..1, by its position; others rest. Grippers stay as they
-                are, of delta actions all else does.
+            held: how far each number is pushed, -1..1, by its position; others rest: absolute numbers and
+                grippers stay as they are, changes and velocities are 0.
             speed: factor of the rates.
         """
         out = np.array(command, dtype=np.float64)
         for channel in self.channels:
             push = float(np.clip(held.get(channel.number, 0.0), -1.0, 1.0)) * speed
             at = channel.number
-            if self.robot.delta and at not in self._grippers:
+            if at in self._changes:
                 out[at] = push * channel.rate
             else:
                 out[at] += push * channel.rate / self.robot.fps

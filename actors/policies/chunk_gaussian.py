@@ -183,6 +183,11 @@ class ChunkGaussianHead(Head):
         self.gain.copy_(torch.where(active, spread, 0.0))
         self.offset.copy_(torch.where(active, middle, centre))
 
+    @property
+    def varies(self) -> Tensor:
+        """See Head.varies."""
+        return self.gain > 0
+
     def target(self, chunks: Tensor) -> Tensor:
         """Knots [N, knots, A] in normalised units."""
         gain = torch.where(self.gain > 0, self.gain, torch.ones_like(self.gain))

@@ -128,6 +128,11 @@ class ChunkTokenHead(Head):
         self.low.copy_(torch.where(active, low - margin, centre))
         self.high.copy_(torch.where(active, high + margin, centre))
 
+    @property
+    def varies(self) -> Tensor:
+        """See Head.varies."""
+        return self.high > self.low
+
     def target(self, chunks: Tensor) -> Tensor:
         """Bin numbers [N, K, A]."""
         return bins_of(chunks, self.low, self.high, self.bins)
@@ -137,7 +142,7 @@ class ChunkTokenHead(Head):
         wrong = F.cross_entropy(self(hidden)[0].flatten(0, -2), target.flatten(), reduction="none").view(
             target.shape
         )
-        active = (self.high > self.low).float()
+        active = self.varies.float()
         return (wrong * active).sum() / (active.sum().clamp(min=1) * target.shape[0] * target.shape[1])
 
     def apart(self, one: Tensor, other: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ Whatever else a policy has is used if it is there:
 - `trained`: the part that learners train and score, if that is not all of it;
 - `freeze_perception()`: for rl.freeze_perception;
 - `normalise(chunks [N, K, A], states [N, S], commands in force [N, A])`: takes units from demonstrations;
+- `constants`: names of the numbers of an action that it then always says the same of, which is told;
 - `policy_features(observed)` [B, width] and `width`: through them perception is taught on all recorded
   frames;
 - `gaze(observed)`, those features and what key-points look for (vla.py), `instruction_keypoints` and

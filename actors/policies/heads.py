@@ -11,7 +11,10 @@ from torch import Tensor, nn
 from envs.conditioning.units import RESOLUTION
 from envs.embodiment import ActionKind, Embodiment
 
-MARGIN = 0.01  # share of the greatest spread among numbers of one unit, below which a number is constant
+MARGIN = 0.01  # share of the greatest spread among numbers of one unit, below which it may be constant
+# Variance over mean squared step, above which a number travels. Noise has 1/2; where chunks are offsets from
+# a command that is as noisy, it has 1.
+_DIRECTED = 1.25
 
 
 class Head(nn.Module, abc.ABC):
@@ -64,6 +67,11 @@ class Head(nn.Module, abc.ABC):
         self.share.fill_(share)
 
     @property
+    @abc.abstractmethod
+    def varies(self) -> Tensor:
+        """Which numbers of an action are no constants, bool [A]; all until `normalise`."""
+
+    @property
     def exploration(self) -> float:
         """How widely chunks are drawn, over how widely the config says; 1 where a step of parameters moves
         the distribution as far however widely it is drawn.
@@ -84,19 +92,39 @@ def some_drawn(drawn: Tensor, mode: Tensor, share: Tensor) -> Tensor:
 def varying(chunks: Tensor, robot: Embodiment) -> Tensor:
     """Which numbers of an action vary in demonstrated chunks [N, K, A]: bool [A].
 
-    A number is constant if its standard deviation is below RESOLUTION, or below MARGIN times the greatest one
-    among the numbers of its unit: positions, angles and joints each have one, grippers that of their range,
-    and numbers of unknown meaning are each alone.
+    A number is constant if its standard deviation is below RESOLUTION, or small and noise alone. Small is
+    below MARGIN times the greatest one among the numbers of its unit: positions, angles and joints each have
+    one, grippers that of their range, and numbers of unknown meaning are each alone. Positions and angles of
+    poses are certain to share theirs, so what is small among them need not look like noise. Of joints one may
+    be a rail in metres, the others in degrees, and the range of a gripper may be another than is thought.
     """
     spread = chunks.flatten(0, 1).double().std(0, unbiased=False)
     least = torch.full_like(spread, RESOLUTION)
     for group in _units(robot):
         least[group] = torch.maximum(least[group], MARGIN * spread[group].max())
+    doubtful = torch.zeros_like(spread, dtype=torch.bool)
+    if robot.action_kind is ActionKind.JOINTS:
+        doubtful[[number for arm in robot.arms for number in arm.numbers]] = True
     for arm in robot.arms:
         if arm.gripper is not None:
             opened, closed = arm.gripper_range
-            least[arm.gripper] = max(RESOLUTION, MARGIN * abs(closed - opened))
-    return spread > least
+            least[arm.gripper], doubtful[arm.gripper] = MARGIN * abs(closed - opened), True
+    return (spread > RESOLUTION) & ((spread > least) | (doubtful & _travels(chunks, robot)))
+
+
+def _travels(chunks: Tensor, robot: Embodiment) -> Tensor:
+    """Which numbers go further in chunks [N, K, A] than steps without a direction would take them: bool [A].
+
+    Noise is as far from its mean as from what comes next, up to a factor. Steps in which nothing moves, as
+    past an episode's end, tell nothing.
+    """
+    path = chunks.to(torch.float64, copy=True)
+    changes = list(robot.changes)
+    path[..., changes] = path[..., changes].cumsum(1)
+    steps = path.diff(dim=1)
+    steps = steps[(steps != 0).any(-1)]
+    square = steps.square().sum(0) / max(1, len(steps))
+    return path.flatten(0, 1).var(0, unbiased=False) > _DIRECTED * square
 
 
 def _units(robot: Embodiment) -> list[list[int]]:

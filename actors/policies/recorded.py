@@ -28,7 +28,7 @@ class Commands:
 
 class RecordedActions(TensorDictModuleBase):
     """Acts as somebody did before from the same starts, and rests when the recording is over: absolute
-    commands stay in force, of changes only grippers do.
+    commands stay in force, changes and velocities are 0.
 
     Args:
         commands: of the episodes that begin at a world's initial states, in their order.

@@ -269,6 +269,12 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         for part in parts if query is None else [*parts, query.proprioception]:
             part.normalise(*(states, commands)[: len(part.keys)])
 
+    @property
+    def constants(self) -> list[str]:
+        """Names of the numbers of an action that it always says the same of."""
+        pairs = zip(self.spec.embodiment.action_names, self.head.varies.tolist(), strict=True)
+        return [name for name, varies in pairs if not varies]
+
     def scale_exploration(self, width: float, share: float) -> None:
         """Multiply how widely chunks are drawn around the mode, which stays, and draw that share of them."""
         self.head.scale_exploration(width, share)

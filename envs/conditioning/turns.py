@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 
 _TURN = 2 * math.pi
+_HALF = math.pi + 0.1  # rad, that a robot tells at most
+_STEP = 1.0  # rad, that a robot turns from one frame to the next at most, mostly far less
 _UNIT = 0.05  # how far from 1 the norm of a recorded quaternion may be
 
 
@@ -22,9 +24,9 @@ class Turns(nn.Module):
     Args:
         size: how many numbers there are.
         groups: positions of the numbers of each orientation: 1 is an angle in radians, 3 are a rotation
-            vector in radians, 4 a quaternion in any order. Angles and vectors of more than a turn, and
-            quaternions of another norm than 1, are counted in something else, or counted on, and are taken
-            as they are.
+            vector in radians, 4 a quaternion in any order. Angles and vectors of more than a turn, or of more
+            than half a turn that jump by no whole turns, and quaternions of another norm than 1, are counted
+            in something else, or counted on, and are taken as they are.
     """
 
     turn: Tensor
@@ -41,11 +43,14 @@ class Turns(nn.Module):
 
     @torch.no_grad()
     def fit(self, values: Tensor) -> Tensor:
-        """See which orientations values [N, size] bear out; their mean [size], whatever way each is told."""
+        """See which orientations values [N, size] bear out, in whose order a robot came from one to the next;
+        their mean [size], whatever way each is told.
+        """
         values = values.to(self.turn.device)
+        sizes = {number: values[:, number].abs() for number in self.angles}
         self.turn.zero_()
-        for number in self.angles:
-            self.turn[number] = _TURN * bool((values[:, number].abs() <= _TURN).all())
+        for number, size in sizes.items():
+            self.turn[number] = _TURN * bool((size <= _TURN).all())
         circular = torch.atan2(values.sin().mean(0), values.cos().mean(0))
         middle = torch.where(self.turn > 0, circular, values.mean(0))
         for which, group in enumerate(self.wholes):
@@ -54,6 +59,14 @@ class Turns(nn.Module):
             self.borne_out[which] = bool(fits.all())
             if len(values) and self.borne_out[which]:
                 middle[group] = _vector(_axis(_quaternion(some))) if len(group) == 3 else _axis(some)
+        told, back = self.nearest(values, middle), self.nearest(values[1:], values[:-1])
+        for number, size in sizes.items():
+            if not _in_radians(values[:, [number]], size, told[:, [number]], back[:, [number]]):
+                self.turn[number], middle[number] = 0.0, values[:, number].mean()
+        for which, group in enumerate(self.wholes):
+            some = values[:, group]
+            if len(group) == 3 and not _in_radians(some, some.norm(dim=-1), told[:, group], back[:, group]):
+                self.borne_out[which], middle[group] = False, some.mean(0)
         return middle + (self.nearest(values, middle) - middle).mean(0)
 
     def nearest(self, values: Tensor, to: Tensor) -> Tensor:
@@ -73,6 +86,25 @@ class Turns(nn.Module):
                 factor = 1 - _TURN / norm * ((norm - along / norm) / _TURN).round()
             values[..., group] = some * torch.where(borne_out, factor, 1.0).to(some)
         return values
+
+
+def _in_radians(values: Tensor, sizes: Tensor, told: Tensor, back: Tensor) -> bool:
+    """Whether angles [N, 1] or rotation vectors [N, 3] of at most a turn are in radians, not a few degrees.
+
+    Robots tell half a turn at most. What lies beyond was counted on, so it either needs no other way to be
+    told, or jumps by whole turns, which degrees that pass a number of no meaning to them do not.
+
+    Args:
+        sizes: of the values, [N].
+        told: the values, nearest to their mean.
+        back: all but the first, nearest to the one before.
+    """
+    if bool((sizes <= _HALF).all()) or bool((told == values).all()):
+        return True
+    before, after = values[:-1], values[1:]
+    jumps = (after - before).norm(dim=-1) > math.pi
+    whole = (back - before).norm(dim=-1) < _STEP
+    return bool(jumps.any()) and 2 * int((jumps & whole).sum()) > int(jumps.sum())
 
 
 def _axis(quaternions: Tensor) -> Tensor:

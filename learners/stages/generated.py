@@ -31,6 +31,7 @@ def generated_frames(
         and of the chunk that made the frame features float32 [D], pooled, and offset int64, the frame's place
         in it.
     """
+    episodes = episodes[store.length[episodes] > 1]  # nothing follows the first frame of others
     if not len(episodes):
         views = (0, store.spec.views, 3, *store.spec.size)
         none = torch.zeros(0, dtype=torch.int64)

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from envs.conditioning.units import Units
 from envs.episodes.clips import ClipStore
@@ -17,6 +18,23 @@ from pipeline.evaluation.statistics import quantiles
 
 _LAST = 4  # frames at the end of an episode
 _CHUNKS = 10  # of an episode at most, by which speed is measured
+
+
+_told: set[str] = set()  # what this process has said of episodes
+
+
+def followed(store: ClipStore, episodes: Tensor) -> Tensor:
+    """Those of episodes int64 [N] in which something follows the first frame; of the others nothing can be
+    generated or judged, and how many they are is told once in a process.
+    """
+    more = store.length[episodes] > 1
+    if not more.all():
+        names = sorted({str(store.parts[store.episodes[n]["dataset"]].folder) for n in episodes[~more]})
+        said = f"{int((~more).sum())} episodes of a single frame are left out ({', '.join(names)})"
+        if said not in _told:
+            _told.add(said)
+            tqdm.write(said)
+    return episodes[more]
 
 
 def groups(store: ClipStore, episodes: Tensor) -> dict[str, Tensor]:

@@ -26,7 +26,7 @@ class TaskSection:
     chunk: Count
     horizon: Count
     mode: Literal["relative", "absolute"]
-    data: Sequence[str] | str = ()
+    data: Sequence[str] = ()
     variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
@@ -99,7 +99,7 @@ class ExtraStartsSection:
 
     variants: Sequence[Name]
     episodes: Count
-    data: Sequence[str] | str
+    data: Sequence[str]
     share: Annotated[float, Gt(0), Lt(1)]
 
 
@@ -153,7 +153,7 @@ class StateFitSection:
 class FinetuneSection:
     """Section finetune."""
 
-    data: Sequence[str] | str
+    data: Sequence[str]
     weights: str | None
     simulator: Mapping[str, Any]
     state: StateFitSection

@@ -113,12 +113,7 @@ def demonstrations(cfg: Cfg, store: ClipStore) -> Tensor:
     good = [n for n in mine.tolist() if store.episodes[n]["success"] is not False]
     chosen = evenly(cfg, store, torch.tensor(good, dtype=torch.int64), section["demos"])
     if len(chosen) < section["demos"]:
-        sources = sorted({row["source"] for row in store.episodes})
-        raise ConfigError(
-            f"imitation.demos={section['demos']}, but the data hold {len(chosen)} successful episodes of"
-            f" imitation.sources={list(section['sources'])} for learning (sources there: {sources[:8]});"
-            " say \"imitation.sources=['*']\" for all or name others, lower imitation.demos, or collect more"
-        )
+        raise ConfigError(_too_few(section, store, learnable, len(chosen)))
     return chosen
 
 
@@ -131,6 +126,30 @@ def deployed_in(inputs: Inputs, role: str) -> int:
     manifest = read_manifest(inputs.folder(role))
     assert manifest is not None, "a role is played by finished stages"
     return int(manifest["result"]["round"])
+
+
+def _too_few(section: Mapping[str, Any], store: ClipStore, learnable: Tensor, found: int) -> str:
+    """Why so few episodes can be cloned from, and what helps, by what becomes of the others."""
+    allowed, mine = set(learnable.tolist()), set(store.select(list(section["sources"])).tolist())
+    failed = {n for n, row in enumerate(store.episodes) if row["success"] is False}
+    lost, held = len(mine & failed & allowed), len(mine - failed - allowed)
+    rest = allowed - mine - failed
+    others = sorted({store.episodes[n]["source"] for n in rest})
+    why, fixes = [f"{lost} of these sources failed"] if lost else [], []
+    if rest:
+        why.append(f"{len(rest)} successful ones are of other sources, {others[:8]}")
+        fixes.append("say \"imitation.sources=['*']\" for all, or name others")
+    if held:
+        why.append(f"{held} are held out")
+        fixes.append("hold out fewer (splits)")
+    if found:
+        fixes.append(f"lower imitation.demos to {found} at most")
+    fixes.append("record more that succeed" + (", or correct next.success" if lost and not found else ""))
+    return (
+        f"imitation.demos={section['demos']}, but the data hold {found} successful episodes of"
+        f" imitation.sources={list(section['sources'])} for learning"
+        f"{' (' + '; '.join(why) + ')' if why else ''}; {'; or '.join(fixes)}"
+    )
 
 
 def successful_episodes(cfg: Cfg, store: ClipStore, number: int) -> Tensor:

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from actors.factory import build_policy, build_simulator
 from actors.process import prepare_process
@@ -16,6 +17,7 @@ from learners.stages.generated import generated_frames
 from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.perception import train_perception
 from learners.stages.traces import Hands
+from learners.training.parallel import leads
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import (
@@ -40,7 +42,7 @@ def imitation(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return {**cloned(cfg, folder, store, demos), "demos": len(demos)}
 
 
-def cloned(cfg: Cfg, folder: Path, store: ClipStore, episodes: Tensor) -> dict[str, float]:
+def cloned(cfg: Cfg, folder: Path, store: ClipStore, episodes: Tensor) -> dict[str, Any]:
     """Leave a policy from nothing in a stage's folder: its perception learns on all that may be learned from,
     then it clones `episodes`, int64 [N]. Returns what training says of itself.
     """
@@ -57,7 +59,10 @@ def cloned(cfg: Cfg, folder: Path, store: ClipStore, episodes: Tensor) -> dict[s
     # Perception has taken its units from all frames; demonstrations must not change them again.
     stats = train_imitation(Cloning(policy, store, episodes, mode), fit, folder, fresh=not seen)
     save_weights(policy, folder)
-    return _both(stats, seen)
+    constant = list(getattr(policy, "constants", ()))
+    if constant and leads():
+        tqdm.write(f"imitation: the policy holds constant, as demonstrations do: {', '.join(constant)}")
+    return {**_both(stats, seen), "constant": constant}
 
 
 @stage(reads=(*SIMULATOR, "policy", "imitation", "clone"), place=Place.LEARNERS)

@@ -60,7 +60,7 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     outcome = evaluate(world, policy, seeds, stochastic=True, label="gap", sampling_seed=cfg["seed"])
     write_film(folder / "media/imagined.mp4", side_by_side(world.base_env.video(0).numpy()), store.fps)
     tasks, judge = tasks_of_episodes(cfg, store, mine), world.transform[-1].judge
-    held = store.split("held_out")
+    held = measurement.followed(store, store.split("held_out"))
     sides = (truth, outcome.success, outcome.counted, torch.isin(mine, held))
     result = {"round": number, **_gap(*sides), "tasks": by_task(tasks, _gap, *sides)}
     held = held[torch.isin(held, store.select(["policy-*"]))]
@@ -193,7 +193,8 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     bf16 = cfg["simulator"]["bf16"]
     result: dict[str, Any] = {"rollout": {}, "judge": {}}
     rows: list[dict[str, Any]] = []
-    for name, episodes in measurement.groups(store, store.split("held_out")).items():
+    held = measurement.followed(store, store.split("held_out"))
+    for name, episodes in measurement.groups(store, held).items():
         made = replay(simulator, store, episodes, decoder, bf16=bf16)
         result["rollout"][name] = measurement.rollout_error(store, episodes, made)
         views = judge_both(judge, simulator, store, episodes, made, bf16)

@@ -28,6 +28,7 @@ from envs.simulators.replay import replay
 from pipeline.evaluation.by_task import evenly
 from pipeline.evaluation.disagreement import compared, curves, worst
 from pipeline.evaluation.judging import judge_both
+from pipeline.evaluation.measurement import followed
 from pipeline.evaluation.media import REST, paired_frames
 from pipeline.evaluation.report import VIDEOS, build_report
 from pipeline.evaluation.result import build_result
@@ -135,8 +136,9 @@ def replays(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     prepare_process(cfg["seed"], cfg["threads"])
     studio, store = Studio.of(cfg, folder, inputs), open_store(cfg, inputs)
-    held = store.split("held_out")
-    label, episodes = ("held-out", held) if len(held) else ("learned-from", torch.arange(len(store)))
+    held = followed(store, store.split("held_out"))
+    every = followed(store, torch.arange(len(store)))
+    label, episodes = ("held-out", held) if len(held) else ("learned-from", every)
     made = list(studio.worst(inputs, store))
     made += studio.paired(store, evenly(cfg, store, episodes, cfg["measure"]["videos"]), label)
     return studio.keep(made)

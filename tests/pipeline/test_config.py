@@ -98,6 +98,19 @@ def test_mistakes_name_the_key(words: list[str], match: str) -> None:
 NEEDED = {"task=lerobot": ["task.data=[recordings]"], "judge=golden_goal_action": ["simulator=tokens"]}
 
 
+def test_one_folder_of_data_needs_no_brackets() -> None:
+    for key in ("task.data", "extra_starts.data", "finetune.data", "imagined.data"):
+        section = key.partition(".")[0]
+        for value, wanted in {"/my/data": ["/my/data"], "[a,b]": ["a", "b"], "[]": [], "": []}.items():
+            words = ["task=lerobot", "task.data=[x]", f"{key}={value}"]
+            assert read_config(words)[section]["data"] == wanted
+    assert load_config(["task=lerobot", "task.data=my_data"])["task"]["data"] == ["my_data"]
+    with pytest.raises(ConfigError, match=r"^task has neither a suite .* nor data"):
+        load_config(["task=lerobot", "task.data="])
+    cfg = read_config(["task=lerobot", "task.data=[x]"])
+    assert any("task.data" in fault for fault in faults({**cfg, "task": {**cfg["task"], "data": "x"}}))
+
+
 def test_options_of_a_choice_count_with_that_choice_alone() -> None:
     mine = ["+if_chosen.judge={proxy: {width: 4}, learned: {points: 7}}"]
     mine += ["+if_chosen.task={push: {suite: {hold: 0.2}}}"]

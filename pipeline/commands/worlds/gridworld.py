@@ -11,6 +11,7 @@ from actors.factory import build_simulator
 from envs.files import write_text
 from envs.simulators.replay import replay
 from envs.targets import TARGET
+from pipeline.evaluation.measurement import followed
 from pipeline.evaluation.squares import square_errors
 from pipeline.graph.graph import Graph
 from pipeline.stages import collect, world
@@ -67,7 +68,7 @@ def _measured(cfg: Mapping[str, Any], root: Path, tracker: Tracker | None) -> di
     manifests = graph.run(tracker=tracker)
     inputs = graph.inputs(name)
     store = open_store(cfg, inputs)
-    held = store.split("held_out")
+    held = followed(store, store.split("held_out"))
     simulator = build_simulator(cfg, graph.folder(name) / "weights.safetensors")
     made = replay(simulator, store, held, bf16=cfg["simulator"]["bf16"])
     steps = tuple(step for step in STEPS if step <= made.valid.shape[1])

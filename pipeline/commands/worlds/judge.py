@@ -18,6 +18,7 @@ from envs.judges.base import Judge
 from envs.judges.vlm import VLMJudge
 from envs.targets import ConfigError, target
 from pipeline.evaluation.judging import cost_text, facts_text, labelled
+from pipeline.evaluation.measurement import followed
 from pipeline.evaluation.rewards.shown import ALL, check_frames, shown_table
 from pipeline.loop import build_loop, has_physics, last_round
 from pipeline.stages.given import datasets, learns
@@ -73,7 +74,7 @@ def judge_study(cfg: Mapping[str, Any], root: Path, selection: Selection) -> str
     """
     store = open_clips(cfg, _folders(cfg, root, selection))
     chosen = torch.arange(len(store)) if selection.split == "all" else store.split(selection.split)
-    episodes = labelled(store, chosen)
+    episodes = labelled(store, followed(store, chosen))
     if not len(episodes):
         raise ConfigError(
             f"no episode of split={selection.split} says whether it succeeded; say split=all, or other data"

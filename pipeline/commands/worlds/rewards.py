@@ -26,6 +26,7 @@ from envs.simulators.base import Simulator
 from envs.simulators.replay import Replay, replay
 from envs.targets import ConfigError
 from pipeline.evaluation.judging import Scores, judge_both, labelled
+from pipeline.evaluation.measurement import followed
 from pipeline.evaluation.rewards.figures import BY_PHYSICS, Truth, by_rule, chosen, curve, figures, truth_of
 from pipeline.evaluation.rewards.page import build_page, table_text
 from pipeline.graph.graph import Graph
@@ -133,7 +134,7 @@ def _seen(cfg: Cfg, base: Graph, plan: Plan) -> Domain:
         ConfigError: if these do not say what the rewards are compared with.
     """
     store = open_store(cfg, base.inputs(JUDGE))
-    held = labelled(store, store.split("held_out"))
+    held = labelled(store, followed(store, store.split("held_out")))
     if not len(held):
         raise ConfigError("no held-out episode of the data says whether it succeeded (next.success)")
     spread = torch.linspace(0, len(held) - 1, min(plan.episodes, len(held))).round().long()

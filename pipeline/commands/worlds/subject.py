@@ -17,6 +17,7 @@ from envs.manifest import mark_of, read_manifest
 from envs.simulators.base import Simulator
 from envs.simulators.state_experts.base import StateDecoder
 from envs.targets import ConfigError
+from pipeline.evaluation.measurement import followed
 from pipeline.graph.code_version import code_of
 from pipeline.graph.graph import Graph
 from pipeline.loop import build_loop, has_physics
@@ -90,7 +91,7 @@ class Subject:
         return open_clips(self.cfg, self.data)
 
     def held_out(self, store: ClipStore) -> Tensor:
-        """Numbers int64 [N] of the episodes that no part of the world has learned from.
+        """Numbers int64 [N] of the episodes of 2 frames or more that no part of the world has learned from.
 
         Raises:
             ConfigError: if there are none.
@@ -102,6 +103,8 @@ class Subject:
                 " imagined.data=[folder], or say in meta/info.json of these which are, as in"
                 ' "splits": {"train": "0:4", "held_out": "4:5"}'
             )
+        if not len(held := followed(store, held)):
+            raise ConfigError("no held-out episode has 2 frames or more; name others by imagined.data")
         return held
 
     def simulator(self, cfg: Cfg | None = None) -> Simulator:

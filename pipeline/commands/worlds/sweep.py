@@ -81,13 +81,11 @@ def usual_travel(store: ClipStore, cfg: Mapping[str, Any]) -> Tensor:
 
 def commanded(spec: WorldSpec, start: Tensor, travel: Tensor, steps: int) -> Tensor:
     """Commands float32 [B, steps, A] by which numbers go from where they are, `start` [B, A], by `travel`
-    [B, A] in a straight line. Of a robot that acts by changes only grippers do; the other numbers are that
-    change again and again.
+    [B, A] in a straight line. Changes and velocities (Embodiment.changes) are that one again and again.
     """
     robot = spec.embodiment
     share = (torch.arange(1, steps + 1) / steps)[:, None].repeat(1, robot.action_dim)
-    if robot.delta:
-        share[:, [k for k in range(robot.action_dim) if k not in robot.grippers]] = 1.0
+    share[:, list(robot.changes)] = 1.0
     return at_rest(start, robot)[:, None] + share * travel[:, None]
 
 

@@ -23,6 +23,7 @@ from learners.stages.generated import generated_frames, recorded_features
 from learners.stages.judge import calibrate, judge_recordings, train_judge
 from learners.stages.text_world import calibrate_ending, train_text_world
 from pipeline.evaluation.judging import episode_success, labelled
+from pipeline.evaluation.measurement import followed
 from pipeline.evaluation.rewards.figures import auc
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
@@ -151,7 +152,7 @@ def _calibrate(cfg: Cfg, model: Judge, store: ClipStore, world: Simulator, bf16:
     """
     if not model.calibrates:
         return {}
-    unseen = labelled(store, store.split("calibration"))
+    unseen = labelled(store, followed(store, store.split("calibration")))
     if not len(unseen):
         return {}
     features = features_of_episodes(world, store, unseen, bf16) if model.reads_features else None
@@ -167,12 +168,15 @@ def _calibrate(cfg: Cfg, model: Judge, store: ClipStore, world: Simulator, bf16:
         if blank == len(unseen):  # nor would it on generated ones, which RL would drop one after the other
             raise ConfigError(why)
         tqdm.write(why)
-    if not calibrate(model, score, succeeded):
-        tqdm.write(
-            f"judge: {int(succeeded.sum())} of {len(succeeded)} calibration episodes succeeded, and its"
-            f" scores do not tell which; threshold left at {float(model.threshold):.3f}"
-        )
     won, sure = succeeded[judged], model.confidence(score[judged].double())
+    if not calibrate(model, score, succeeded):
+        why = "its scores do not tell which"
+        if won.all() or not won.any():
+            why = f"one that {'failed' if won.all() else 'succeeded'} is needed beside them; record some"
+        tqdm.write(
+            f"judge: {int(won.sum())} of {len(won)} calibration episodes succeeded, and {why}; threshold"
+            f" left at {float(model.threshold):.3f}"
+        )
     if won.all() or not won.any():
         return {}
     return {

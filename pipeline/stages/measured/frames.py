@@ -9,7 +9,7 @@ from actors.factory import build_judge
 from actors.process import prepare_process
 from envs.targets import ConfigError
 from pipeline.evaluation.judging import labelled
-from pipeline.evaluation.measurement import evenly
+from pipeline.evaluation.measurement import evenly, followed
 from pipeline.evaluation.rewards.shown import shown_table
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import ROBOT, Cfg, open_store
@@ -25,7 +25,7 @@ def shown_frames(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     prepare_process(cfg["seed"], cfg["threads"])
     store, judge = open_store(cfg, inputs), build_judge(cfg, inputs.weights("judge")).eval()
-    episodes = labelled(store, store.split("held_out"))
+    episodes = labelled(store, followed(store, store.split("held_out")))
     if not len(episodes):
         raise ConfigError("no held-out episode of the data says whether it succeeded (next.success)")
     episodes = evenly(episodes, inputs.settings["episodes"])

@@ -8,7 +8,7 @@ from typing import Any
 from actors.factory import build_simulator
 from actors.process import prepare_process
 from pipeline.evaluation.fidelity.open_loop import OpenLoop
-from pipeline.evaluation.measurement import evenly
+from pipeline.evaluation.measurement import evenly, followed
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import TASK, Cfg, open_store
 
@@ -20,8 +20,7 @@ def video_errors(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     prepare_process(cfg["seed"], cfg["threads"])
     store = open_store(cfg, inputs)
-    held = store.split("held_out")
-    episodes = evenly(held[store.length[held] > 1], cfg["fidelity"]["episodes"])
+    episodes = evenly(followed(store, store.split("held_out")), cfg["fidelity"]["episodes"])
     loop = OpenLoop(store, episodes, cfg["simulator"]["bf16"])
     simulator = build_simulator(cfg, inputs.weights("simulator")).eval()
     found = loop.measure(simulator).result(store.spec.embodiment.views, {})

@@ -6,6 +6,7 @@ import asyncio
 import base64
 import io
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,10 @@ def test_keys_move_what_their_names_say() -> None:
     pushed = deltas.action(start, {0: 1.0, 3: 1.0})
     assert pushed.tolist() == pytest.approx([1, 0, 0, -1 + 4 / 12.5])
     assert deltas.action(pushed, {}).tolist() == pytest.approx([0, 0, 0, -1 + 4 / 12.5])
+    base = Controls(replace(BIMANUAL_JOINTS, action_names=("x.vel", *BIMANUAL_JOINTS.action_names[1:])))
+    assert base.start(np.full(16, 0.3)).tolist() == [0.0, *[0.3] * 15]
+    driven = base.action(np.full(16, 0.3), {0: 1.0})
+    assert driven[0] == 1.0 and base.action(driven, {}).tolist() == [0.0, *[0.3] * 15]
 
 
 def test_a_person_the_expert_and_a_recording_drive_physics() -> None:

@@ -12,6 +12,7 @@ from actors.policies.chunk_gaussian import ChunkGaussian, ChunkGaussianHead, kno
 from actors.policies.chunk_tokens import ChunkTokenHead, ChunkTokens
 from actors.policies.heads import varying
 from envs.embodiment import ActionKind
+from envs.specs import ActionMode, to_chunk
 from tests.embodiments import ARM_JOINTS, BIMANUAL_POSES
 
 
@@ -107,6 +108,39 @@ def test_what_hardly_varies_is_told_by_the_spread_of_its_unit() -> None:
     assert varying(chunks, ARM_JOINTS).tolist() == [True, True, False, True, True, True, True]
     unknown = replace(ARM_JOINTS, action_kind=ActionKind.OTHER)
     assert bool(varying(chunks, unknown).all())
+
+
+def demonstrated(mode: ActionMode, delta: bool) -> torch.Tensor:
+    """Chunks [N, 4, 7] of ARM_JOINTS that wander by degrees; joint 0 is a rail in metres, joint 1 stands
+    still up to noise, the gripper opens and closes between 0 and 1, and all rest at the end.
+    """
+    g = torch.Generator().manual_seed(1)
+    chunks = []
+    for _ in range(20):
+        path = torch.randn(44, 7, generator=g).cumsum(0) * torch.tensor([0.01, 0.0, 5, 5, 5, 5, 0.0])
+        path[:, 1] = 90 + 0.02 * torch.randn(44, generator=g)
+        path[:, 6] = ((torch.arange(44) + torch.randint(20, (), generator=g)) // 10 % 2).float()
+        path[38:] = path[38]
+        last = path[:-1]
+        if delta:
+            path = torch.cat((path[1:, :6] - path[:-1, :6], path[1:, 6:]), 1)
+            last = path
+        ahead = path[torch.arange(1, 40)[:, None] + torch.arange(4)]
+        chunks.append(to_chunk(ahead, last[:39], mode))
+    return torch.cat(chunks)
+
+
+@pytest.mark.parametrize(
+    ("mode", "delta"),
+    [(ActionMode.ABSOLUTE, False), (ActionMode.RELATIVE, False), (ActionMode.ABSOLUTE, True)],
+)
+def test_what_moves_is_not_held_for_its_unit(mode: ActionMode, delta: bool) -> None:
+    chunks = demonstrated(mode, delta)
+    robot = replace(ARM_JOINTS, delta=delta)  # whose gripper is said to go from 0 to 100
+    before = chunks.clone()
+    for given in (chunks, before.double()):
+        assert varying(given, robot).tolist() == [True, False, True, True, True, True, True]
+        assert torch.equal(given, before.to(given))  # nothing is changed in them
 
 
 def test_where_modes_are_taken_too_the_spread_does_not_learn() -> None:

@@ -238,6 +238,7 @@ def test_imitates_a_few_chunks_after_taking_units_from_them(name: str) -> None:
     chunks = 20.0 + rise * 3 * torch.randn(6, 1, spec.action_dim)
     chunks[..., 1] = 5.0  # a joint that never moves
     policy.normalise(chunks, seen[STATE], seen[COMMAND])
+    assert getattr(policy, "constants", ["joint1.pos"]) == ["joint1.pos"]
     optimiser = torch.optim.Adam(policy.parameters(), 3e-3)
     losses = []
     for _ in range(60):

@@ -51,6 +51,28 @@ def test_degrees_and_numbers_that_are_no_angles_are_taken_as_they_are() -> None:
     assert torch.allclose(units(torch.tensor([358.0, 100.0])), torch.tensor([2.0, 0.0]), atol=1e-6)
 
 
+@pytest.mark.parametrize("start", [-5.0, -3.6, -1.0])
+def test_a_few_degrees_are_no_radians(start: float) -> None:
+    sweep = torch.linspace(start, 5, 40)
+    for episodes in ((sweep, sweep.flip(0)), (sweep, sweep), (-sweep, sweep, sweep)):
+        told = torch.cat(episodes)[:, None]
+        units = Units(1, [[0]])
+        units.normalise(told)
+        assert torch.allclose(units.values(units(told)), told, atol=1e-4)
+        vector = Units(3, [[0, 1, 2]])
+        vectors = told * torch.tensor([0.6, 0.0, 0.8])
+        vector.normalise(vectors)
+        assert torch.allclose(vector.values(vector(vectors)), vectors, atol=1e-4)
+
+
+def test_angles_that_were_counted_on_beyond_pi_are_radians() -> None:
+    swing = 3.1 + 0.7 * torch.linspace(0, 2 * math.pi, 40).sin()
+    for episodes in ((swing, swing), (swing, swing - 2 * math.pi, swing), (swing.remainder(2 * math.pi),)):
+        units = Units(1, [[0]])
+        units.normalise(torch.cat(episodes)[:, None])
+        assert torch.allclose(units(wrapped(swing)[:, None]), units(swing[:, None]), atol=1e-4)
+
+
 def turned_clips(frames: int) -> tuple[TensorDict, TensorDict]:
     """Clips that remember so many frames, whose angles lie around pi, counted on, and the same as a robot
     tells them.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,14 +13,14 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from actors.policies.contract import inputs_for
-from envs.embodiment import Embodiment
+from envs.embodiment import Arm, Embodiment
 from envs.episodes.clips import ClipStore
 from envs.specs import C2W, CHUNK, IMAGE, INSTRUCTION_UTF8, ActionMode, bytes_to_text
 from learners.stages.generated import generated_frames
 from learners.stages.imitation import Cloning, chunks_ahead, train_imitation
 from learners.stages.observed import observe
 from learners.training.fit import FitConfig
-from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, EMBODIMENTS
+from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_POSES, EMBODIMENTS
 from tests.learners.models import POLICIES, policy_of, simulator_of
 from tests.moving_square import INSTRUCTION
 
@@ -66,6 +67,19 @@ def test_past_the_end_of_a_robot_that_takes_changes_only_grippers_go_on(tiny_sto
     row = torch.tensor([int(store.length[0]) - 2])
     chunk = chunks_ahead(store, row, ActionMode.ABSOLUTE)[0]
     assert chunk[0].tolist() == [1.0] * 4 and chunk[1:].tolist() == [[0.0, 0.0, 0.0, 1.0]] * (len(chunk) - 1)
+
+
+def test_a_base_does_not_drive_on_past_the_end(tiny_store: Stores) -> None:
+    names = (*ARM_JOINTS.action_names[:4], "x.vel", "theta.vel", "gripper.pos")
+    robot = replace(ARM_JOINTS, action_names=names, arms=(Arm("arm", (0, 1, 2, 3), 6, (100.0, 0.0)),))
+    robot = replace(robot, cameras=tuple(replace(camera, wrist=None) for camera in robot.cameras))
+    store = tiny_store(robot)
+    store.arrays["commands"] = torch.ones_like(store.arrays["commands"])
+    row = torch.tensor([int(store.length[0]) - 2])
+    chunk = chunks_ahead(store, row, ActionMode.ABSOLUTE)[0]
+    assert chunk[0].tolist() == [1.0] * 7
+    assert chunk[1:].tolist() == [[1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 1.0]] * (len(chunk) - 1)
+    assert robot.changes == (4, 5) and not ARM_JOINTS.changes and ARM_DELTAS.changes == (0, 1, 2)
 
 
 def test_what_is_observed(tiny_store: Stores) -> None:

@@ -10,6 +10,7 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -20,6 +21,7 @@ from envs.episodes.splits import write_splits
 from envs.manifest import DamagedArtefact, write_manifest
 from envs.physics.suite import Observation
 from envs.rng import Purpose, episode_seeds
+from envs.targets import ConfigError
 from learners.training.fit import TrainingDiverged, fit
 from pipeline.config import load_config
 from pipeline.evaluation.by_task import evenly, tasks_of_episodes, tasks_of_seeds, tasks_told
@@ -186,6 +188,36 @@ def test_recordings_that_stand_task_by_task_are_shared_out_evenly(tmp_path: Path
     suite = {"_target_": "tests.envs.physics.sections.Counting", "fault": "", "tasks": ["do b", "do a"]}
     physics = {**cfg, "task": {**cfg["task"], "suite": suite, "name": "do b"}}
     assert tasks_of_episodes(physics, store, everything) == [f"do {word}" for word in "aaaaaaaabbbbc"]
+
+
+@pytest.mark.parametrize(
+    ("succeed", "told"),
+    [
+        (
+            set(),
+            "0 successful episodes of imitation.sources=['expert'] for learning (3 of these sources failed);"
+            " record more that succeed, or correct next.success",
+        ),
+        (
+            {0, 1, 3, 6},
+            "1 successful episodes of imitation.sources=['expert'] for learning (2 of these sources failed; 2"
+            " successful ones are of other sources, ['random']; 1 are held out); say"
+            " \"imitation.sources=['*']\" for all, or name others; or hold out fewer (splits); or lower"
+            " imitation.demos to 1 at most; or record more that succeed",
+        ),
+    ],
+)
+def test_too_few_demonstrations_are_told_with_what_helps(
+    succeed: set[int], told: str, tmp_path: Path
+) -> None:
+    made = [moving_square(ARM_DELTAS, seed, "random" if seed % 2 else "expert") for seed in range(8)]
+    made = [replace(one, success=np.full(len(one), seed in succeed)) for seed, one in enumerate(made)]
+    LeRobotWriter(tmp_path / "set", made[0].embodiment).write(made)
+    write_splits(tmp_path / "set", {"train": 5, "held_out": 2, "calibration": 1})
+    words = ("task=lerobot", f"task.data=[{tmp_path / 'set'}]", "task.size=[32,32]", "imitation.demos=4")
+    cfg = load_config(["experiment=smoke", *words, "imitation.sources=[expert]"])
+    with pytest.raises(ConfigError, match=f"^{re.escape(f'imitation.demos=4, but the data hold {told}')}$"):
+        demonstrations(cfg, open_clips(cfg, cfg["task"]["data"]))
 
 
 class Wordy(Counting):

@@ -57,3 +57,24 @@ def test_a_judge_that_cannot_tell_success_on_recorded_video_is_an_alarm(told: bo
     assert made["calibration_successes"] == made["calibration_failures"] == 8
     assert (made["auc"] >= 0.8) == told, made["auc"]
     assert ("hardly tells success from failure" in made.get("alarm", "")) == (not told)
+
+
+@pytest.mark.parametrize(("success", "missing"), [(True, "failed"), (False, "succeeded")])
+def test_calibration_on_one_outcome_asks_for_the_other(
+    success: bool, missing: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, settings = tmp_path / "data", {"phase": "first"}
+    some = [moving_square(ARM_DELTAS, seed) for seed in range(8)]
+    said = [replace(one, success=np.full(len(one), success or seed < 2)) for seed, one in enumerate(some)]
+    LeRobotWriter(data, ARM_DELTAS.at(SIZE)).write(said)
+    write_splits(data, {"train": 4, "calibration": 4})
+    words = ("judge=learned", "task=lerobot", f"task.data=[{data}]", "task.size=[32,32]", "launch.device=cpu")
+    fit = ("judge_fit.first.imagined=0", "judge_fit.first.fit.steps=2")
+    cfg = load_config(["experiment=smoke", *words, *fit, "task.chunk=4", "task.horizon=8"])
+    (tmp_path / DATASETS).write_text(json.dumps([str(data)]))
+    judging.judge.run(
+        judging.judge.view("judge-1", cfg, settings), tmp_path, Inputs({"data": tmp_path}, settings)
+    )
+    (told,) = [line for line in capsys.readouterr().out.splitlines() if "calibration episodes" in line]
+    assert f"{4 * success} of 4 calibration episodes succeeded, and one that {missing} is needed" in told
+    assert "do not tell which" not in told

@@ -106,6 +106,18 @@ def test_of_episodes_of_one_frame_nothing_can_be_measured(tmp_path: Path) -> Non
         fidelity(load_config(words), tmp_path / "run")
 
 
+def test_a_long_rollout_of_a_single_frame_is_none(tmp_path: Path) -> None:
+    made = [moving_square(ARM_DELTAS, seed, length=1 if seed == 2 else 6) for seed in range(3)]
+    LeRobotWriter(tmp_path / "set", ARM_DELTAS.at(SIZE)).write(made)
+    write_splits(tmp_path / "set", {"train": 1, "held_out": 2, "calibration": 0})
+    words = ["experiment=smoke", "track=disabled", "task=lerobot", f"task.data=[{tmp_path / 'set'}]"]
+    words += ["task.size=[32,32]", "task.chunk=4", "task.horizon=8", "fidelity.long.frames=5"]
+    words += untrained_world(load_config(words), tmp_path)
+    fidelity(load_config(words), tmp_path / "run")
+    result = json.loads(written(tmp_path / "run", "fidelity.json").read_text())
+    assert result["episodes"] == result["long"]["episodes"] == 1
+
+
 def test_a_judge_that_learns_nothing_is_asked_and_one_that_has_not_learned_is_not(
     tmp_path: Path, tiny_data: Callable[[Embodiment], Path]
 ) -> None:
