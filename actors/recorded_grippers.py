@@ -17,7 +17,6 @@ from envs.conditioning.units import RESOLUTION
 from envs.embodiment import Embodiment
 from envs.episodes.episode import EpisodeError
 from envs.episodes.formats.lerobot_files import column_array, open_parquet
-from envs.episodes.formats.lerobot_info import INFO_KEY
 
 log = logging.getLogger(__name__)
 _BEYOND = 0.5  # of a range, by which recorded values that are of it may leave it
@@ -26,14 +25,13 @@ _warned: set[tuple[str, str]] = set()  # data sets and grippers that this proces
 
 
 def with_recorded_grippers(robot: Embodiment, folders: Sequence[Path]) -> Embodiment:
-    """The robot of LeRobot data sets; if the first does not say its arms itself, which names then tell, its
-    grippers' ranges by what is recorded.
+    """The robot of LeRobot data sets, whose arms names tell, its grippers' ranges by what is recorded.
 
     Recorded actions that lie far outside of a guessed range, or hardly fill it, are of another unit: the
     range then goes from the least to the greatest of them, open at the side at which the guess is. Tells so
     once in a process. Actions that cannot be read, or in which a gripper never moves, change nothing.
     """
-    if not robot.grippers or _says_arms(folders[0]):
+    if not robot.grippers:
         return robot
     bounds = [one for folder in folders if (one := _bounds(folder, robot.action_dim)) is not None]
     if not bounds:
@@ -50,11 +48,6 @@ def with_recorded_grippers(robot: Embodiment, folders: Sequence[Path]) -> Embodi
                 arm = replace(arm, gripper_range=recorded)
         arms.append(arm)
     return replace(robot, arms=tuple(arms))
-
-
-def _says_arms(folder: Path) -> bool:
-    about = json.loads((folder / "meta/info.json").read_text())["features"]["action"].get("info") or {}
-    return "arms" in about.get(INFO_KEY, {})
 
 
 def _goes_with(guess: tuple[float, float], least: float, most: float) -> bool:

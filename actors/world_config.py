@@ -39,7 +39,7 @@ def embodiment_of(cfg: Mapping[str, Any]) -> Embodiment:
             " suite, or name LeRobot data sets by task.data=[folder]"
         )
     robots = [(str(folder), *_recorded_robot(Path(folder))) for folder in task["data"]]
-    first, robot, _ = robots[0]
+    first, robot, stated = robots[0]
     for folder, other, _ in robots[1:]:
         if difference := robot.differs(other):
             raise ConfigError(f"task.data: {first} and {folder} are of different robots: {difference}")
@@ -51,7 +51,7 @@ def embodiment_of(cfg: Mapping[str, Any]) -> Embodiment:
                 f"task.data: {said[0][0]} and {folder} are of different robots: arms are {said[0][1]}, but"
                 f" {arms}; correct features.action.info.worldloop.arms in one of their meta/info.json"
             )
-    return with_recorded_grippers(robot, [Path(folder) for folder in task["data"]])
+    return robot if stated else with_recorded_grippers(robot, [Path(folder) for folder, *_ in robots])
 
 
 def _suite(section: Mapping[str, Any]) -> tuple[Embodiment, tuple[str, ...]]:
