@@ -15,7 +15,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from envs.targets import ConfigError, nearest
+from envs.targets import ConfigError, nearest, target
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 IF_CHOSEN = "if_chosen"  # options by group and choice, which count where that is what was chosen
@@ -34,9 +34,21 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
     cfg = read_config(overrides)
     from pipeline.checks import faults  # needs torch, which an unknown key should not wait for
 
+    cfg = _decided(cfg)
     if wrong := faults(cfg):
         raise ConfigError("\n".join(wrong))
     return cfg
+
+
+def _decided(cfg: dict[str, Any]) -> dict[str, Any]:
+    """The config with rl.freeze_perception=auto as the policy's class allows."""
+    rl = cfg.get("rl")
+    if not isinstance(rl, Mapping) or rl.get("freeze_perception") != "auto":
+        return cfg
+    able = False
+    with suppress(ConfigError, AttributeError):  # of what is no section, or not there, `faults` tells
+        able = hasattr(target(cfg["policy"], "policy"), "freeze_perception")
+    return {**cfg, "rl": {**rl, "freeze_perception": able}}
 
 
 def read_config(overrides: Sequence[str]) -> dict[str, Any]:

@@ -75,11 +75,14 @@ class Judge(nn.Module):
         discount: per frame, of the progress that `loss` is given: discount ** (frames until success).
         calibrates: whether the threshold is to be set on recorded video (learners/stages/judge.py).
 
+        rehearsed: whether one may be built before any work, to see that it can; not where that is dear.
+
     Raises:
         ValueError: if hold is less than one frame.
     """
 
     threshold: Tensor
+    rehearsed = True
     needs_labels = False
     reads_features = False
     asks_world = False
