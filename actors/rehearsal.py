@@ -128,7 +128,7 @@ def _lacking(policy: Any, who: str) -> Iterator[str]:
             f"{who} has no {' and no '.join(missing)}: lists of the keys of envs/specs.py that it reads and"
             " writes, such as [STATE] and [CHUNK]; see docs/own_policy.md"
         )
-    elif CHUNK not in policy.out_keys:
+    elif CHUNK not in getattr(policy, "out_keys", ()):
         yield f"{who} does not write {CHUNK}; add it to its out_keys"
 
 
