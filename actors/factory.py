@@ -34,6 +34,7 @@ from envs.targets import ConfigError, build, target, to_plain
 from envs.transforms import world_transforms
 from envs.world import WorldEnv
 
+_ALGORITHM = {"bootstraps": False, "supports_delayed_reward": False, "group_size": 1}
 _shapes: dict[str, tuple[int, ...]] = {}  # of the features of simulators that judges asked for
 
 
@@ -156,8 +157,14 @@ def _suite_of(cfg: Mapping[str, Any], changes: Mapping[str, Any] | None) -> dict
 
 
 def build_algorithm(cfg: Mapping[str, Any], policy: TensorDictModuleBase) -> Any:
-    """The algorithm of the algorithm section (learners.rl.algorithm.Algorithm) around a policy."""
-    return build(cfg["algorithm"], "algorithm", policy=policy, spec=world_spec(cfg))
+    """The algorithm of the algorithm section (learners.rl.algorithm.Algorithm) around a policy; attributes
+    that it does not say are those of one without a critic, steps or groups of its own.
+    """
+    made = build(cfg["algorithm"], "algorithm", policy=policy, spec=world_spec(cfg))
+    for name, value in {"name": type(made).__name__, **_ALGORITHM}.items():
+        if not hasattr(made, name):
+            setattr(made, name, value)
+    return made
 
 
 def build_world(

@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from actors.recorded_grippers import with_recorded_grippers
+from actors.rehearsal import judge_faults, policy_faults, refusals
+from envs.chunked import check_mode
 from envs.conditioning import PoseMapStyle
 from envs.embodiment import Embodiment, EmbodimentError, Robot
 from envs.episodes.formats.lerobot_info import arms_are_said
@@ -19,7 +19,7 @@ from envs.geometry.kinematics import Kinematics, KinematicsError
 from envs.physics.suite import SuiteError, build_suite, check_task, task_names
 from envs.simulators.base import WORLD_OPTIONS
 from envs.specs import Rewards, WorldSpec
-from envs.targets import TARGET, ConfigError, build, options, target, to_plain
+from envs.targets import TARGET, ConfigError, options, target, to_plain
 
 _suites: dict[str, tuple[Embodiment, tuple[str, ...]]] = {}  # robot and tasks of each section
 
@@ -67,8 +67,8 @@ def _suite(section: Mapping[str, Any]) -> tuple[Embodiment, tuple[str, ...]]:
 
 
 def check_world(cfg: Mapping[str, Any]) -> None:
-    """See that robot, tasks, variants and judge are there as the config names them, and that simulator and
-    text world can be built so, which reading the config cannot tell.
+    """See that robot, tasks and variants are there as the config names them, and that simulator, policy,
+    algorithm, judge and text world can be built so, which reading the config cannot tell.
 
     Raises:
         ConfigError: with a line for each thing that is wrong.
@@ -97,21 +97,24 @@ def check_world(cfg: Mapping[str, Any]) -> None:
                 robot.views_of(section["cameras"])
             except ValueError as error:
                 wrong.append(f"{key}{error}")
-    try:
-        judge: Any = target(cfg["judge"], "judge")
-        judge.check(cfg["judge"])
-    except ConfigError as error:
-        wrong.append(str(error))
-    else:
-        if "text_world" in cfg["judge"]:
-            wrong += _refusals(cfg["judge"]["text_world"], "judge.text_world", spec)
+    simulator = None
     if not cfg["finetune"]["data"]:  # else it is the robot of those data that counts
         own = {name: value for name, value in cfg["simulator"].items() if name not in WORLD_OPTIONS}
-        wrong += _refusals(own, "simulator", spec)
+        simulator, refused = refusals(own, "simulator", spec=spec)
+        wrong += refused
         try:
             check_state_expert(cfg)
         except ConfigError as error:
             wrong.append(str(error))
+        try:
+            check_mode(robot, cfg["task"]["mode"])
+        except ValueError as error:
+            wrong.append(str(error))
+        wrong += policy_faults(cfg, spec)
+    if refused := judge_faults(cfg, spec, simulator):
+        wrong += refused
+    elif "text_world" in cfg["judge"]:
+        wrong += refusals(cfg["judge"]["text_world"], "judge.text_world", spec=spec)[1]
     if wrong:
         raise ConfigError("\n".join(wrong))
 
@@ -138,30 +141,6 @@ def _variant_faults(task: Mapping[str, Any], robot: Embodiment, tasks: tuple[str
                 f"task.variants.{name} has another robot than task.suite, so what learned the task cannot act"
                 f" in it: {odd}; leave out of it what changes actions or cameras"
             )
-
-
-def _refusals(section: Mapping[str, Any], key: str, spec: WorldSpec) -> list[str]:
-    """What a class says against its options, [] for nothing: it is built once without memory (torch's meta
-    device), in hundredths of a second whatever its size.
-
-    Only a ValueError counts, which is how options are refused, and none that goes back to a RuntimeError or
-    TypeError: so torch answers where a class asks for the values of tensors that have no memory. Whatever
-    cannot be built without is left to its first stage, and so is a checkpoint, which would be read for this
-    alone.
-    """
-    if section.get("checkpoint"):
-        return []
-    try:
-        with torch.device("meta"):
-            build(section, key, spec=spec)
-    except ValueError as error:
-        reason: BaseException | None = error
-        while reason is not None and not isinstance(reason, (RuntimeError, TypeError)):
-            reason = reason.__cause__ or reason.__context__
-        return [str(error)] if reason is None else []
-    except Exception:  # somebody else's class may raise anything
-        return []
-    return []
 
 
 def check_state_expert(cfg: Mapping[str, Any]) -> None:

@@ -14,6 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from envs.embodiment import Embodiment
 from envs.rng import episode_stream
 from envs.specs import (
     EPISODE,
@@ -24,6 +25,19 @@ from envs.specs import (
     text_to_bytes,
     warn_of_cut,
 )
+
+
+def check_mode(robot: Embodiment, mode: ActionMode | str) -> None:
+    """See that a robot's chunks can be meant so.
+
+    Raises:
+        ValueError: if deltas are to be relative.
+    """
+    if robot.delta and ActionMode(mode) is ActionMode.RELATIVE:
+        raise ValueError(
+            f"task.mode=relative needs absolute actions, and those of {robot.robot} are deltas;"
+            " set task.mode=absolute"
+        )
 
 
 class ChunkedEnv(EnvBase):
@@ -59,11 +73,7 @@ class ChunkedEnv(EnvBase):
         mode = ActionMode(mode)
         if horizon % spec.chunk:
             raise ValueError(f"task.horizon={horizon} must be a multiple of task.chunk={spec.chunk}")
-        if spec.embodiment.delta and mode is ActionMode.RELATIVE:
-            raise ValueError(
-                f"task.mode=relative needs absolute actions, and those of {spec.embodiment.robot} are deltas;"
-                " set task.mode=absolute"
-            )
+        check_mode(spec.embodiment, mode)
         super().__init__(device=torch.device(device), batch_size=torch.Size([batch]))
         self.spec, self.horizon, self.mode = spec, horizon, mode
         self._stream = episode_stream(seed)

@@ -120,3 +120,18 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+def named_files(name: str) -> list[Path]:
+    """The file of this name, or the files that lie directly in that folder; hidden ones are no part of it.
+
+    [] for a text that names nothing.
+    """
+    path = Path(name)
+    try:
+        if name and path.is_dir():
+            inside = sorted(path.iterdir())
+            return [one for one in inside if one.is_file() and not one.name.startswith(".")]
+        return [path] if path.is_file() else []
+    except (OSError, ValueError):  # too long for a name, or a folder of somebody else's
+        return []

@@ -21,6 +21,7 @@ from typing import Any, TypeVar, get_type_hints
 T = TypeVar("T")
 TARGET = "_target_"
 ROOMS = ("envs", "actors", "learners", "pipeline")  # packages of this repository
+_PLAIN = (TypeError, ValueError, ImportError, OSError)  # whose texts are sentences; a KeyError's is the key
 
 
 @dataclass(frozen=True)
@@ -52,11 +53,12 @@ def target(section: Mapping[str, Any], key: str) -> Callable[..., Any]:
     module, _, name = str(path).rpartition(".")
     try:
         found = importlib.import_module(module)
-    except ImportError as error:
-        raise ConfigError(
-            f"{key}.{TARGET}={path} does not import: {error}. Install the package that holds it, or correct"
-            " the path."
-        ) from error
+    except Exception as error:
+        missing = isinstance(error, ImportError)
+        if not missing and module.split(".")[0] in ROOMS:
+            raise
+        fix = ". Install the package that holds it, or correct the path." if missing else ""
+        raise ConfigError(f"{key}.{TARGET}={path} does not import: {_said(error, module)}{fix}") from error
     if not hasattr(found, name):
         names = [k for k, v in vars(found).items() if inspect.isclass(v)]
         raise ConfigError(f"{key}.{TARGET}={path}: {module} has no {name}{nearest(name, names)}")
@@ -72,7 +74,7 @@ def build(section: Mapping[str, Any], key: str, **context: Any) -> Any:
         context: what the caller knows and no config says, such as spec=...
 
     Raises:
-        ConfigError: naming the key, the class and the fix.
+        ConfigError: naming the key, the class and the fix; whatever somebody else's class raises is told so.
     """
     factory = target(section, key)
     given = {str(name): to_plain(value) for name, value in section.items() if name != TARGET}
@@ -86,9 +88,11 @@ def build(section: Mapping[str, Any], key: str, **context: Any) -> Any:
         return factory(**context, **given)
     except ConfigError:
         raise
-    except (TypeError, ValueError, ImportError) as error:
-        where = _place(error, getattr(factory, "__module__", ""))
-        raise ConfigError(f"{key} ({section[TARGET]}): {error}{where}") from error
+    except Exception as error:
+        if not isinstance(error, _PLAIN) and str(section[TARGET]).split(".")[0] in ROOMS:
+            raise
+        said = _said(error, getattr(factory, "__module__", ""))
+        raise ConfigError(f"{key} ({section[TARGET]}): {said}") from error
 
 
 def options(kind: type[T], section: Mapping[str, Any], key: str) -> T:
@@ -226,15 +230,15 @@ def _allowed(error: Mapping[str, Any]) -> str:
     return wanted if wanted != message else f"be something else: {message}"
 
 
-def _place(error: Exception, module: str) -> str:
-    """Where a module of somebody else raised an error, as " (my_suite.py, line 34)": what Python says of a
-    slip names no place. "" for ours, whose words say what to change.
-    """
-    if module.split(".")[0] in ROOMS:
-        return ""
+def _said(error: Exception, module: str) -> str:
+    """What an error says, and where a module of somebody else raised it, as " (my_suite.py, line 34)"."""
+    said = str(error) if isinstance(error, _PLAIN) else f"{type(error).__name__}: {error}"
+    # a SyntaxError, and whoever looks for a package, names the place itself
+    if module.split(".")[0] in ROOMS or isinstance(error, (SyntaxError, ImportError)):
+        return said
     file = getattr(sys.modules.get(module), "__file__", None)
-    lines = [step.lineno for step in traceback.extract_tb(error.__traceback__) if step.filename == file]
-    return f" ({file}, line {lines[-1]})" if lines else ""
+    steps = [step for step in traceback.extract_tb(error.__traceback__) if file in (None, step.filename)]
+    return said + "".join(f" ({step.filename}, line {step.lineno})" for step in steps[-1:])
 
 
 def _has(value: Any, position: int) -> bool:

@@ -266,7 +266,7 @@ def _learning(cfg: Cfg) -> Iterator[str]:
     """What of an algorithm, its loop and rewards does not go together; stages would find it hours later."""
     rl, task, kind = cfg["rl"], cfg["task"], target(cfg["algorithm"], "algorithm")
     name = getattr(kind, "name", kind.__name__)
-    if rl["rewards_later"] and not getattr(kind, "supports_delayed_reward", True):
+    if rl["rewards_later"] and not getattr(kind, "supports_delayed_reward", False):
         yield (
             f"rl.rewards_later=true, but algorithm={name} learns from every step as it was rewarded; use grpo"
             " or filtered_bc"
@@ -274,7 +274,7 @@ def _learning(cfg: Cfg) -> Iterator[str]:
     if rl["schedule"] == "async" and rl["queue"] < rl["shards"]:
         yield f"rl.queue={rl['queue']} must hold at least the rl.shards={rl['shards']} jobs of one iteration"
     short = imagined_chunks(cfg) * task["chunk"] < task["horizon"]
-    if short and not getattr(kind, "bootstraps", True) and not cfg["judge"]["rewards"]["progress"]:
+    if short and not getattr(kind, "bootstraps", False) and not cfg["judge"]["rewards"]["progress"]:
         yield (
             f"rl.horizon={rl['horizon']} cuts episodes short, and neither a critic (algorithm={name}) nor"
             " judge.rewards.progress=0 says what the rest is worth; set rl.horizon=null"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import inspect
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -15,7 +16,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from envs.targets import ConfigError, nearest
+from envs.targets import TARGET, ConfigError, nearest, target
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 IF_CHOSEN = "if_chosen"  # options by group and choice, which count where that is what was chosen
@@ -35,9 +36,21 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
     cfg = read_config(overrides)
     from pipeline.checks import faults  # needs torch, which an unknown key should not wait for
 
+    cfg = _decided(cfg)
     if wrong := faults(cfg):
         raise ConfigError("\n".join(wrong))
     return cfg
+
+
+def _decided(cfg: dict[str, Any]) -> dict[str, Any]:
+    """The config with rl.freeze_perception=auto as the policy's class allows."""
+    rl = cfg.get("rl")
+    if not isinstance(rl, Mapping) or rl.get("freeze_perception") != "auto":
+        return cfg
+    able = False
+    with suppress(ConfigError, AttributeError):  # of what is no section, or not there, `faults` tells
+        able = hasattr(target(cfg["policy"], "policy"), "freeze_perception")
+    return {**cfg, "rl": {**rl, "freeze_perception": able}}
 
 
 def read_config(overrides: Sequence[str]) -> dict[str, Any]:
@@ -90,7 +103,7 @@ def composed(overrides: Sequence[str]) -> dict[str, Any]:
         chosen, section = made.pop("hydra").runtime.choices, made.pop(IF_CHOSEN)
     given = [word.split("=")[0].lstrip("+~") for word in overrides]
     given = [key for key in given if key not in chosen]  # judge=proxy says which, and no option of it
-    for group, option, value in _of_chosen(OmegaConf.to_container(section), chosen):
+    for group, option, value in _of_chosen(OmegaConf.to_container(section), chosen, overrides):
         path = f"{_SECTIONS.get(group, group)}.{option}"
         if any(key == path or path.startswith(f"{key}.") or key.startswith(f"{path}.") for key in given):
             continue
@@ -123,15 +136,21 @@ def _replacing(word: str) -> list[str]:
     return [f"{key}=null", word] if isinstance(said, Mapping) and "_target_" in said else [word]
 
 
-def _of_chosen(section: Any, chosen: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
+def _of_chosen(
+    section: Any, chosen: Mapping[str, Any], overrides: Sequence[str]
+) -> Iterator[tuple[str, str, Any]]:
     """Groups, paths and values of those options in the section if_chosen that belong to what was chosen.
 
     Raises:
-        ConfigError: for a group of choices that there is not.
+        ConfigError: for a group or a choice that there is not.
     """
     for group, by_choice in section.items():
         if group not in chosen:
             raise ConfigError(f"{IF_CHOSEN}.{group} is no group of choices{nearest(group, groups())}")
+        for name in by_choice:
+            if name != chosen[group] and not offered(group, name, overrides):
+                near = nearest(name, choices(group, overrides))
+                raise ConfigError(f"{IF_CHOSEN}.{group}.{name} is no choice of {group}{near}")
         for path, value in _leaves(by_choice.get(chosen[group], {})):
             yield group, path, value
 
@@ -184,6 +203,8 @@ def _unknown_key(overrides: Sequence[str]) -> str:
             continue
         if "=" not in word and (near := _choosing(word, overrides)):
             return f"{word} is not a key; did you mean {' or '.join(near)}?"
+        if _takes(base, key):
+            return f"{key} is an option that the config does not name; say +{word}"
         if elsewhere := _other_choices(key, chosen):
             return f"{key} is no key of the {key.partition('.')[0]} that is chosen, but of {elsewhere}"
         parent = key.rpartition(".")[0]
@@ -194,6 +215,20 @@ def _unknown_key(overrides: Sequence[str]) -> str:
             return f"{key} is not a key; did you mean {' or '.join(list(dict.fromkeys(near + same))[:3])}?"
         return f"{key} is not a key{nearest(key, siblings or [*base, *groups()])}"
     return ""
+
+
+def _takes(cfg: Mapping[str, Any], key: str) -> bool:
+    """Whether a dotted key is an option of the class of the section around it, with a default there."""
+    *around, option = key.split(".")
+    section: Any = cfg
+    for part in around:
+        section = section.get(part) if isinstance(section, Mapping) else None
+    if not isinstance(section, Mapping) or TARGET not in section:
+        return False
+    with suppress(ConfigError, TypeError, ValueError):  # a class that is not there is told by itself
+        parameter = inspect.signature(target(section, key)).parameters.get(option)
+        return parameter is not None and parameter.default is not parameter.empty
+    return False
 
 
 def _other_choices(key: str, chosen: Sequence[str]) -> str:
@@ -211,10 +246,13 @@ def _other_choices(key: str, chosen: Sequence[str]) -> str:
 
 
 def _unreadable(overrides: Sequence[str], error: Exception) -> str:
-    """What to say of the first override that does not go with those before it; choices come first."""
+    """What to say of the first override that does not go with those before it; where choices lie comes first,
+    then they.
+    """
     taken: list[str] = []
     where = ""
-    for word in sorted(overrides, key=lambda word: word.split("=")[0] not in groups()):
+    order = sorted(overrides, key=lambda word: word.split("=")[0] not in groups())
+    for word in sorted(order, key=lambda word: not word.startswith("hydra.")):  # where choices lie
         try:
             composed([*taken, word])
         except Exception as found:

@@ -1,4 +1,5 @@
-"""What stages read that no stage made: recordings, released weights, descriptions of robots, files of judges.
+"""What stages read that no stage made: recordings, released weights, descriptions of robots, files of judges,
+and those that options name.
 
 Keys know it by its content, so that recordings that were labelled anew, or weights that were exchanged, make
 out of date what was learned from them. Large things are told apart without reading all of them.
@@ -9,7 +10,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,9 @@ import pyarrow.parquet as pq
 
 from envs.embodiment import PYTHON
 from envs.episodes.formats.lerobot_info import INFO_KEY
-from envs.files import files_below
+from envs.files import files_below, named_files
 from envs.manifest import digest_of, hashes, mark_of
-from envs.targets import ConfigError, target
+from envs.targets import TARGET, ConfigError, target
 from pipeline.graph.code_version import code_of, digest
 
 Cfg = Mapping[str, Any]
@@ -29,6 +30,9 @@ CHECKPOINT = "simulator.checkpoint"
 STATE_CHECKPOINT = "simulator.state_expert.checkpoint"
 KINEMATICS = "simulator.kinematics.model"
 WEIGHTS = "finetune.weights"
+
+_NAMING = ("task.suite", "task.variants", "policy", "algorithm", "simulator")  # whose options may name files
+_TOLD = (CHECKPOINT, STATE_CHECKPOINT, KINEMATICS)  # by the settings of the stages that read them (files_at)
 
 _DATA = ("meta", "data", "videos", "images")  # folders of a LeRobot data set
 _TEXTS = (".json", ".jsonl")
@@ -69,11 +73,45 @@ def judge_files(cfg: Cfg, part: str = "") -> dict[str, Any]:
         part: of section judge, such as text_world, whose files alone are meant; "" means all.
     """
     kind: Any = target(cfg["judge"], "judge")
+    found = _marks(kind.files(cfg["judge"][part] if part else cfg["judge"]))
+    return {"files": found} if found else {}
+
+
+def option_files(path: str, section: Any) -> dict[str, str]:
+    """Hashes of the files that options of suite, policy, algorithm and simulator name: when one changes, what
+    was made with it is out of date.
+
+    Args:
+        path: where the section stands in the config.
+        section: its value.
+    """
+    texts = [text for key, text in _texts(section, path) if key not in _TOLD and _under(key, _NAMING)]
+    return _marks(file for text in texts for file in named_files(text))
+
+
+def _texts(section: Any, path: str) -> Iterator[tuple[str, str]]:
+    """The texts in a section, however deep, and their dotted keys; names of classes are none."""
+    if isinstance(section, str):
+        yield path, section
+    elif isinstance(section, Mapping):
+        for name, value in section.items():
+            if name != TARGET:
+                yield from _texts(value, f"{path}.{name}")
+    elif isinstance(section, (list, tuple)):
+        for value in section:
+            yield from _texts(value, path)
+
+
+def _under(key: str, paths: tuple[str, ...]) -> bool:
+    return any(f"{key}.".startswith(f"{path}.") for path in paths)
+
+
+def _marks(paths: Iterable[Path]) -> dict[str, str]:
+    """Hashes of files by name, as a file may move; those of one name, in two folders, in the given order."""
     found: dict[str, list[str]] = {}
-    for path in kind.files(cfg["judge"][part] if part else cfg["judge"]):
+    for path in paths:
         found.setdefault(path.name, []).append(_whole(path, _stat(path)))
-    # by name, as a file may move; those of one name, in two folders, count in the options' order
-    return {"files": {name: " ".join(marks) for name, marks in found.items()}} if found else {}
+    return {name: " ".join(marks) for name, marks in found.items()}
 
 
 def files_at(cfg: Cfg, *keys: str) -> dict[str, Any]:

@@ -1,9 +1,9 @@
 """What Worldloop asks of a policy, and how it treats any policy.
 
 A policy is a TensorDictModule that reads observations by the keys of envs/specs.py (`in_keys`) and writes
-("vla_action", "chunk") [B, K, A] with its log-probability [B]; `get_dist` gives the distribution that
-learners differentiate. A policy that also writes ("vla_action", "tokens") is scored on those, as TorchRL's
-are.
+("vla_action", "chunk") [B, K, A], with its log-probability [B] or without; `get_dist` gives the
+distribution that learners differentiate. A policy that also writes ("vla_action", "tokens") is scored on
+those, as TorchRL's are.
 
 Whatever else a policy has is used if it is there:
 
@@ -21,7 +21,9 @@ Whatever else a policy has is used if it is there:
 - `scale_exploration(width, share)`: with it, how widely chunks are drawn around the mode, and how many are
   drawn at all, is found in physics (section explore); without it the policy explores as it is;
 - `exploration`: how widely they are drawn, over how widely the config says (see rl_rate);
-- `imitation_loss(observed, chunks [B, K, A])`: a better one than the negative log-likelihood.
+- `imitation_loss(observed, chunks [B, K, A])`: a better one than the negative log-likelihood;
+- `rehearsed = False` on its class: it is not built before any work, to see that it can (rehearsal.py), since
+  that is dear.
 """
 
 from __future__ import annotations

@@ -61,6 +61,7 @@ class OpenPIPolicy(TensorDictModuleBase):
 
     in_keys: ClassVar[list[Any]] = [IMAGE, STATE, COMMAND, INSTRUCTION_UTF8]
     out_keys: ClassVar[list[Any]] = [CHUNK]
+    rehearsed = False  # it calls its server
 
     def __init__(
         self,

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from envs.files import named_files
 from envs.specs import Status
 
 if TYPE_CHECKING:
@@ -74,11 +75,14 @@ class Judge(nn.Module):
         discount: per frame, of the progress that `loss` is given: discount ** (frames until success).
         calibrates: whether the threshold is to be set on recorded video (learners/stages/judge.py).
 
+        rehearsed: whether one may be built before any work, to see that it can; not where that is dear.
+
     Raises:
         ValueError: if hold is less than one frame.
     """
 
     threshold: Tensor
+    rehearsed = True
     needs_labels = False
     reads_features = False
     asks_world = False
@@ -163,7 +167,7 @@ class Judge(nn.Module):
         """Files whose contents decide judgements, by options, however deep, that name one or a folder, whose
         own files count: when they change, what was made with the judge is out of date.
         """
-        return tuple(path for value in _texts(options) for path in _files_at(value))
+        return tuple(path for value in _texts(options) for path in named_files(value))
 
     @classmethod
     def decisive(cls, options: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -217,18 +221,6 @@ def _texts(options: Any) -> Iterator[str]:
     elif isinstance(options, (Mapping, list, tuple)):
         for value in options.values() if isinstance(options, Mapping) else options:
             yield from _texts(value)
-
-
-def _files_at(name: str) -> list[Path]:
-    """The file of this name, or the files that lie directly in that folder; hidden ones are no part of it."""
-    path = Path(name)
-    try:
-        if name and path.is_dir():
-            inside = sorted(path.iterdir())
-            return [one for one in inside if one.is_file() and not one.name.startswith(".")]
-        return [path] if path.is_file() else []
-    except OSError:  # too long for a name, or a folder of somebody else's
-        return []
 
 
 def judgement_status(success: Tensor) -> Tensor:

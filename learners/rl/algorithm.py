@@ -102,13 +102,13 @@ class RLConfig:
 class Algorithm(Protocol):
     """What tells algorithms apart; one class each, built as `_target_`(policy=, spec=, **options).
 
-    Attributes:
-        name: in the config.
+    Attributes (those of the class; one that is left out is as said in parentheses):
+        name: for messages (the class's).
         bootstraps: whether it values next observations, so that rollouts must carry what critics read of
-            them.
+            them (False).
         supports_delayed_reward: whether it learns from whole first episodes only, so that rewards may arrive
-            after them.
-        group_size: consecutive episodes that belong together, such as a group.
+            after them (False).
+        group_size: consecutive episodes that belong together, such as a group (1).
     """
 
     name: str

@@ -255,8 +255,9 @@ def _check(fleet: Fleet, algorithm: Algorithm, config: RLConfig) -> None:
         )
     if fleet.episodes % algorithm.group_size:
         raise ConfigError(
-            f"rl.envs / rl.shards = {fleet.episodes} must be a multiple of"
-            f" algorithm.group={algorithm.group_size}, or groups would be torn apart"
+            f"rl.envs / rl.shards = {fleet.episodes} must be a multiple of the {algorithm.group_size}"
+            f" episodes that algorithm={algorithm.name} keeps together, or groups would be torn apart;"
+            " change rl.envs"
         )
     if config.rewards_later and not algorithm.supports_delayed_reward:
         raise ConfigError(

@@ -7,7 +7,7 @@ torch.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -228,14 +228,15 @@ def stage_named(name: str, stages: Sequence[str]) -> str:
     return name
 
 
-def _check_learns(cfg: Mapping[str, Any], wanted: Iterable[str]) -> None:
+def _check_learns(cfg: Mapping[str, Any], wanted: Collection[str]) -> None:
     """See that the policy can learn, if stages are wanted in which it does, before anything is recorded.
 
     Raises:
         ConfigError: if it can be evaluated alone.
     """
     kind = target(cfg["policy"], "policy")
-    able = any(hasattr(kind, name) for name in ("get_dist", "imitation_loss"))
+    learning = [name for name in wanted if name.startswith("rl-")]
+    able = any(hasattr(kind, name) for name in ("get_dist", *(() if learning else ("imitation_loss",))))
     if isinstance(kind, type) and not able and "imitation" in wanted:
         raise ConfigError(
             f"policy._target_={cfg['policy']['_target_']} cannot learn, as it has no get_dist; `worldloop"

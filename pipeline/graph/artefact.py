@@ -65,7 +65,8 @@ class Identity:
 
     Args:
         stage: the node's name.
-        config: hash of every config section that it reads, by dotted path.
+        config: hash of every config section that it reads, by dotted path, and of the files that its options
+            name (outside.option_files).
         settings: plain values that tell it from other nodes of the same stage.
         parents: keys of the nodes that it builds on, by name.
         roles: names of those nodes, by the role they play.

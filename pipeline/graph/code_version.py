@@ -2,7 +2,8 @@
 descriptions and texts that lie beside one, such as a robot's.
 
 Imports are found in the syntax tree, also those inside functions, so nothing is run. Comments, docstrings and
-formatting do not count. Installed packages count by their version.
+formatting do not count. Installed packages, and Python's own, are not followed; a class of one counts by the
+package's version.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import ast
 import hashlib
 import importlib.metadata
 import importlib.util
+import sys
 from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
@@ -69,13 +71,36 @@ def _closure(module: str) -> frozenset[str]:
             waiting.append(package)
         path = _source(name)
         if path is not None:
-            waiting += [other for other in _imports(name, path) if _same_house(other, name)]
+            waiting += [other for other in _imports(name, path) if _followed(other, name)]
     return frozenset(found)
 
 
-def _same_house(name: str, importer: str) -> bool:
-    """Whether an import is followed: modules of this repository, and of the importer's own package."""
-    return name.split(".")[0] in (*ROOMS, importer.split(".")[0])
+def _followed(name: str, importer: str) -> bool:
+    """Whether an import is followed: from this repository within it; from somebody else's module also to the
+    others of his, in whatever folder or package.
+    """
+    top = name.split(".")[0]
+    return top in ROOMS or (importer.split(".")[0] not in ROOMS and _of_somebody(top))
+
+
+@cache
+def _of_somebody(top: str) -> bool:
+    """Whether a module or package without a dot is neither installed nor Python's own."""
+    if not top or top in sys.stdlib_module_names:
+        return False
+    try:
+        spec = importlib.util.find_spec(top)
+    except (ImportError, ValueError):
+        return False
+    if spec is None:
+        return False
+    # a package without __init__.py is its folders
+    places = [spec.origin] if spec.has_location and spec.origin else spec.submodule_search_locations or ()
+    return bool(places) and not any(_installed(Path(place)) for place in places)
+
+
+def _installed(path: Path) -> bool:
+    return any(part in _INSTALLED for part in path.parts)
 
 
 @cache
@@ -89,12 +114,12 @@ def _source(module: str) -> Path | None:
         return None
     try:
         spec = importlib.util.find_spec(module)
-    except (ImportError, ValueError):
+    except Exception:  # a package on the way is run, and may raise anything
         return None
     if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
         return None
     path = Path(spec.origin)
-    return None if any(part in _INSTALLED for part in path.parts) else path
+    return None if _installed(path) else path
 
 
 @cache
@@ -138,12 +163,15 @@ def _file_hash(path: Path) -> str:
 
 @cache
 def _beside(module: str) -> dict[str, str]:
-    """{path: hash} of what lies beside a package's module and is no Python, but read by it."""
+    """{path: hash} of what lies beside a module and is no Python, but read by it."""
     path = _source(module)
-    # a module without a package may lie among anything
-    if path is None or not ("." in module or path.name == "__init__.py"):
+    if path is None:
         return {}
     found = sorted(one for pattern in _BESIDE for one in path.parent.glob(pattern))
+    if not ("." in module or path.name == "__init__.py"):
+        # a module without a package may lie among anything; what it reads it names
+        said = {node.value for node in ast.walk(_tree(path)) if isinstance(node, ast.Constant)}
+        found = [one for one in found if one.name in said]
     return {_name(one): hashlib.sha256(one.read_bytes()).hexdigest()[:12] for one in found}
 
 

@@ -19,6 +19,7 @@ from pipeline.graph.code_version import code_of, digest
 from pipeline.graph.stage import Inputs, Stage
 from pipeline.graph.view import ConfigView, sections
 from pipeline.graph.workers import run_stage
+from pipeline.outside import option_files
 from pipeline.track import NullTracker, Tracker
 
 Names = Mapping[str, str | Sequence[str] | None]
@@ -86,12 +87,15 @@ class Graph:
         if unknown:
             raise ValueError(f"stage {name} comes before its inputs {unknown}")
         read = sections(self.cfg, stage.reads_of(settings))
+        config = {
+            path: digest(json.dumps(_decisive(path, value), sort_keys=True)) for path, value in read.items()
+        }
+        for path, value in read.items():
+            if files := option_files(path, value):
+                config[f"files of {path}"] = digest(json.dumps(files, sort_keys=True))
         identity = Identity(
             stage=name,
-            config={
-                path: digest(json.dumps(_decisive(path, value), sort_keys=True))
-                for path, value in read.items()
-            },
+            config=config,
             settings=settings,
             parents={parent: self.key(parent) for parent in parents},
             roles={role: list(_names(names)) for role, names in roles.items()},

@@ -85,6 +85,18 @@ from pipeline.loop import build_loop
             ["+if_chosen.jugde.learned.points=3"],
             r"if_chosen\.jugde is no group of choices; did you mean judge",
         ),
+        (
+            ["+if_chosen.task.tabeltop.horizon=8"],
+            r"if_chosen\.task\.tabeltop is no choice of task; did you mean tabletop",
+        ),
+        (
+            ["+if_chosen.task.dott.horizon=8", "hydra.searchpath=[file://examples/configs]"],
+            r"if_chosen\.task\.dott is no choice of task; did you mean dot\?",
+        ),
+        (
+            ["experiment=smoke", "task=dot", "rl.lr=[1,", "hydra.searchpath=[file://examples/configs]"],
+            r"^rl\.lr=\[1, cannot be read",
+        ),
         (["task=tabletop", "task.suite.scenes=3"], r"task\.suite\.scenes=3"),
         (["task=tabletop", "+task.variants.x={scene: a}"], r"task\.variants\.x\.scene is not an option"),
     ],
@@ -92,6 +104,29 @@ from pipeline.loop import build_loop
 def test_mistakes_name_the_key(words: list[str], match: str) -> None:
     with pytest.raises(ConfigError, match=match):
         load_config(words)
+
+
+def test_choices_and_options_of_ones_own_package_are_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "chosen_here"
+    (folder / "judge").mkdir(parents=True)
+    for name in ("__init__.py", "judge/__init__.py"):
+        (folder / name).touch()
+    (folder / "its.py").write_text("class Mine:\n    def __init__(self, spec, hold: int, share=0.1): ...\n")
+    text = "_target_: chosen_here.its.Mine\nhold: 2\nrewards: {progress: 1.0, success: 1.0}\n"
+    (folder / "judge/mine.yaml").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    found = ["hydra.searchpath=[pkg://chosen_here]", "+if_chosen.judge.mine.hold=3"]
+    assert read_config([*found, "judge=mine"])["judge"]["hold"] == 3
+    assert read_config(found)["judge"]["hold"] == 2
+    for word, said in (
+        ("judge.share=0.3", r"^judge\.share is an option .* not name; say \+judge\.share=0\.3$"),
+        ("judge.shar=0.3", r"^judge\.shar is not a key"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            read_config([*found, "judge=mine", word])
+    assert read_config([*found, "judge=mine", "+judge.share=0.3"])["judge"]["share"] == 0.3
 
 
 # What a choice cannot be without.

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -167,6 +168,41 @@ def test_files_deep_in_a_judges_options_are_known_by_their_content(tmp_path: Pat
     network.write_text("three")
     metric = changed(before, keys(cfg, tmp_path))
     assert {"judge-1", "rl-1"} <= metric and not metric & {"text_world-1", "clone-1", "simulator-1"}
+
+
+@pytest.mark.parametrize(
+    ("key", "same"),
+    [
+        ("task.suite.cameras", set()),
+        ("policy.head.file", {"collect"}),
+        ("algorithm.teacher", {"collect", "imitation", "simulator-1", "judge-1", "gap-1"}),
+        ("simulator.table", {"collect", "imitation", "deploy-1"}),
+    ],
+)
+@pytest.mark.parametrize("folder", [False, True])
+def test_files_that_options_name_are_known_by_their_content(
+    key: str, same: set[str], folder: bool, tmp_path: Path
+) -> None:
+    cfg = load_config(["experiment=smoke"])
+    *around, last = key.split(".")
+    inner: Any = cfg
+    for part in around:
+        inner = inner[part]
+    named = file = tmp_path / "weights"
+    if folder:
+        named.mkdir()
+        file = named / "model.bin"
+    inner[last] = [str(named)]
+    file.write_text("one")
+    before, graph = keys(cfg, tmp_path), build_loop(cfg, tmp_path)
+    assert keys(cfg, tmp_path) == before
+    file.write_text("three")
+    now = keys(cfg, tmp_path)
+    assert {"rl-1", "evaluate-after"} <= changed(before, now) and not same & changed(before, now)
+    if key == "task.suite.cameras":
+        assert changed(before, now) >= {"collect", "imitation", "simulator-1"}
+        old, new = (one.nodes["collect"].identity for one in (graph, build_loop(cfg, tmp_path)))
+        assert new.changed(asdict(old)).endswith("ran: config files of task.suite")
 
 
 def test_a_robots_own_kinematics_are_known_by_their_source(tmp_path: Path) -> None:

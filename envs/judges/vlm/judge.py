@@ -74,6 +74,8 @@ class VLMJudge(Judge):
         ConfigError: if the model, its key or the prompt are not there.
     """
 
+    rehearsed = False  # a local model is read from its folder
+
     def __init__(
         self,
         spec: WorldSpec,

@@ -147,6 +147,30 @@ def test_tasks_are_listed_with_what_can_be_chosen(tmp_path: Path) -> None:
     assert "robot dot" in drawn.stdout and (tmp_path / "dot-reach.gif").exists(), drawn
 
 
+def test_a_suite_that_cannot_be_built_leaves_the_others_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "broken_suite.py").write_text(
+        "class Arm:\n    def __init__(self, robot: str):\n        open(robot)\n\n\n"
+        "class Slip:\n    def __init__(self, robot: str):\n        self.nothing\n"
+    )
+    (tmp_path / "choices/task").mkdir(parents=True)
+    for name in ("Arm", "Slip"):
+        (tmp_path / f"choices/task/{name}.yaml").write_text(
+            f"suite: {{_target_: broken_suite.{name}, robot: /nowhere/robot.xml}}\nname: reach\n"
+            "size: [32, 32]\nchunk: 4\nhorizon: 12\nmode: absolute\n"
+        )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    mine = f"hydra.searchpath=[file://{tmp_path}/choices]"
+    listed = worldloop("tasks", mine)
+    assert listed.returncode == 0 and "task=push" in listed.stdout, listed
+    assert "task.suite (broken_suite.Arm): [Errno 2] No such file or directory: '/nowhere" in listed.stdout
+    assert "task.suite (broken_suite.Slip): AttributeError: " in listed.stdout
+    for name in ("Arm", "Slip"):
+        wrong = worldloop("run", mine, f"task={name}", "experiment=smoke")
+        assert wrong.returncode == 1 and f"task.suite (broken_suite.{name}): " in wrong.stderr, wrong
+
+
 def test_choices_and_classes_of_the_folder_one_stands_in_are_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -139,7 +139,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def fresh_key(root: Path, cfg: dict[str, Any]) -> str:
     """A key as another process would find it."""
-    for cached in ("_closure", "_source", "_tree", "_imports", "_file_hash", "_beside"):
+    for cached in ("_closure", "_source", "_tree", "_imports", "_file_hash", "_beside", "_of_somebody"):
         getattr(code_version, cached).cache_clear()
     return build(root, cfg).key("a")
 
@@ -166,6 +166,28 @@ def test_a_description_beside_the_code_is_part_of_the_key(tmp_path: Path, packag
     (package / "log.csv").write_text("1")
     assert fresh_key(tmp_path, cfg) == keys[-1]
     assert "envs/physics/tabletop/robot.xml" in code_of("envs.physics.tabletop.scene", {})
+
+
+def test_modules_that_lie_beside_somebodys_own_are_part_of_the_key(tmp_path: Path, package: Path) -> None:
+    folder = package.parent
+    (folder / "theirs_alone.py").write_text(
+        "import json, torch\nfrom theirs_beside import part\nfrom theirs_loose import more\n"
+        "run, ROBOT = part, 'robot.xml'\n"
+    )
+    (folder / "theirs_loose").mkdir()  # a package without __init__.py
+    (folder / "theirs_beside.py").write_text("from theirs import part\nvalue = 0\n")
+    (folder / "theirs_loose/more.py").write_text("value = 0\n")
+    (folder / "robot.xml").write_text("one")
+    cfg = {**CFG, "x": {"_target_": "theirs_alone.run"}}
+    keys = [fresh_key(tmp_path, cfg)]
+    for name in ("theirs/part.py", "theirs_beside.py", "theirs_loose/more.py", "robot.xml"):
+        (folder / name).write_text("value = 1\n")
+        keys.append(fresh_key(tmp_path, cfg))
+    assert len(set(keys)) == len(keys)
+    (folder / "notes.txt").write_text("which nobody names")
+    assert fresh_key(tmp_path, cfg) == keys[-1]
+    behind = {Path(name).name for name in code_of("theirs_alone", {})}  # nothing of torch and json
+    assert behind == {"theirs_alone.py", "theirs_beside.py", "more.py", "robot.xml"}
 
 
 def test_stages_say_why_they_will_run_again(tmp_path: Path, package: Path) -> None:
