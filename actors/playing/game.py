@@ -13,7 +13,7 @@ from actors.playing.controls import Controls
 from actors.playing.imagination import Imagined, ImaginedSide
 from envs.embodiment import Embodiment
 from envs.initial_states import InitialStates
-from envs.physics.suite import Array, Observation, TaskSuite, check_task
+from envs.physics.suite import Array, NoExpert, Observation, TaskSuite, check_task, expert_of
 from envs.rng import Stream, episode_rng
 
 Starts = Callable[[Observation, NDArray[np.uint8]], InitialStates]
@@ -134,8 +134,11 @@ class Game:
             if self.suite is None:
                 raise Unplayable("the expert needs physics, which this task has not")
             shown = self.reset(self.seed)
-            expert = self.suite.expert(noise_level, episode_rng(self.seed, Stream.BEHAVIOUR))
-            self._driver = expert
+            rng = episode_rng(self.seed, Stream.BEHAVIOUR)
+            try:
+                self._driver = expert_of(self.suite, self.task, noise_level, rng)
+            except NoExpert as error:
+                raise Unplayable(str(error)) from error
         elif to == "recorded":
             if not 0 <= number < len(self.recorded):
                 raise Unplayable(f"recording {number} is not one of {len(self.recorded)}")

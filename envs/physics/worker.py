@@ -20,7 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.physics.checked import first_observation, rendered
-from envs.physics.suite import Array, Observation, TaskSuite, build_suite, check_task, task_of
+from envs.physics.suite import (
+    Array,
+    Expert,
+    Observation,
+    TaskSuite,
+    build_suite,
+    check_task,
+    expert_of,
+    task_of,
+)
 from envs.rng import Stream, episode_rng
 from envs.targets import ConfigError
 
@@ -177,21 +186,23 @@ class Worker:
 
     def script(self, jobs: list[tuple[int, float]], chunk: int | None) -> list[Track]:
         """Whole episodes of scripted behaviours for (seed, noise_level) pairs; recorded to the horizon, or to
-        the end of the `chunk` actions in which they succeed, if it is not None.
+        the end of the `chunk` actions in which they succeed, if it is not None. Without a horizon, where
+        nobody acts, no behaviour is asked for.
 
         Raises:
             SuiteError: see reset.
+            NoExpert: if a task has no such behaviour.
         """
         out = []
         suite = self.slots[0].suite
         for seed, noise_level in jobs:
             self._lay_out(suite, seed)
-            act = suite.expert(noise_level, episode_rng(seed, Stream.BEHAVIOUR))
+            act = self._behaviour(suite, seed, noise_level)
             observed = first_observation(suite)
             track = Track(seed, observed.instruction, observed.intrinsic)
             track.add(suite, observed)
             for step in range(self.spec.horizon):
-                if observed.success and chunk is not None and step % chunk == 0:
+                if act is None or (observed.success and chunk is not None and step % chunk == 0):
                     break
                 suite.step(act())
                 observed = suite.observe()
@@ -199,6 +210,13 @@ class Worker:
                 self._alive()
             out.append(track)
         return out
+
+    def _behaviour(self, suite: TaskSuite, seed: int, noise_level: float) -> Expert | None:
+        """Who acts in a scripted episode; None where it has no step."""
+        if not self.spec.horizon:
+            return None
+        rng = episode_rng(seed, Stream.BEHAVIOUR)
+        return expert_of(suite, task_of(self.spec.tasks, seed), noise_level, rng)
 
     def segment(
         self, jobs: list[tuple[int, Array]]

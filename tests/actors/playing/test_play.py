@@ -35,6 +35,7 @@ from tests.embodiments import (
     recorded_cameras,
     world_spec,
 )
+from tests.envs.physics.sections import Scriptless
 from tests.envs.simulators.test_engines import build_engine
 from tests.envs.test_world import Fixed
 
@@ -116,6 +117,15 @@ def test_a_person_the_expert_and_a_recording_drive_physics() -> None:
         played.hand_over("recorded", 1)
     with pytest.raises(Unplayable, match=r"actions=2 must lie in 1\.\.1"):
         played.press({}, 1.0, 2)
+
+
+def test_a_task_without_an_expert_is_played_by_hand() -> None:
+    suite = Scriptless("")
+    played = Game(suite.embodiment, suite.tasks, suite, None)
+    played.reset(7)
+    with pytest.raises(Unplayable, match=r"Scriptless\.expert has no behaviour of noise level 0 for task"):
+        played.hand_over("expert")
+    assert played.driven_by == "keys" and len(played.press({}, 1.0, 1).true) == 1
 
 
 def test_both_sides_take_the_same_actions() -> None:
