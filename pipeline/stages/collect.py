@@ -217,8 +217,14 @@ def deploy(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 
 def split_counts(episodes: int, shares: Mapping[str, float]) -> dict[str, int]:
-    """Episodes per split, in the order of SPLITS; those in `shares` get at least one, train gets the rest."""
-    counts = {name: max(1, round(shares[name] * episodes)) for name in SPLITS if name in shares}
+    """Episodes per split, in the order of SPLITS: the first one is for learning, those in `shares` get at
+    least one of the others as far as they go, and train the rest.
+    """
+    left, counts = max(0, episodes - 1), dict[str, int]()
+    for name in SPLITS:
+        if name in shares:
+            counts[name] = min(left, max(1, round(shares[name] * episodes)))
+            left -= counts[name]
     return {"train": episodes - sum(counts.values()), **counts}
 
 
