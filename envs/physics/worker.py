@@ -19,17 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.checked import first_observation, rendered
-from envs.physics.suite import (
-    Array,
-    Expert,
-    Observation,
-    TaskSuite,
-    build_suite,
-    check_task,
-    expert_of,
-    task_of,
-)
+from envs.physics.checked import observation, privileged, rendered
+from envs.physics.suite import Array, Observation, TaskSuite, build_suite, check_task, expert_of, task_of
 from envs.rng import Stream, episode_rng
 from envs.targets import ConfigError
 
@@ -68,7 +59,7 @@ class Track:
         for name, value in row.items():
             if value is not None:
                 self.rows.setdefault(name, []).append(np.array(value))
-        for name, value in {"progress": observed.progress, **suite.privileged()}.items():
+        for name, value in {"progress": observed.progress, **privileged(suite, self.privileged)}.items():
             self.privileged.setdefault(name, []).append(np.array(value))
 
     def __len__(self) -> int:
@@ -102,6 +93,7 @@ class Slot:
     steps: int = 0
     over: bool = True
     track: Track | None = None
+    observed: Observation | None = None
 
 
 class Worker:
@@ -130,7 +122,7 @@ class Worker:
         """Start episodes {slot: seed}; returns an observation per slot.
 
         Raises:
-            SuiteError: if pictures or calibration are not what the embodiment says.
+            SuiteError: if what it shows or says is not what its embodiment announces.
         """
         self._exchange({index: task_of(self.spec.tasks, seed) for index, seed in seeds.items()})
         out = {}
@@ -138,7 +130,7 @@ class Worker:
             slot = self.slots[index]
             self._lay_out(slot.suite, seed)
             slot.steps, slot.over, slot.track = 0, False, None
-            observed = first_observation(slot.suite)
+            slot.observed = observed = observation(slot.suite)
             if record:
                 slot.track = Track(seed, observed.instruction, observed.intrinsic)
                 slot.track.add(slot.suite, observed)
@@ -170,11 +162,12 @@ class Worker:
         out = {}
         for index, chunk in chunks.items():
             slot = self.slots[index]
-            observed = slot.suite.observe()
+            observed = slot.observed
+            assert observed is not None  # it was reset
             for command in () if slot.over else chunk:
                 slot.suite.step(command)
                 slot.steps += 1
-                observed = slot.suite.observe()
+                slot.observed = observed = observation(slot.suite, observed)
                 if slot.track is not None:
                     slot.track.add(slot.suite, observed)
                 self._alive()
@@ -197,26 +190,20 @@ class Worker:
         suite = self.slots[0].suite
         for seed, noise_level in jobs:
             self._lay_out(suite, seed)
-            act = self._behaviour(suite, seed, noise_level)
-            observed = first_observation(suite)
+            task, rng = task_of(self.spec.tasks, seed), episode_rng(seed, Stream.BEHAVIOUR)
+            act = expert_of(suite, task, noise_level, rng) if self.spec.horizon else None
+            observed = observation(suite)
             track = Track(seed, observed.instruction, observed.intrinsic)
             track.add(suite, observed)
             for step in range(self.spec.horizon):
                 if act is None or (observed.success and chunk is not None and step % chunk == 0):
                     break
                 suite.step(act())
-                observed = suite.observe()
+                observed = observation(suite, observed)
                 track.add(suite, observed)
                 self._alive()
             out.append(track)
         return out
-
-    def _behaviour(self, suite: TaskSuite, seed: int, noise_level: float) -> Expert | None:
-        """Who acts in a scripted episode; None where it has no step."""
-        if not self.spec.horizon:
-            return None
-        rng = episode_rng(seed, Stream.BEHAVIOUR)
-        return expert_of(suite, task_of(self.spec.tasks, seed), noise_level, rng)
 
     def segment(
         self, jobs: list[tuple[int, Array]]

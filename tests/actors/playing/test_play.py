@@ -6,6 +6,7 @@ import asyncio
 import base64
 import io
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -75,6 +76,13 @@ def game(imagined: bool = False) -> Game:
     side = imagination(suite.embodiment) if imagined else None
     recorded = [Recorded("0: seed 7", "reach", 7, ACTIONS)]
     return Game(suite.embodiment, suite.tasks, suite, side, starts if imagined else None, recorded)
+
+
+class NumpyBacked(Scriptless):
+    """Counts, and answers with NumPy's own truths and numbers."""
+
+    def observe(self) -> Observation:
+        return replace(super().observe(), success=np.bool_(True), progress=np.float32(0.5))  # type: ignore
 
 
 def test_keys_move_what_their_names_say() -> None:
@@ -237,3 +245,16 @@ def test_a_page_of_another_origin_cannot_play() -> None:
             assert answer.status == status, origin
 
     in_browser(talk)
+
+
+def test_truths_and_numbers_of_numpy_reach_the_page() -> None:
+    async def asked() -> dict[str, Any]:
+        suite = NumpyBacked("")
+        server = PlayServer(lambda: Game(suite.embodiment, suite.tasks, suite, None))
+        async with TestClient(TestServer(server.app())) as client:
+            answer = await client.post("/api/step", json={"actions": 1, "held": {}})
+            assert answer.status == 200, await answer.text()
+            found: dict[str, Any] = await answer.json()
+            return found
+
+    assert asyncio.run(asked())["true"] == {"success": True, "progress": 0.5}
