@@ -50,7 +50,7 @@ def observation(suite: TaskSuite, before: Observation | None = None) -> Observat
         raise SuiteError(f"{says} a {type(seen).__name__}; give an envs.physics.suite.Observation")
     if not isinstance(seen.instruction, str):
         raise SuiteError(f"{says} instruction={seen.instruction!r}; give the task in words, as a text")
-    due = {"state": (robot.state_dim,), "command": (robot.action_dim,)}
+    due: dict[str, tuple[int, ...]] = {"state": (robot.state_dim,), "command": (robot.action_dim,)}
     if seen.poses is not None:
         due["poses"] = (len(robot.arms), 7)
     given = {name: _floats(says, name, getattr(seen, name), shape) for name, shape in due.items()}
