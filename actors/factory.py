@@ -99,6 +99,11 @@ def build_policy(cfg: Mapping[str, Any], weights: Path | None = None) -> TensorD
     return load(policy, weights).to(device_of(cfg)).eval()
 
 
+def at_once(cfg: Mapping[str, Any], most: int) -> int:
+    """How many of `most` episodes the task lets be laid out at once (task.envs)."""
+    return min(most, cfg["task"].get("envs") or most)
+
+
 def build_physics(
     cfg: Mapping[str, Any],
     batch: int,
@@ -109,15 +114,20 @@ def build_physics(
     """The true world.
 
     Args:
-        batch: episodes side by side.
+        batch: episodes side by side, no more than `at_once` allows.
         record: keep every frame, for PhysicsEnv.pop_tracks.
         seed: of the stream of episode seeds.
         changes: options of the suite that are other than the config says, as one of task.variants is.
 
     Raises:
-        ConfigError: if the task has no suite, or no task of that name.
+        ConfigError: if the task has no suite, no task of that name, or less room than is asked for.
     """
     task, suite = cfg["task"], _suite_of(cfg, changes)
+    if at_once(cfg, batch) < batch:
+        raise ConfigError(
+            f"task.envs={task['envs']} episodes may be laid out side by side, but RL in physics asks for"
+            f" {batch}, which is rl.envs / rl.shards: lower rl.envs, or take more shards"
+        )
     try:
         pool = TaskPool(suite, task["name"], batch, task["horizon"], cfg["launch"]["workers"])
         return PhysicsEnv(pool, world_spec(cfg), ActionMode(task["mode"]), rewards_of(cfg), record, seed)
@@ -137,7 +147,7 @@ def build_pool(
     Raises:
         ConfigError: if the task has no suite, or no task of that name.
     """
-    task, workers = cfg["task"], cfg["launch"]["workers"] or available_cores()
+    task, workers = cfg["task"], at_once(cfg, cfg["launch"]["workers"] or available_cores())
     actions, suite = task["horizon"] if horizon is None else horizon, _suite_of(cfg, changes)
     try:
         return TaskPool(suite, task["name"], workers, actions, workers)

@@ -10,6 +10,10 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from math import inf
+from typing import Any
+
+from envs.orientations import orientations
 
 
 class EmbodimentError(ValueError):
@@ -45,6 +49,9 @@ class Arm:
     gripper: int | None = None
     gripper_range: tuple[float, float] = (0.0, 1.0)
 
+    def __post_init__(self) -> None:
+        _as_tuples(self, "numbers", "gripper_range")
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -61,6 +68,15 @@ class Camera:
     size: tuple[int, int]
     wrist: str | None = None
     calibrated: bool = False
+
+    def __post_init__(self) -> None:
+        _as_tuples(self, "size")
+
+
+def _as_tuples(part: Any, *fields: str) -> None:
+    """Fields of a description that may be given as lists; it is compared as a whole."""
+    for name in fields:
+        object.__setattr__(part, name, tuple(getattr(part, name)))
 
 
 PYTHON = "python:"  # before the import path of a function, where the path of a robot's file may stand
@@ -82,44 +98,6 @@ class Robot:
     joints: tuple[tuple[str, ...], ...]
     flanges: tuple[str, ...]
     held: Mapping[str, float] = field(default_factory=dict)
-
-
-_ANGLES = ("roll", "pitch", "yaw")
-_JOINTS = ("joint", "waist", "shoulder", "elbow", "wrist", "forearm", "neck", "head")
-_VECTORS = (("wx", "wy", "wz"), ("rotvec",), ("axis", "angle"), ("axisangle",))  # as LeRobot and others say
-_QUATERNIONS = (("qw", "qx", "qy", "qz"), ("quat",), ("quaternion",))
-
-
-def orientations(names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
-    """Positions of the numbers that tell orientations, by their names, in order.
-
-    Single angles are called roll, pitch or yaw and are no joint's (left_roll, but not wrist_roll); three in a
-    row are a rotation vector if they are called wx, wy, wz, or have rotvec, axis_angle or axisangle in their
-    names; four in a row a quaternion if they are called qx, qy, qz, qw in any order, or have quat or
-    quaternion in them.
-    """
-    words = [[word for word in re.split(r"[^a-z]+", name.lower()) if word] for name in names]
-    found: list[tuple[int, ...]] = []
-    place = 0
-    while place < len(words):
-        group: tuple[int, ...] = ()
-        if words[place] and words[place][-1] in _ANGLES and not {*words[place]} & {*_JOINTS}:
-            group = (place,)
-        for size, kinds in ((3, _VECTORS), (4, _QUATERNIONS)):
-            some = words[place : place + size]
-            if len(some) == size and any(_called(some, kind) for kind in kinds):
-                group = tuple(range(place, place + size))
-        if group:
-            found.append(group)
-        place += max(1, len(group))
-    return tuple(found)
-
-
-def _called(some: Sequence[Sequence[str]], kind: tuple[str, ...]) -> bool:
-    """Whether names end in these words, each in one, or all have them."""
-    if len(kind) == len(some):
-        return sorted(words[-1] if words else "" for words in some) == sorted(kind)
-    return all({*kind} <= {*words} for words in some)
 
 
 @dataclass(frozen=True)
@@ -154,6 +132,18 @@ class Embodiment:
     kinematics: Robot | None = None
 
     def __post_init__(self) -> None:
+        _as_tuples(self, "action_names", "arms", "state_names", "cameras")
+        for field_name in ("action_names", "state_names"):
+            given = getattr(self, field_name)
+            doubled = sorted({name for name in given if given.count(name) > 1})
+            if not given or doubled:
+                why = f"holds {doubled} more than once" if doubled else "is empty"
+                raise EmbodimentError(
+                    f"{self.robot}: {field_name} {why}; there is at least one number, and each has a name of"
+                    " its own"
+                )
+        if not 0 < self.fps < inf:
+            raise EmbodimentError(f"{self.robot}: fps={self.fps} must be frames per second, above 0")
         names = [camera.name for camera in self.cameras]
         if not names or len(set(names)) != len(names):
             raise EmbodimentError(f"{self.robot}: cameras {names} must be at least one, with different names")

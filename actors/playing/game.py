@@ -13,7 +13,8 @@ from actors.playing.controls import Controls
 from actors.playing.imagination import Imagined, ImaginedSide
 from envs.embodiment import Embodiment
 from envs.initial_states import InitialStates
-from envs.physics.suite import Array, Observation, TaskSuite, check_task
+from envs.physics.checked import observation, rendered
+from envs.physics.suite import Array, NoExpert, Observation, TaskSuite, check_task, expert_of
 from envs.rng import Stream, episode_rng
 
 Starts = Callable[[Observation, NDArray[np.uint8]], InitialStates]
@@ -103,7 +104,7 @@ class Game:
             task: "" keeps the task.
 
         Raises:
-            SuiteError: if there is no such task.
+            SuiteError: if there is no such task, or what the suite shows and says is not its embodiment's.
         """
         if task:
             check_task(task, self.tasks)
@@ -112,8 +113,8 @@ class Game:
         shown, starts = Shown(), None
         if self.suite is not None:
             self.suite.reset(self.task, seed)
-            self.seen = self.suite.observe()
-            shown.true = [self.suite.render()]
+            self.seen = observation(self.suite)
+            shown.true = [rendered(self.suite)]
             self.command = self.controls.start(self.seen.command)
             starts = self.starts(self.seen, shown.true[0]) if self.starts is not None else None
         if self.imagination is not None:
@@ -134,8 +135,11 @@ class Game:
             if self.suite is None:
                 raise Unplayable("the expert needs physics, which this task has not")
             shown = self.reset(self.seed)
-            expert = self.suite.expert(noise_level, episode_rng(self.seed, Stream.BEHAVIOUR))
-            self._driver = expert
+            rng = episode_rng(self.seed, Stream.BEHAVIOUR)
+            try:
+                self._driver = expert_of(self.suite, self.task, noise_level, rng)
+            except NoExpert as error:
+                raise Unplayable(str(error)) from error
         elif to == "recorded":
             if not 0 <= number < len(self.recorded):
                 raise Unplayable(f"recording {number} is not one of {len(self.recorded)}")
@@ -170,8 +174,8 @@ class Game:
                 break
             if self.suite is not None:
                 self.suite.step(action)
-                self.seen = self.suite.observe()
-                shown.true.append(self.suite.render())
+                self.seen = observation(self.suite, self.seen)
+                shown.true.append(rendered(self.suite))
             taken.append(np.asarray(action if self.seen is None else self.seen.command))
             # Grippers of delta actions stay where the keys left them, whatever the suite made of the action.
             self.command = np.asarray(action, dtype=np.float64) if self.robot.delta else taken[-1].copy()

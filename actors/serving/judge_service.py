@@ -28,7 +28,7 @@ from torch import Tensor
 from actors.factory import build_judge
 from actors.policies.contract import device_of
 from actors.process import prepare_process
-from envs.judges.base import Judge, JudgeError, Judgement
+from envs.judges.base import Judge, JudgeError, Judgement, checked
 from envs.ranges import Count, Natural, NonNegative, Positive
 from envs.specs import Status
 from envs.targets import ConfigError
@@ -163,7 +163,9 @@ class JudgeServer:
             torch.from_numpy(np.stack([clip[part] for clip in clips])).to(device) for part in (0, 1, 3)
         )
         seen = (features,) if self.judge.reads_features else ()
-        return self.judge.score(frames, first, [clip[2] for clip in clips], *seen)
+        return checked(
+            self.judge, self.judge.score(frames, first, [clip[2] for clip in clips], *seen), frames
+        )
 
 
 class JudgeClient(Judge):

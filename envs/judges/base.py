@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 
 from envs.files import named_files
 from envs.specs import Status
+from envs.targets import ConfigError
 
 if TYPE_CHECKING:
     from envs.simulators.base import Simulator
@@ -34,6 +36,10 @@ class Judgement(NamedTuple):
     success: Tensor
     progress: Tensor
     status: Tensor
+
+
+_SLACK = 1e-4  # by which rounding may carry a probability beyond 0..1
+_STATUS = tuple(status.value for status in Status)
 
 
 class MissingFeatures(ValueError):
@@ -145,7 +151,7 @@ class Judge(nn.Module):
 
     def fetch(self, ticket: Any) -> Judgement:
         """The judgement on what `submit` was given."""
-        return self.score(*ticket)
+        return ask(self, *ticket)
 
     @classmethod
     def check(cls, options: Mapping[str, Any]) -> None:
@@ -227,3 +233,58 @@ def judgement_status(success: Tensor) -> Tensor:
     """Status int64 [B] of probabilities [B, T]: ERROR where one is not finite, OK elsewhere."""
     bad = ~torch.isfinite(success).all(1)
     return torch.where(bad, Status.ERROR.value, Status.OK.value)
+
+
+def ask(judge: Judge, frames: Tensor, first: Tensor, instruction: list[str], *features: Tensor) -> Judgement:
+    """A judge's judgement on clips (see Judge.score), held to its contract.
+
+    Raises:
+        JudgeError: if it raises an error of its own, or answers something else than a judgement on them.
+    """
+    try:
+        judgement = judge.score(frames, first, instruction, *features)
+    except (JudgeError, MissingFeatures, ConfigError):
+        raise
+    except Exception as error:
+        step = traceback.extract_tb(error.__traceback__)[-1]
+        raise JudgeError(
+            f"judge: {type(judge).__name__}.score raised {type(error).__name__}: {error}"
+            f" ({step.filename}, line {step.lineno})"
+        ) from error
+    return checked(judge, judgement, frames)
+
+
+def checked(judge: Judge, judgement: Any, frames: Tensor) -> Judgement:
+    """What a judge answered on frames [B, T, ...], if it is a Judgement as that class says; its numbers as
+    float32 and int64.
+
+    Raises:
+        JudgeError: naming the judge's class and what is wrong.
+    """
+    says = f"judge: {type(judge).__name__}.score gives"
+    if not isinstance(judgement, Judgement):
+        raise JudgeError(f"{says} a {type(judgement).__name__}; give an envs.judges.base.Judgement")
+    batch, count = frames.shape[:2]
+    for name, value in judgement._asdict().items():
+        due, kind = ((batch,), "int64") if name == "status" else ((batch, count), "float32")
+        right = isinstance(value, Tensor) and tuple(value.shape) == due and value.dtype != torch.bool
+        if not right or value.is_floating_point() != (kind == "float32"):
+            found = (
+                f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+            )
+            raise JudgeError(
+                f"{says} {name} {found.removeprefix('torch.')} on {batch} clips of {count} frames; give"
+                f" {kind} {list(due)}"
+            )
+    success, progress, status = judgement.success.float(), judgement.progress.float(), judgement.status.long()
+    if not torch.isin(status, torch.tensor(_STATUS, device=status.device)).all():
+        raise JudgeError(f"{says} status {status.tolist()[:8]}; each is one of envs.specs.Status, {_STATUS}")
+    known = (status == Status.OK.value).unsqueeze(-1)
+    for name, numbers in (("success", success), ("progress", progress)):
+        odd = numbers[known.to(numbers.device) & ~((numbers >= -_SLACK) & (numbers <= 1 + _SLACK))]
+        if len(odd):
+            raise JudgeError(
+                f"{says} {name} {float(odd[0]):.4g} where its status is OK; give 0..1 (of a logit"
+                " its sigmoid, of percents a hundredth), or another status"
+            )
+    return Judgement(success, progress, status)

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from envs.physics.suite import Array, Observation, SuiteError, TaskSuite
+
+_SLACK = 1e-6  # by which rounding may carry progress beyond 0..1
 
 
 def rendered(suite: TaskSuite) -> NDArray[np.uint8]:
@@ -24,18 +30,90 @@ def rendered(suite: TaskSuite) -> NDArray[np.uint8]:
     return shown
 
 
-def first_observation(suite: TaskSuite) -> Observation:
-    """What the suite says at the start of an episode, with intrinsics and camera poses of those cameras that
-    its embodiment calls calibrated, and of no others. Ray maps and pose maps are drawn only once all episodes
-    are collected, which is too late to find that they cannot be.
+def observation(suite: TaskSuite, before: Observation | None = None) -> Observation:
+    """What the suite says, its numbers as arrays of floats, success a bool and progress a float.
+
+    At the start of an episode intrinsics and camera poses are held to what its embodiment calls calibrated,
+    too: ray maps and pose maps are drawn only once all episodes are collected, which is too late to find that
+    they cannot be.
+
+    Args:
+        before: what it said before in the same episode; None at its start.
 
     Raises:
-        SuiteError: if a camera's are missing, of another shape, not finite, or not announced; names it.
+        SuiteError: if that is not what Observation says; names the class and the field.
+        ValueError: if physics came to numbers that are not finite after the start; that is one episode's.
     """
-    seen = suite.observe()
-    for name, edge in (("intrinsic", 3), ("c2w", 4)):
-        _check_cameras(suite, name, getattr(seen, name), edge)
-    return seen
+    seen, robot = suite.observe(), suite.embodiment
+    says = f"task.suite: {type(suite).__name__}.observe gives"
+    if not isinstance(seen, Observation):
+        raise SuiteError(f"{says} a {type(seen).__name__}; give an envs.physics.suite.Observation")
+    if not isinstance(seen.instruction, str):
+        raise SuiteError(f"{says} instruction={seen.instruction!r}; give the task in words, as a text")
+    due: dict[str, tuple[int, ...]] = {"state": (robot.state_dim,), "command": (robot.action_dim,)}
+    if seen.poses is not None:
+        due["poses"] = (len(robot.arms), 7)
+    given = {name: _floats(says, name, getattr(seen, name), shape) for name, shape in due.items()}
+    given["progress"] = _floats(says, "progress", seen.progress, ())
+    progress = float(given["progress"])
+    for name, value in given.items():
+        if not np.isfinite(value).all():
+            kind = SuiteError if before is None else ValueError
+            raise kind(f"{says} {name} {value.tolist()}, which is not finite")
+    if not -_SLACK <= progress <= 1 + _SLACK:
+        raise SuiteError(f"{says} progress={progress:g}; it is RL's reward in physics: bring it to 0..1")
+    success = np.asarray(seen.success)
+    if success.dtype != bool or success.size != 1:
+        raise SuiteError(f"{says} success={seen.success!r}; give a bool")
+    if before is not None and before.success and not success.item():
+        raise SuiteError(
+            f"{says} success=False after it was True in the same episode; once true it stays true, or whoever"
+            " looks later counts a failure: keep it by HeldCondition (envs/physics/suite.py)"
+        )
+    if before is None:
+        for name, edge in (("intrinsic", 3), ("c2w", 4)):
+            _check_cameras(suite, name, getattr(seen, name), edge)
+    eyes = {"intrinsic": seen.intrinsic, "c2w": seen.c2w}
+    given |= {name: np.asarray(value) for name, value in eyes.items() if value is not None}
+    found = {**given, "progress": min(max(progress, 0.0), 1.0), "success": success.item()}
+    return replace(seen, **found)
+
+
+def privileged(suite: TaskSuite, before: Mapping[str, Sequence[Array]]) -> dict[str, Array]:
+    """What only physics knows.
+
+    Args:
+        before: by name, of the frames before in the same episode.
+
+    Raises:
+        SuiteError: if the shape of one changes.
+    """
+    known = suite.privileged()
+    for name, value in known.items():
+        rows = before.get(name)
+        if rows and np.shape(value) != np.shape(rows[0]):
+            raise SuiteError(
+                f"task.suite: {type(suite).__name__}.privileged gives {name} {list(np.shape(value))} after"
+                f" {list(np.shape(rows[0]))}; its shape is the suite's, whatever the task and the frame"
+            )
+    return known
+
+
+def _floats(says: str, name: str, given: Any, shape: tuple[int, ...]) -> Array:
+    """A field of an observation as an array of floats of this shape."""
+    try:
+        known = isinstance(given, np.ndarray) and given.dtype.kind == "f"
+        value = given if known else np.asarray(given, np.float64)
+    except (TypeError, ValueError) as error:
+        raise SuiteError(
+            f"{says} {name}={given!r}, which are no numbers; give float {list(shape)}"
+        ) from error
+    if given is None or (value.shape != shape and (shape or value.size != 1)):
+        found = "nothing" if given is None else f"numbers {list(value.shape)}"
+        raise SuiteError(
+            f"{says} {found} for {name}, of which its embodiment makes float {list(shape)}; correct either"
+        )
+    return value.reshape(shape)
 
 
 def _check_cameras(suite: TaskSuite, name: str, given: Array | None, edge: int) -> None:

@@ -28,6 +28,10 @@ class SuiteError(ConfigError):
     """A task suite cannot be built from its config; the message names the key and the fix."""
 
 
+class NoExpert(SuiteError):
+    """Nobody has scripted a behaviour for a task; the message says what can be done without."""
+
+
 @dataclass
 class Observation:
     """What a bench says of its robot and task between two actions; pictures come from `TaskSuite.render`.
@@ -112,6 +116,8 @@ class TaskSuite(ABC):
 
         Raises:
             ValueError: if the noise level lies outside [0, 1].
+            NotImplementedError: if the task has none; see expert_of. One that has random actions alone gives
+                them at noise level 1.
         """
 
     def segment(self) -> NDArray[np.uint8] | None:
@@ -224,6 +230,23 @@ def check_noise_level(noise_level: float) -> None:
     """
     if not 0.0 <= noise_level <= 1.0:
         raise ValueError(f"noise_level={noise_level} must lie in [0, 1]: 0 is the expert, 1 is random")
+
+
+def expert_of(suite: TaskSuite, task: str, noise_level: float, rng: np.random.Generator) -> Expert:
+    """The suite's scripted behaviour for the episode of `task` that was just reset; see TaskSuite.expert.
+
+    Raises:
+        NoExpert: if there is none.
+    """
+    try:
+        return suite.expert(noise_level, rng)
+    except NotImplementedError as error:
+        raise NoExpert(
+            f"task.suite: {type(suite).__name__}.expert has no behaviour of noise level {noise_level:g} for"
+            f" task {task!r} (NotImplementedError: {error}); write one, choose other tasks by task.name, or"
+            " learn from recordings (task=lerobot task.data=[<folder>]); random actions, which suites give at"
+            " noise level 1, can be had alone by collect.mix={expert: 0, noisy: 0, random: 1}"
+        ) from error
 
 
 def build_suite(section: Mapping[str, Any]) -> TaskSuite:

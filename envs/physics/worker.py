@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.checked import first_observation, rendered
-from envs.physics.suite import Array, Observation, TaskSuite, build_suite, check_task, task_of
+from envs.physics.checked import observation, privileged, rendered
+from envs.physics.suite import Array, Observation, TaskSuite, build_suite, check_task, expert_of, task_of
 from envs.rng import Stream, episode_rng
 from envs.targets import ConfigError
 
@@ -59,7 +59,7 @@ class Track:
         for name, value in row.items():
             if value is not None:
                 self.rows.setdefault(name, []).append(np.array(value))
-        for name, value in {"progress": observed.progress, **suite.privileged()}.items():
+        for name, value in {"progress": observed.progress, **privileged(suite, self.privileged)}.items():
             self.privileged.setdefault(name, []).append(np.array(value))
 
     def __len__(self) -> int:
@@ -93,6 +93,7 @@ class Slot:
     steps: int = 0
     over: bool = True
     track: Track | None = None
+    observed: Observation | None = None
 
 
 class Worker:
@@ -121,7 +122,7 @@ class Worker:
         """Start episodes {slot: seed}; returns an observation per slot.
 
         Raises:
-            SuiteError: if pictures or calibration are not what the embodiment says.
+            SuiteError: if what it shows or says is not what its embodiment announces.
         """
         self._exchange({index: task_of(self.spec.tasks, seed) for index, seed in seeds.items()})
         out = {}
@@ -129,7 +130,7 @@ class Worker:
             slot = self.slots[index]
             self._lay_out(slot.suite, seed)
             slot.steps, slot.over, slot.track = 0, False, None
-            observed = first_observation(slot.suite)
+            slot.observed = observed = observation(slot.suite)
             if record:
                 slot.track = Track(seed, observed.instruction, observed.intrinsic)
                 slot.track.add(slot.suite, observed)
@@ -161,11 +162,12 @@ class Worker:
         out = {}
         for index, chunk in chunks.items():
             slot = self.slots[index]
-            observed = slot.suite.observe()
+            observed = slot.observed
+            assert observed is not None  # it was reset
             for command in () if slot.over else chunk:
                 slot.suite.step(command)
                 slot.steps += 1
-                observed = slot.suite.observe()
+                slot.observed = observed = observation(slot.suite, observed)
                 if slot.track is not None:
                     slot.track.add(slot.suite, observed)
                 self._alive()
@@ -177,24 +179,27 @@ class Worker:
 
     def script(self, jobs: list[tuple[int, float]], chunk: int | None) -> list[Track]:
         """Whole episodes of scripted behaviours for (seed, noise_level) pairs; recorded to the horizon, or to
-        the end of the `chunk` actions in which they succeed, if it is not None.
+        the end of the `chunk` actions in which they succeed, if it is not None. Without a horizon, where
+        nobody acts, no behaviour is asked for.
 
         Raises:
             SuiteError: see reset.
+            NoExpert: if a task has no such behaviour.
         """
         out = []
         suite = self.slots[0].suite
         for seed, noise_level in jobs:
             self._lay_out(suite, seed)
-            act = suite.expert(noise_level, episode_rng(seed, Stream.BEHAVIOUR))
-            observed = first_observation(suite)
+            task, rng = task_of(self.spec.tasks, seed), episode_rng(seed, Stream.BEHAVIOUR)
+            act = expert_of(suite, task, noise_level, rng) if self.spec.horizon else None
+            observed = observation(suite)
             track = Track(seed, observed.instruction, observed.intrinsic)
             track.add(suite, observed)
             for step in range(self.spec.horizon):
-                if observed.success and chunk is not None and step % chunk == 0:
+                if act is None or (observed.success and chunk is not None and step % chunk == 0):
                     break
                 suite.step(act())
-                observed = suite.observe()
+                observed = observation(suite, observed)
                 track.add(suite, observed)
                 self._alive()
             out.append(track)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from envs.judges.base import Judge, Judgement
+from envs.judges.base import Judge, Judgement, ask
 from envs.simulators.features import pooled
 from envs.specs import FEATURES, FRAMES, IMAGE, JUDGE_STATUS, PROGRESS, SUCCESS, Rewards, Status
 
@@ -63,7 +63,7 @@ class JudgeReward(Transform):
             )
             next_tensordict[JUDGE_STATUS] = torch.full_like(self._run, Status.OK.value).unsqueeze(-1)
             return next_tensordict.exclude(FRAMES, FEATURES, "world")
-        self._decide(self.judge.score(*clips), next_tensordict)
+        self._decide(ask(self.judge, *clips), next_tensordict)
         return next_tensordict.exclude(FRAMES, FEATURES, "world")
 
     def forget(self) -> None:
@@ -128,7 +128,7 @@ class JudgeReward(Transform):
         shown = [image.unsqueeze(1), world.opening, world.instructions]
         if self.judge.reads_features:
             shown.append(world.features_now()[:, None])
-        judgement = self.judge.score(*shown)
+        judgement = ask(self.judge, *shown)
         known = judgement.status == Status.OK.value
         return torch.where(known.unsqueeze(-1), judgement.progress, 0.0), judgement.status
 

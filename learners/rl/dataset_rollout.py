@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from actors.policies.contract import VISUAL_FEATURES, feature_part, inputs_for, writes_features
 from envs.episodes.clips import ClipStore
-from envs.judges.base import Judge
+from envs.judges.base import Judge, ask
 from envs.specs import IMAGE, INSTRUCTION_UTF8, STATE, Rewards, Status
 from learners.stages.observed import observe
 
@@ -104,8 +104,8 @@ def _told(
     """Progress float32 [N, T] in recorded frames `rows` [N, T]; NaN where the judge does not know."""
     device = judge.threshold.device
     first, texts = store.frames(store.start[episodes]), [store.instructions[n] for n in episodes.tolist()]
-    read = () if features is None else (features.to(device),)  # others' judges need not know the word
-    said = judge.score(store.frames(rows).to(device), first.to(device), texts, *read)
+    read = () if features is None else (features.to(device),)
+    said = ask(judge, store.frames(rows).to(device), first.to(device), texts, *read)
     known = (said.status == Status.OK.value)[:, None].cpu() & store.arrays["present"][rows]
     return torch.where(known, said.progress.float().cpu(), torch.nan)
 

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.episodes.clips import ClipStore
-from envs.judges.base import Judge, MissingFeatures
+from envs.judges.base import Judge, MissingFeatures, ask
 from envs.judges.labels import progress_to_success, success_labels
 from envs.specs import Status
 from envs.targets import ConfigError
@@ -197,7 +197,7 @@ def judge_recordings(
     for some in torch.arange(len(episodes)).split(batch):
         texts = [store.instructions[number] for number in episodes[some].tolist()]
         seen = () if features is None else (features[some],)
-        judgement = judge.score(store.frames(rows[some]), first[some], texts, *seen)
+        judgement = ask(judge, store.frames(rows[some]), first[some], texts, *seen)
         known = (judgement.status == Status.OK.value).unsqueeze(-1)
         parts.append(torch.where(known, valid[some] * judgement.success.float(), torch.nan))
     return torch.cat(parts)

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from actors.factory import build_pool
 from actors.world_config import embodiment_of
 from envs.episodes.filming import side_by_side, write_film
-from envs.machine import available_cores
-from envs.physics.pool import TaskPool
 from envs.physics.suite import task_names
 from envs.physics.worker import Track
 from envs.rng import Purpose, episode_seeds
@@ -90,8 +89,7 @@ def _play(cfg: Mapping[str, Any], changes: Mapping[str, Any], level: float) -> d
     """Scripted episodes by task."""
     task, names = cfg["task"], task_names(cfg["task"]["name"])
     seeds = episode_seeds(0, Purpose.EVALUATE, cfg["evaluate"]["episodes"] * len(names))
-    workers = cfg["launch"]["workers"] or available_cores()
-    pool = TaskPool({**task["suite"], **changes}, task["name"], workers, task["horizon"], workers)
+    pool = build_pool(cfg, changes)
     out = {name: Outcomes() for name in names}
     try:
         for begin in range(0, len(seeds), _AT_ONCE):

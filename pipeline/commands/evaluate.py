@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from actors.factory import build_physics, build_policy
+from actors.factory import at_once, build_physics, build_policy
 from actors.rollouts.evaluate import evaluate
 from envs.rng import Purpose, episode_seeds
 from envs.targets import ConfigError
@@ -65,7 +65,11 @@ def _line(success: Tensor, counted: Tensor) -> str:
 def _physics(cfg: Cfg, changes: Cfg) -> tuple[Any, list[int], list[str]]:
     section = cfg["evaluate"]
     seeds = episode_seeds(cfg["seed"], Purpose.EVALUATE, section["episodes"])
-    return build_physics(cfg, section["envs"], changes=changes), seeds, tasks_of_seeds(cfg, seeds)
+    return (
+        build_physics(cfg, at_once(cfg, section["envs"]), changes=changes),
+        seeds,
+        tasks_of_seeds(cfg, seeds),
+    )
 
 
 def _imagined(cfg: Cfg, graph: Graph) -> tuple[Any, list[int], list[str]]:

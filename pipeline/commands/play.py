@@ -18,6 +18,7 @@ from actors.world_config import build_kinematics, embodiment_of, pose_style, wor
 from envs.embodiment import Embodiment
 from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.initial_states import InitialStates
+from envs.physics.checked import observation, rendered
 from envs.physics.suite import Observation, TaskSuite, build_suite, task_names, task_of
 from envs.targets import ConfigError
 from pipeline.acting import acting
@@ -63,7 +64,7 @@ def build_game(cfg: Cfg, world: Mapping[str, Path], actions: Path | None = None)
         return Game(robot, tasks, suite, None, None, recorded)
     begin = partial(_start, cfg)
     suite.reset(tasks[0], 0)
-    imagination = _imagination(cfg, world, begin(suite.observe(), suite.render()))
+    imagination = _imagination(cfg, world, begin(observation(suite), rendered(suite)))
     return Game(robot, tasks, suite, imagination, begin, recorded)
 
 

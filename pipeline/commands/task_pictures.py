@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from envs.episodes.filming import Picture, side_by_side, titled, write_gif
-from envs.physics.suite import build_suite, task_names
+from envs.physics.suite import Expert, NoExpert, TaskSuite, build_suite, expert_of, task_names
 from envs.rng import Stream, episode_rng
 
 _TILE, _COLUMNS = 112, 10  # pixels of a scene's picture, and pictures in a row
@@ -65,13 +65,20 @@ def _sheet(task: Mapping[str, Any], groups: Mapping[str, list[str]]) -> Picture:
 
 
 def _episode(task: Mapping[str, Any], name: str) -> list[Picture]:
-    """All views of an expert's episode side by side, under the words."""
+    """All views of an expert's episode side by side, under the words; of a task without one, its start."""
     suite = build_suite(task["suite"])
     suite.reset(name, _SEED)
-    act, frames = suite.expert(0.0, episode_rng(_SEED, Stream.BEHAVIOUR)), []
+    act, frames = _expert(suite, name), list[Picture]()
     for _ in range(task["horizon"]):
         frames += titled(side_by_side(suite.picture(_GIF)[None]), suite.observe().instruction)
-        if suite.observe().success:
+        if act is None or suite.observe().success:
             break
         suite.step(act())
     return [*frames, *[frames[-1]] * 3]
+
+
+def _expert(suite: TaskSuite, name: str) -> Expert | None:
+    try:
+        return expert_of(suite, name, 0.0, episode_rng(_SEED, Stream.BEHAVIOUR))
+    except NoExpert:
+        return None

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from actors.policies.safe import SafePolicyWrapper
 from envs.episodes.clips import ClipStore
 from envs.initial_states import DecisionPoints
-from envs.judges.base import Judge
+from envs.judges.base import Judge, ask
 from envs.physics.env import PhysicsEnv
 from envs.rng import resampling_generator
 from envs.specs import CHUNK, IMAGE, LOST, PROGRESS, SUCCESS, to_chunk
@@ -135,7 +135,7 @@ def carry_out(
             chunk[mine] = chunks[number, mine].to(chunk.device)
         acted[CHUNK] = chunk
         after = physics.step(acted)
-        judgement = judge.score(after["next", IMAGE].unsqueeze(1), first, texts)
+        judgement = ask(judge, after["next", IMAGE].unsqueeze(1), first, texts)
         done, run = judge.streak(judgement.success.cpu().expand(-1, physics.chunk), run)
         told |= done.any(1)
         progress = torch.where(told, 1.0, judgement.progress[:, 0].cpu())

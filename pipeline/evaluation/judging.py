@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from envs.episodes.clips import ClipStore
-from envs.judges.base import Judge
+from envs.judges.base import Judge, ask
 from envs.simulators.base import Simulator
 from envs.simulators.features import features_of_episodes
 from envs.simulators.replay import Replay
@@ -64,7 +64,7 @@ def judge_frames(
         first = store.frames(store.start[episodes[some]])
         texts = [store.instructions[n] for n in episodes[some].tolist()]
         seen = (features[some].to(device),) if judge.reads_features and features is not None else ()
-        verdict = judge.score(frames[some].to(device), first.to(device), texts, *seen)
+        verdict = ask(judge, frames[some].to(device), first.to(device), texts, *seen)
         scores.append([value.cpu() for value in verdict])
     return Scores(*(torch.cat(parts) for parts in zip(*scores, strict=True)))
 

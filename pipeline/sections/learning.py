@@ -17,7 +17,8 @@ class TaskSection:
     """Section task: a suite (physics), or recordings (data).
 
     `variants` are options of the suite, by a name of their own, under which policies and experts are tried as
-    well: other scenes, other words.
+    well: other scenes, other words. `envs` bounds how many episodes are laid out side by side, each in a
+    suite of its own, wherever the suite is played; None leaves that to whoever plays.
     """
 
     suite: Choice | None
@@ -27,6 +28,7 @@ class TaskSection:
     horizon: Count
     mode: Literal["relative", "absolute"]
     data: Sequence[str] = ()
+    envs: Count | None = None
     variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 

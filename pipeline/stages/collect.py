@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from actors.factory import build_physics, build_policy, build_pool, open_clips
+from actors.factory import at_once, build_physics, build_policy, build_pool, open_clips
 from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
 from actors.world_config import world_spec
@@ -218,8 +218,14 @@ def deploy(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 
 def split_counts(episodes: int, shares: Mapping[str, float]) -> dict[str, int]:
-    """Episodes per split, in the order of SPLITS; those in `shares` get at least one, train gets the rest."""
-    counts = {name: max(1, round(shares[name] * episodes)) for name in SPLITS if name in shares}
+    """Episodes per split, in the order of SPLITS: the first one is for learning, those in `shares` get at
+    least one of the others as far as they go, and train the rest.
+    """
+    left, counts = max(0, episodes - 1), dict[str, int]()
+    for name in SPLITS:
+        if name in shares:
+            counts[name] = min(left, max(1, round(shares[name] * episodes)))
+            left -= counts[name]
     return {"train": episodes - sum(counts.values()), **counts}
 
 
@@ -227,7 +233,7 @@ def run_recorded(cfg: Cfg, policy: Any, seeds: list[int], stochastic: bool = Tru
     """Recorded episodes of a policy in physics, in the order of the seeds, as many at once as run side by
     side; those in which physics crashes again and again are missing.
     """
-    env = build_physics(cfg, batch=min(_SIDE_BY_SIDE, len(seeds)), record=True)
+    env = build_physics(cfg, batch=at_once(cfg, min(_SIDE_BY_SIDE, len(seeds))), record=True)
     try:
         for begin in range(0, len(seeds), env.batch_size[0]):
             part = seeds[begin : begin + env.batch_size[0]]

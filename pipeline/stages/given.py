@@ -25,7 +25,7 @@ Cfg = Mapping[str, Any]
 
 # Config sections behind the task, the shapes of a robot's world, a policy for it, the imagined world, and
 # physics. Variants of a task are for evaluation alone: one more makes nothing else out of date.
-TASK = tuple(f"task.{key}" for key in ("suite", "name", "size", "chunk", "horizon", "mode", "data"))
+TASK = tuple(f"task.{key}" for key in ("suite", "name", "size", "chunk", "horizon", "mode", "data", "envs"))
 ROBOT = (
     *("seed", *TASK, "simulator.kinematics"),
     *("simulator.pose_map", "simulator.pose_map_style", "simulator.ray_map"),

@@ -11,7 +11,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from actors.factory import build_judge, build_physics, build_policy, build_simulator, build_state_decoder
+from actors.factory import (
+    at_once,
+    build_judge,
+    build_physics,
+    build_policy,
+    build_simulator,
+    build_state_decoder,
+)
 from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
 from envs.episodes.filming import side_by_side, write_film
@@ -112,7 +119,7 @@ def _true_success(cfg: Cfg, folder: Path, inputs: Inputs, changes: Mapping[str, 
     section = cfg["evaluate"]
     prepare_process(cfg["seed"], cfg["threads"])
     policy = build_policy(cfg, inputs.weights("policy"))
-    env = build_physics(cfg, section["envs"], changes=changes)
+    env = build_physics(cfg, at_once(cfg, section["envs"]), changes=changes)
     began = time.perf_counter()
     try:
         seeds = episode_seeds(cfg["seed"], Purpose.EVALUATE, section["episodes"])

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from actors.factory import build_physics, build_policy
+from actors.factory import at_once, build_physics, build_policy
 from actors.rollouts.evaluate import evaluate
 from actors.rollouts.host import Weights
 from envs.rng import Purpose, episode_seeds
@@ -38,7 +38,7 @@ def true_success(cfg: Cfg, settings: RLConfig, policy: Path | None) -> Watch | N
             with torch.no_grad():
                 for name, value in weights.items():
                     known[name].copy_(torch.tensor(value))
-            env = build_physics(cfg, min(_SIDE_BY_SIDE, len(seeds)))
+            env = build_physics(cfg, at_once(cfg, min(_SIDE_BY_SIDE, len(seeds))))
             try:
                 outcome = evaluate(env, replica, seeds, label=f"physics after {iteration + 1}")
             finally:

@@ -182,10 +182,12 @@ class LeRobotWriter:
             )
             if differing:
                 name = differing[0]
+                fix = "write it to another data set"
+                if name.startswith(names.PRIVILEGED):
+                    fix = "shapes of what TaskSuite.privileged gives are the suite's, whatever the task"
                 raise EpisodeError(
                     f"{self.root}: feature {name} is {wanted.get(name, 'absent')} in the data set, but"
-                    f" {found.get(name, 'absent')} in episode {episode.seed} of {episode.source}; write it to"
-                    " another data set"
+                    f" {found.get(name, 'absent')} in episode {episode.seed} of {episode.source}; {fix}"
                 )
         return dict(features)
 

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from actors.factory import (
+    at_once,
     build_judge,
     build_physics,
     build_policy,
@@ -77,7 +78,7 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
         *(cfg, simulator, decoder, judge, points, len(which) * futures),
         horizon=depth * int(cfg["task"]["chunk"]),
     )
-    physics = build_physics(cfg, min(_SIDE_BY_SIDE, len(which) * futures))
+    physics = build_physics(cfg, at_once(cfg, min(_SIDE_BY_SIDE, len(which) * futures)))
     policy = SafePolicyWrapper(build_policy(cfg, inputs.weights("policy")), physics.spec, physics.mode)
     seed_process(cfg["seed"])
     try:

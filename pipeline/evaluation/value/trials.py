@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from actors.factory import build_physics, build_pool
+from actors.factory import at_once, build_physics, build_pool
 from actors.policies.recorded import Commands, RecordedActions
 from actors.rollouts.evaluate import Outcome, evaluate
 from envs.judges.base import Judge
@@ -77,7 +77,7 @@ class Physics:
         return {"off": torch.stack([(row.float() - begun).abs().flatten(1).mean(1) for row in first])}
 
     def _physics(self, seeds: int) -> PhysicsEnv:
-        width = min(self.cfg["evaluate"]["envs"], seeds)
+        width = at_once(self.cfg, min(self.cfg["evaluate"]["envs"], seeds))
         if self._env is None or self._env.batch_size[0] != width:
             self._close_env()
             self._env = build_physics(self.cfg, width)

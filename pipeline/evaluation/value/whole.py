@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from envs.judges.base import Judge, Judgement
+from envs.judges.base import Judge, Judgement, ask
 from envs.specs import Status
 
 
@@ -48,7 +48,7 @@ class Onlooker(Judge):
             return Judgement(nobody, nobody, fine)
         whole = [torch.cat(parts, 1) for parts in zip(*self._seen, strict=True)]
         self._seen, self._first = [], None
-        found = self.judge.score(whole[0], first.cpu(), instruction, *whole[1:])
+        found = ask(self.judge, whole[0], first.cpu(), instruction, *whole[1:])
         every = torch.ones(found.success.shape, dtype=torch.bool, device=found.success.device)
         won = self.judge.episode(found.success, every).to(frames.device)
         success = won[:, None].float().expand_as(nobody)

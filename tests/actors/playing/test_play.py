@@ -36,6 +36,7 @@ from tests.embodiments import (
     recorded_cameras,
     world_spec,
 )
+from tests.envs.physics.sections import Scriptless
 from tests.envs.simulators.test_engines import build_engine
 from tests.envs.test_world import Fixed
 
@@ -75,6 +76,13 @@ def game(imagined: bool = False) -> Game:
     side = imagination(suite.embodiment) if imagined else None
     recorded = [Recorded("0: seed 7", "reach", 7, ACTIONS)]
     return Game(suite.embodiment, suite.tasks, suite, side, starts if imagined else None, recorded)
+
+
+class NumpyBacked(Scriptless):
+    """Counts, and answers with NumPy's own truths and numbers."""
+
+    def observe(self) -> Observation:
+        return replace(super().observe(), success=np.bool_(True), progress=np.float32(0.5))  # type: ignore
 
 
 def test_keys_move_what_their_names_say() -> None:
@@ -121,6 +129,15 @@ def test_a_person_the_expert_and_a_recording_drive_physics() -> None:
         played.hand_over("recorded", 1)
     with pytest.raises(Unplayable, match=r"actions=2 must lie in 1\.\.1"):
         played.press({}, 1.0, 2)
+
+
+def test_a_task_without_an_expert_is_played_by_hand() -> None:
+    suite = Scriptless("")
+    played = Game(suite.embodiment, suite.tasks, suite, None)
+    played.reset(7)
+    with pytest.raises(Unplayable, match=r"Scriptless\.expert has no behaviour of noise level 0 for task"):
+        played.hand_over("expert")
+    assert played.driven_by == "keys" and len(played.press({}, 1.0, 1).true) == 1
 
 
 def test_both_sides_take_the_same_actions() -> None:
@@ -232,3 +249,16 @@ def test_a_page_of_another_origin_cannot_play() -> None:
             assert answer.status == status, origin
 
     in_browser(talk)
+
+
+def test_truths_and_numbers_of_numpy_reach_the_page() -> None:
+    async def asked() -> dict[str, Any]:
+        suite = NumpyBacked("")
+        server = PlayServer(lambda: Game(suite.embodiment, suite.tasks, suite, None))
+        async with TestClient(TestServer(server.app())) as client:
+            answer = await client.post("/api/step", json={"actions": 1, "held": {}})
+            assert answer.status == 200, await answer.text()
+            found: dict[str, Any] = await answer.json()
+            return found
+
+    assert asyncio.run(asked())["true"] == {"success": True, "progress": 0.5}

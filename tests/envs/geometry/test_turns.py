@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from actors.policies.proprioception import Proprioception
 from envs.conditioning.turns import Turns
 from envs.conditioning.units import Units
-from envs.embodiment import orientations
 from envs.episodes.angles import turned_steadily
+from envs.orientations import orientations
 from tests.embodiments import ARM_JOINTS, BIMANUAL_POSES
 
 QUATERNION = ("x", "y", "z", "qx", "qy", "qz", "qw")

@@ -89,6 +89,15 @@ class Counting(TaskSuite):
         return lambda: np.array([noise_level * 2])
 
 
+class Scriptless(Counting):
+    """Counts, and has no scripted behaviour but random actions."""
+
+    def expert(self, noise_level: float, rng: np.random.Generator) -> Expert:
+        if noise_level < 1:
+            raise NotImplementedError("nobody has written it")
+        return super().expert(0.0, rng)
+
+
 class Solved(Tabletop):
     """The table top, whose block is put where it belongs before the first action."""
 

@@ -1,17 +1,20 @@
-"""Pictures and calibration that are not what a suite's embodiment says, found before anything is recorded."""
+"""What a suite shows and says and its embodiment does not, found before anything is recorded."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from envs.embodiment import Camera
-from envs.episodes import Episode
+from envs.episodes import Episode, LeRobotWriter
+from envs.episodes.episode import EpisodeError
+from envs.physics.checked import observation
 from envs.physics.pool import TaskPool
-from envs.physics.suite import Observation
+from envs.physics.suite import Array, Observation, SuiteError
 from envs.targets import ConfigError
 from tests.envs.physics.sections import Counting
 
@@ -89,3 +92,125 @@ def test_cameras_that_are_not_calibrated_are_nan_among_others() -> None:
     pool.close()
     episode = Episode.from_track(track, "expert", TwoCameras("").embodiment)
     assert episode.c2w is not None and np.isnan(episode.c2w[:, 1]).all() and len(episode) == 9
+
+
+SAID: dict[str, dict[str, Any]] = {
+    "lists": {"state": [3], "command": [0.0], "success": np.bool_(False), "progress": np.float32(0.25)},
+    "arrays": {"success": np.zeros(1, bool), "progress": np.full(1, 0.25), "command": np.zeros(1, int)},
+    "no state": {"state": None},
+    "long state": {"state": np.zeros(2)},
+    "words for numbers": {"command": ["left"]},
+    "no words": {"instruction": None},
+    "much progress": {"progress": 7.5},
+    "less than none": {"progress": -0.1},
+    "many progresses": {"progress": np.zeros(2)},
+    "unknown progress": {"progress": np.nan},
+    "infinite": {"state": np.array([np.inf])},
+    "numbers for success": {"success": 0.0},
+    "no arms": {"poses": np.zeros((1, 7))},
+}
+
+
+class Saying(Counting):
+    """Counts, and says of itself what SAID has under `what` from its frame `since`, and in no more than
+    `frames` of them.
+    """
+
+    def __init__(self, what: str, since: int = 0, frames: int = 99):
+        super().__init__("")
+        self.what, self.since, self.frames = what, since, frames
+        self.reset("count", 0)
+
+    def reset(self, task: str, seed: int) -> None:
+        super().reset(task, seed)
+        self.tick = 0
+
+    def step(self, action: Array) -> None:
+        super().step(action)
+        self.tick += 1
+
+    def observe(self) -> Observation:
+        now = self.since <= self.tick < self.since + self.frames
+        said = {"won": {"success": True}, "more things": {}, **SAID}[self.what] if now else {}
+        return replace(super().observe(), **said)
+
+    def privileged(self) -> dict[str, Array]:
+        many = self.what == "more things" and self.tick >= self.since
+        return {"object_poses": np.zeros((1 + many, 3))}
+
+
+def saying(what: str, **how: int) -> TaskPool:
+    return TaskPool({"_target_": f"{__name__}.Saying", "what": what, **how}, "count", 1, 8, 1)
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("no state", r"gives nothing for state, of which its embodiment makes float \[1\]"),
+        ("long state", r"gives numbers \[2\] for state, .* float \[1\]; correct either"),
+        ("words for numbers", r"gives command=\['left'\], which are no numbers; give float \[1\]"),
+        ("no words", r"gives instruction=None; give the task in words"),
+        ("much progress", r"gives progress=7\.5; it is RL's reward in physics: bring it to 0\.\.1"),
+        ("less than none", r"gives progress=-0\.1; "),
+        ("many progresses", r"gives numbers \[2\] for progress"),
+        ("unknown progress", r"gives progress nan, which is not finite"),
+        ("infinite", r"gives state \[inf\], which is not finite"),
+        ("numbers for success", r"gives success=0\.0; give a bool"),
+        ("no arms", r"gives numbers \[1, 7\] for poses, .* float \[0, 7\]"),
+    ],
+)
+def test_what_an_observation_cannot_hold_is_refused_at_the_start(what: str, said: str) -> None:
+    with pytest.raises(SuiteError, match=rf"^task\.suite: Saying\.observe {said}"):
+        observation(Saying(what))
+
+
+@pytest.mark.parametrize("what", ["lists", "arrays"])
+def test_what_can_be_brought_to_the_contract_is(what: str) -> None:
+    seen = observation(Saying(what))
+    assert (seen.success, seen.progress) == (False, 0.25)
+    assert type(seen.success) is bool and type(seen.progress) is float
+    assert seen.state.shape == seen.command.shape == (1,) and seen.command.dtype == np.float64
+
+
+def test_a_success_that_is_taken_back_is_refused_wherever_it_is_played() -> None:
+    for ask in (lambda pool: pool.script([(0, 0.0)], None), _played):
+        pool = saying("won", since=1, frames=2)
+        with pytest.raises(
+            ConfigError, match=r"Saying\.observe gives success=False after it was True .*Held"
+        ):
+            ask(pool)
+        pool.close()
+    pool = saying("won", since=1)
+    (track,) = pool.script([(0, 0.0)], None)
+    pool.close()
+    assert [bool(row) for row in track.rows["success"]] == [False] + 8 * [True]
+
+
+def _played(pool: TaskPool) -> None:
+    pool.reset({0: 0}, False)
+    pool.step({0: np.zeros((4, 1))})
+
+
+def test_numbers_that_physics_blows_up_cost_an_episode_and_not_the_run() -> None:
+    pool = saying("infinite", since=2)
+    assert not pool.script([(3, 0.0)], 1) and pool.lost == [3]
+    pool.close()
+
+
+def test_shapes_of_what_only_physics_knows_stay() -> None:
+    pool = saying("more things", since=2)
+    with pytest.raises(
+        ConfigError, match=r"privileged gives object_poses \[2, 3\] after \[1, 3\]; its shape"
+    ):
+        pool.script([(0, 0.0)], 1)
+    pool.close()
+
+
+def test_shapes_that_hang_on_the_task_are_told_where_episodes_meet(tmp_path: Path) -> None:
+    robot, made = Saying("lists").embodiment, []
+    for since in (0, 99):
+        pool = saying("more things", since=since)
+        made.append(Episode.from_track(pool.script([(since, 0.0)], 1)[0], "expert", robot))
+        pool.close()
+    with pytest.raises(EpisodeError, match=r"privileged\.object_poses .*are the suite's, whatever the task"):
+        LeRobotWriter(tmp_path, robot).write(made)

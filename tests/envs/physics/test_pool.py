@@ -243,6 +243,23 @@ def test_what_cannot_be_built_is_a_config_error(workers: int) -> None:
         TaskPool({"_target_": "no_such_package.Suite"}, "count", 2, 8, workers)
 
 
+def test_a_task_without_an_expert_is_told_at_once_and_its_random_actions_play() -> None:
+    suite = {"_target_": "tests.envs.physics.sections.Scriptless", "fault": ""}
+    pool = TaskPool(suite, "count", 2, 8, 2)
+    mine = pool.processes()
+    said = r"Scriptless\.expert has no behaviour of noise level 0\.5 for task 'count' .*nobody has written it"
+    with pytest.raises(ConfigError, match=rf"task\.suite: {said}.*collect\.mix="):
+        pool.script([(0, 1.0), (1, 0.5)], 1)
+    assert not pool.lost and pool.processes()[1:] == mine[1:]
+    (track,) = pool.script([(2, 1.0)], 1)
+    pool.close()
+    assert len(track) == 9
+    pool = TaskPool(suite, "count", 1, 0, 1)  # no step, so nobody is asked
+    (track,) = pool.script([(2, 0.0)], 1)
+    pool.close()
+    assert len(track) == 1
+
+
 def test_other_classes_are_no_suites() -> None:
     with pytest.raises(ConfigError, match="TaskSuite"):
         build_suite({"_target_": "fractions.Fraction", "numerator": 1})

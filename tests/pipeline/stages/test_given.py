@@ -55,6 +55,13 @@ def test_splits_add_up_and_none_is_empty() -> None:
     }
 
 
+def test_few_episodes_are_first_of_all_for_learning() -> None:
+    shares = {"held_out": 0.125, "calibration": 0.25}
+    for episodes, due in ((0, (0, 0, 0)), (1, (1, 0, 0)), (2, (1, 1, 0)), (4, (2, 1, 1))):
+        assert tuple(split_counts(episodes, shares).values()) == due
+    assert split_counts(4, {"held_out": 0.9, "calibration": 0.1})["train"] == 1
+
+
 def test_a_shard_that_is_spoiled_before_the_stage_ends_is_found(tmp_path: Path) -> None:
     cfg = load_config(["experiment=soak", "collect.episodes={train: 1, held_out: 1, calibration: 1}"])
     cfg["collect"]["shard"], cfg["launch"]["workers"] = 2, 1
@@ -122,6 +129,19 @@ def test_starts_that_crash_physics_are_dropped_and_counted(
     said = stage.run(stage.view("odd", cfg, asked), tmp_path, Inputs(settings=asked))
     assert (said[made], said["dropped"]) == (2, 1)
     assert said.get("physics_episodes", {"first frames": 2}) == {"first frames": 2}
+
+
+def test_starts_and_random_episodes_need_no_expert(tmp_path: Path) -> None:
+    cfg = load_config(["experiment=soak", "launch.workers=1", "extra_starts.episodes=3"])
+    suite = {"_target_": "tests.envs.physics.sections.Scriptless", "fault": ""}
+    cfg["task"] |= {"suite": suite, "variants": {"odd": {}}}
+    cfg["task"] |= {"name": "count", "size": [4, 4], "horizon": 4, "mode": "absolute"}
+    asked = {"variant": "odd"}
+    said = first_frames.run(first_frames.view("odd", cfg, asked), tmp_path, Inputs(settings=asked))
+    assert (said["starts"], said["dropped"]) == (3, 0)
+    cfg["collect"]["mix"] = {"expert": 0, "noisy": 0, "random": 1}
+    cfg["collect"]["episodes"] = {"train": 2, "held_out": 1, "calibration": 1}
+    assert collect.run(collect.view("collect", cfg, {}), tmp_path / "random", Inputs())["episodes"] == 4
 
 
 def test_any_prefix_of_the_scripted_episodes_is_mixed() -> None:
