@@ -7,6 +7,8 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
 from actors.policies.contract import VISUAL_FEATURES, writes_features
+from actors.policies.proprioception import Proprioception
+from envs.embodiment import Embodiment
 from envs.encoders.images import MultiViewEncoder
 from envs.encoders.language import TextEncoder
 from envs.specs import IMAGE, INSTRUCTION_UTF8, STATE, WorldSpec
@@ -14,50 +16,72 @@ from envs.specs import IMAGE, INSTRUCTION_UTF8, STATE, WorldSpec
 _POINTS, _WIDTH, _TEXT = 16, 16, 32  # of the encoder of a critic that has to see for itself
 
 
-class FeatureValue(nn.Module):
-    """V(observation) from visual features [..., F] and the robot's state [..., S] -> [..., 1].
+class Value(nn.Module):
+    """V(observation) from what was seen and the robot's state in units of its own spread: beside joints in
+    degrees pictures would not count, and positions in metres not beside pictures.
+
+    Args:
+        features: of what is seen.
+        robot: whose state.
+        width: hidden size.
+    """
+
+    knows_units: Tensor
+
+    def __init__(self, features: int, robot: Embodiment, width: int):
+        super().__init__()
+        self.posture = Proprioception(robot, command=False)
+        self.register_buffer("knows_units", torch.tensor(False))
+        self.norm = nn.LayerNorm(features)
+        self.layers = nn.Sequential(
+            nn.Linear(features + self.posture.size, width),
+            nn.SiLU(),
+            nn.Linear(width, width),
+            nn.SiLU(),
+            nn.Linear(width, 1),
+        )
+
+    @torch.no_grad()
+    def take_units(self, states: Tensor) -> None:
+        """Take units from the first states [..., S] that there are; later ones change nothing."""
+        if not self.knows_units:
+            self.posture.normalise(states.reshape(-1, states.shape[-1]))
+            self.knows_units.fill_(True)
+
+    def value(self, seen: Tensor, state: Tensor) -> Tensor:
+        """float32 [..., 1] from features [..., F] and states [..., S]."""
+        out: Tensor = self.layers(torch.cat((self.norm(seen), self.posture(state)), -1))
+        return out
+
+
+class FeatureValue(Value):
+    """Of visual features [..., F] and the robot's state [..., S].
 
     Gradients do not reach the features, so the critic cannot disturb the policy.
     """
 
-    def __init__(self, features: int, states: int, width: int):
-        super().__init__()
-        self.layers = _layers(features + states, width)
-
     def forward(self, seen: Tensor, state: Tensor) -> Tensor:
-        return self.layers(torch.cat((seen.detach(), state), -1))
+        return self.value(seen.detach(), state)
 
 
-class PictureValue(nn.Module):
-    """V(observation) from pictures uint8 [..., V, 3, H, W], instruction's bytes and state -> [..., 1]."""
+class PictureValue(Value):
+    """Of pictures uint8 [..., V, 3, H, W], instruction's bytes and state [..., S]."""
 
     def __init__(self, spec: WorldSpec, width: int):
-        super().__init__()
-        self.views = MultiViewEncoder(spec, _POINTS, _WIDTH)
+        views = MultiViewEncoder(spec, _POINTS, _WIDTH)
+        super().__init__(views.out_features + _TEXT, spec.embodiment, width)
+        self.views = views
         self.text = TextEncoder(_TEXT)
-        self.layers = _layers(self.views.out_features + _TEXT + spec.state_dim, width)
 
     def forward(self, image: Tensor, text: Tensor, state: Tensor) -> Tensor:
-        seen = self.views(image.reshape(-1, *image.shape[-4:]))
-        known = torch.cat((seen.unflatten(0, image.shape[:-4]), self.text(text), state), -1)
-        return self.layers(known)
+        seen = self.views(image.reshape(-1, *image.shape[-4:])).unflatten(0, image.shape[:-4])
+        return self.value(torch.cat((seen, self.text(text)), -1), state)
 
 
 def build_critic(policy: TensorDictModuleBase, spec: WorldSpec, width: int) -> TensorDictModule:
     """The value network that fits a policy: it writes "state_value" [..., 1]."""
     if writes_features(policy):
-        network: nn.Module = FeatureValue(policy.visual_dim, spec.state_dim, width)
+        network: Value = FeatureValue(policy.visual_dim, spec.embodiment, width)
         return TensorDictModule(network, in_keys=[VISUAL_FEATURES, STATE], out_keys=["state_value"])
     network = PictureValue(spec, width)
     return TensorDictModule(network, in_keys=[IMAGE, INSTRUCTION_UTF8, STATE], out_keys=["state_value"])
-
-
-def _layers(size: int, width: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.LayerNorm(size),
-        nn.Linear(size, width),
-        nn.SiLU(),
-        nn.Linear(width, width),
-        nn.SiLU(),
-        nn.Linear(width, 1),
-    )

@@ -22,7 +22,7 @@ from torchrl.objectives.value import GAE
 from actors.policies.contract import action_key, device_of, input_keys, trained_part, with_text
 from envs.ranges import Count, Discount, Fraction, Natural, NonNegative, Positive, Share
 from envs.rng import order_generator
-from envs.specs import LOG_PROB, WorldSpec
+from envs.specs import LOG_PROB, STATE, WorldSpec
 from envs.targets import options
 from learners.rl.algorithm import clip_bounds, sound, transitions
 from learners.rl.critic import build_critic
@@ -121,6 +121,7 @@ class PPO:
     @torch.no_grad()
     def _advantages(self, batch: TensorDict) -> None:
         """Write values, advantages and value targets [B, T, 1] into a rollout [B, T]."""
+        self.critic.module.take_units(batch[STATE])
         for part in (batch, batch["next"]):
             part["state_value"] = self.critic(part.select(*self.critic.in_keys))["state_value"]
         self.gae(batch)
