@@ -95,6 +95,7 @@ class JudgeReward(Transform):
         failed = (status != Status.OK.value).unsqueeze(-1)
         success = done.any(1, keepdim=True) & ~failed
         progress = torch.where(failed, self._progress, judgement.progress[:, -1:])
+        progress = torch.where(success, 1.0, progress)  # what is done is done, as where physics says it
         next_tensordict["reward"] = self.rewards(self._progress, progress, success)
         self._progress = progress
         next_tensordict[SUCCESS], next_tensordict[PROGRESS] = success, progress

@@ -157,7 +157,8 @@ def test_relative_chunks_accumulate_deltas_do_not_and_the_horizon_truncates() ->
 def test_success_ends_the_episode_and_pays() -> None:
     td = play(world("two_arms_poses", 2, Fixed(0.9)), [0, 1], 1)
     assert bool(td[SUCCESS].all()) and bool(td["terminated"].all())
-    assert torch.allclose(td["reward"], torch.ones(2, 1)) and td[PROGRESS].shape == (2, 1)
+    assert torch.allclose(td["reward"], torch.full((2, 1), 1.1))  # from .9 to 1, and the bonus
+    assert torch.equal(td[PROGRESS], torch.ones(2, 1))
 
 
 def test_a_judges_error_is_no_zero_reward() -> None:
