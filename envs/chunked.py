@@ -4,6 +4,7 @@ episodes.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -135,9 +136,13 @@ class ChunkedEnv(EnvBase):
     def schedule(self, seeds: Iterable[int]) -> None:
         """Queue episode seeds; resets take them in order, lowest slot first. Replaces what was queued.
 
-        Once they are used up, they come again from the first; where none were given, others are drawn.
+        Once they are used up, they come again from the first; where none were given, others are drawn. What a
+        subclass draws from the stream of its own hangs on nothing but `seeds`, too.
         """
         self._queue = deque(int(seed) for seed in seeds)
+        if self._queue:
+            digest = hashlib.sha256(repr(tuple(self._queue)).encode()).digest()
+            self._stream = episode_stream(int.from_bytes(digest[:6], "big"))
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:

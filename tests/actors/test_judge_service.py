@@ -157,7 +157,7 @@ def test_rewards_that_come_later_are_those_that_come_at_once(recipe: Recipe) -> 
     )
     now.host._judging.judge.threshold.fill_(0.0)  # type: ignore[union-attr]
     later.host._judging.judge.threshold.fill_(0.0)  # type: ignore[union-attr]
-    job = Job(0, tuple(range(4)), 5)
+    job = Job(0, tuple(range(8)), 5)
     one, other = now.host.run(job), later.host.run(job)
     mine = first_episode(one["next", "done"].squeeze(-1))
     assert torch.equal(mine, first_episode(other["next", "done"].squeeze(-1)))

@@ -231,7 +231,7 @@ def test_what_others_said_when_one_failed_is_no_answer_to_the_next_request() -> 
 
 
 def test_a_suite_that_cannot_be_made_is_told_at_once() -> None:
-    with pytest.raises(PoolError, match=r"(?s)cannot start:.*on fire"):
+    with pytest.raises(ConfigError, match=r"task\.suite \(tests\..*\.Counting\): .*on fire"):
         pool_of(2, 2, at_start="raise")
 
 

@@ -1,4 +1,4 @@
-"""What RL's stage lets a critic, and then PPO, learn of what physics has told."""
+"""What RL learns of what physics has told, beside imagined decisions; RL in physics for comparison."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ from envs.embodiment import Embodiment
 from envs.manifest import write_manifest
 from pipeline.config import load_config
 from pipeline.graph.stage import Inputs
+from pipeline.loop import build_loop, deployed_episodes
 from pipeline.stages import rl as stages
 from pipeline.stages.given import rl_options
+from pipeline.study.methods import add_rl_in_physics
+from pipeline.track import read_metrics
 from tests.embodiments import ARM_DELTAS
 
 SETTINGS = {"imagined": 0.0, "iterations": 1, "seed": 0, "lr": 1e-4}
@@ -50,3 +53,18 @@ def test_true_decisions_are_learned_from_whatever_measures_progress(
     )
     assert "nothing but the anchor" in alarm and stages.nothing_left(learning, None) == [alarm]
     assert not stages.nothing_left(rl_options(cfg, **{**SETTINGS, "imagined": 1.0}), None)
+
+
+def test_in_physics_it_plays_as_many_episodes_as_are_deployed_and_not_whole_iterations(
+    tmp_path: Path,
+) -> None:
+    words = ("experiment=soak", "track=disabled", "explore.levels=[]", "rounds.deploy=[5]", "algorithm=ppo")
+    cfg = load_config([*words, "rl.imagined=0"])  # which is about imagination alone
+    graph = build_loop(cfg, tmp_path)
+    name = add_rl_in_physics(graph, cfg, "episodes")
+    made = graph.run(name)[name]["result"]
+    asked = deployed_episodes(cfg)
+    assert asked % cfg["rl"]["envs"] == 2
+    assert asked <= made["episodes"] == made["physics_episodes"]["own"] <= asked + 2
+    rows = read_metrics(graph.folder(name) / "metrics.jsonl")
+    assert any(row.get("rl/loss") for row in rows)
