@@ -79,14 +79,19 @@ def judge_files(cfg: Cfg, part: str = "") -> dict[str, Any]:
 
 def option_files(path: str, section: Any) -> dict[str, str]:
     """Hashes of the files that options of suite, policy, algorithm and simulator name: when one changes, what
-    was made with it is out of date.
+    was made with it is out of date. Texts count that have a folder or an ending, such as weights.pt.
 
     Args:
         path: where the section stands in the config.
         section: its value.
     """
     texts = [text for key, text in _texts(section, path) if key not in _TOLD and _under(key, _NAMING)]
-    return _marks(file for text in texts for file in named_files(text))
+    return _marks(file for text in texts if _like_a_path(text) for file in named_files(text))
+
+
+def _like_a_path(text: str) -> bool:
+    """Whether a text has a folder or an ending: a word such as "scene" may be a folder's name by chance."""
+    return len(Path(text).parts) > 1 or bool(Path(text).suffix)
 
 
 def _texts(section: Any, path: str) -> Iterator[tuple[str, str]]:

@@ -19,7 +19,7 @@ from pipeline import outside
 from pipeline.commands.finetune import build_finetune
 from pipeline.config import load_config
 from pipeline.loop import build_loop
-from pipeline.outside import fingerprint
+from pipeline.outside import fingerprint, option_files
 from tests.envs.episodes.lerobot_sets import SETS, write_set
 
 SUCCESS = "next.success"
@@ -203,6 +203,18 @@ def test_files_that_options_name_are_known_by_their_content(
         assert changed(before, now) >= {"collect", "imitation", "simulator-1"}
         old, new = (one.nodes["collect"].identity for one in (graph, build_loop(cfg, tmp_path)))
         assert new.changed(asdict(old)).endswith("ran: config files of task.suite")
+
+
+def test_a_word_that_a_folder_happens_to_have_as_its_name_names_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "head").mkdir()
+    for name in ("head/log", "push.txt"):
+        (tmp_path / name).write_text("one")
+    monkeypatch.chdir(tmp_path)
+    assert option_files("task.suite", {"cameras": ["head"]}) == {}
+    assert option_files("task.suite", {"words": f"{tmp_path}/head"}).keys() == {"log"}
+    assert option_files("task.suite", {"words": "push.txt"}).keys() == {"push.txt"}
 
 
 def test_a_robots_own_kinematics_are_known_by_their_source(tmp_path: Path) -> None:
