@@ -17,6 +17,7 @@ from envs.conditioning.units import RESOLUTION
 from envs.embodiment import Embodiment
 from envs.episodes.episode import EpisodeError
 from envs.episodes.formats.lerobot_files import column_array, open_parquet
+from envs.files import files_below
 
 log = logging.getLogger(__name__)
 _BEYOND = 0.5  # of a range, by which recorded values that are of it may leave it
@@ -89,7 +90,7 @@ def _read_bounds(
         pass  # written by another program, which keeps none
     lows, highs = [], []
     try:
-        for path in sorted((folder / "data").rglob("*.parquet")):
+        for path in (path for path in files_below(folder / "data") if path.suffix == ".parquet"):
             rows = column_array(open_parquet(path).read(columns=["action"]), "action")
             if len(rows):
                 lows.append(rows.min(0))

@@ -77,6 +77,15 @@ def test_what_a_set_says_of_itself_counts(tmp_path: Path) -> None:
     assert robot_of(folder).arms == (Arm("arm", (0, 1, 2, 3, 4), 5, (90, 10)),)
 
 
+def test_rows_that_lie_behind_a_link_are_looked_at(tmp_path: Path) -> None:
+    folder, store = recorded(tmp_path / "set", "so101", 0.0, 1.0), tmp_path / "store"
+    (folder / "data").rename(store)
+    (folder / "data").mkdir()
+    for part in store.iterdir():
+        (folder / "data" / part.name).symlink_to(part)
+    assert robot_of(folder).arms[0].gripper_range == (1.0, 0.0)
+
+
 def test_rows_that_cannot_be_read_leave_the_guess(tmp_path: Path) -> None:
     folder = recorded(tmp_path, "so101", 0.0, 1.0)
     for path in (folder / "data").rglob("*.parquet"):
