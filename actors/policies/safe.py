@@ -54,7 +54,7 @@ class SafePolicyWrapper(TensorDictModuleBase):
 
         Raises:
             ConfigError: if the policy's chunks are of another size than the world takes, or it says other
-            log-probabilities than theirs.
+                log-probabilities than theirs.
         """
         # Features that lie there are those of the decision before.
         seen = observed.exclude(VISUAL_FEATURES)

@@ -80,7 +80,6 @@ class Judge(nn.Module):
             apart.
         discount: per frame, of the progress that `loss` is given: discount ** (frames until success).
         calibrates: whether the threshold is to be set on recorded video (learners/stages/judge.py).
-
         rehearsed: whether one may be built before any work, to see that it can; not where that is dear.
 
     Raises:

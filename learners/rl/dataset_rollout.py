@@ -59,9 +59,10 @@ def dataset_rollout(
     over = at[:, 1:] == last[:, None]
     won = (store.arrays["success"][rows[:, 1:]] > 0.5) & over
     progress = torch.zeros(at.shape)
+    after = progress[:, 1:]
     if judge is not None and rewards.progress:
         progress = _seen_progress(judge, store, episodes, at, features)
-    after = torch.where(won, float(judge is not None and rewards.progress > 0), progress[:, 1:])
+        after = torch.where(won, 1.0, progress[:, 1:])
     out = seen[:, :-1].copy()
     out["row"], out["valid"] = rows[:, :-1], at[:, :-1] < last[:, None]
     out["whole"] = at[:, :-1] + chunk <= last[:, None]

@@ -129,8 +129,7 @@ class Cloning:
 def chunks_ahead(store: ClipStore, rows: Tensor, mode: ActionMode) -> Tensor:
     """The chunks [N, K, A] that followed frames `rows` [N].
 
-    Past an episode's end its last command is held: absolute ones repeat, changes and
-    velocities are 0.
+    Past an episode's end its last command is held: absolute ones repeat, changes are 0.
     """
     commands, robot = store.arrays["commands"], store.spec.embodiment
     ahead, last = rows[:, None] + torch.arange(1, store.spec.chunk + 1), last_rows(store, rows)[:, None]
