@@ -10,15 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 import yaml
 
-from actors.world_config import check_world
-from envs.simulators.base import WORLD_OPTIONS, Simulator
-from envs.specs import WorldSpec
 from envs.targets import TARGET, ConfigError, _within, target
 from pipeline.checks import faults
-from pipeline.cli.words import prepared
 from pipeline.config import CONFIGS, choices, groups, load_config, read_config
 from pipeline.loop import build_loop
 
@@ -249,91 +244,6 @@ def test_drawn_overrides_are_understood_or_refused(seed: int) -> None:
             assert load_config(["".join(word)])["name"]
 
 
-@pytest.mark.parametrize(
-    ("word", "said"),
-    [
-        ("task.name=psh", r"task\.name='psh' is unknown.*'push'"),
-        ("task.suite.cameras=[hed]", r"task\.suite\.cameras holds \['hed'\]"),
-        ("task.suite.actions=thoughts", r"task\.suite\.actions='thoughts'"),
-        ("cameras=[hed]", r"^cameras=\['hed'\] must be some of"),
-        ("policy.cameras=[hed]", r"policy\.cameras=\['hed'\] must be some of .*head"),
-        ("judge.cameras=most", r"judge\.cameras='most' must be all, main or"),
-        ("task.suite.size=[32,48]", r"task\.size=\[64, 64\], but the suite renders \[\[32, 48\]\]"),
-    ],
-)
-def test_what_the_robot_has_not_is_told_before_any_work(word: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        prepared([word])
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (
-            ["task.variants.out_of_domain.scenes=out_of_domian"],
-            r"out_of_domain: task\.suite\.scenes holds 'out_of",
-        ),
-        (["+task.variants.swapped.phrasings=[plane]"], r"swapped: task\.suite\.phrasings holds 'plane'"),
-        (["+task.variants.swapped.actions=joints"], r"swapped has another robot .*: action_names is"),
-        (["+task.variants.swapped.cameras=[head]"], r"swapped has another robot .*: views is"),
-        (["+task.variants.swapped.size=[32,32]"], r"swapped has another robot .*: cameras \(name, size"),
-    ],
-)
-def test_a_variant_that_cannot_be_is_told_before_any_work(words: list[str], said: str) -> None:
-    with pytest.raises(ConfigError, match=rf"^task\.variants\.{said}"):
-        prepared(["task=tabletop", *words])
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["simulator=tokens", "simulator.window=4"], r"simulator\.window=4 must be more than task\.chunk=4"),
-        (["simulator=tokens", "simulator.codec.bits=19"], r"codec\.bits=19 must be a multiple of"),
-        (["simulator=tokens", "simulator.codec.bits=64"], r"codec\.bits=64 .* tokens of 32 bits"),
-        (["simulator=forcing", "simulator.horizon=3", "task=metaworld"], r"simulator\.horizon=3 must be at"),
-        (["simulator=gesim"], r"task\.chunk=4 must be 1 \+ a multiple of 4"),
-        (["judge=golden_goal", "judge.text_world.net.heads=5"], r"^judge\.text_world\.net: net\.width=128"),
-        (["judge=golden_goal", "judge.text_world.codec.stride=12"], r"^judge\.text_world .*codec\.stride=12"),
-    ],
-)
-def test_what_simulator_or_text_world_refuses_is_told_before_any_work(words: list[str], said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        prepared(words)
-
-
-class Own(Simulator):
-    """An engine of somebody else's, which computes with its first weights."""
-
-    def __init__(self, spec: WorldSpec, memory_frames: int, slip: str):
-        super().__init__(spec, memory_frames)
-        if memory_frames > 4:
-            raise ValueError(f"memory_frames={memory_frames} must be at most 4")
-        weights = torch.ones(3)
-        if slip == "item":  # RuntimeError
-            float(weights.sum())
-        elif slip == "numpy":  # TypeError
-            weights.numpy()
-        elif slip == "turned":
-            try:
-                weights.tolist()
-            except RuntimeError:
-                raise ValueError("weights cannot be read") from None
-        elif slip == "own":
-            raise KeyError(slip)
-
-
-@pytest.mark.parametrize("slip", ["item", "numpy", "turned", "own"])
-def test_engines_that_need_memory_are_not_refused_for_that(slip: str) -> None:
-    cfg = load_config([])
-    around = {key: value for key, value in cfg["simulator"].items() if key in WORLD_OPTIONS}
-    own = {**around, "_target_": f"{__name__}.Own", "memory_frames": 4, "slip": slip}
-    check_world({**cfg, "simulator": own})
-    with pytest.raises(ConfigError, match=r"memory_frames=5 must be at most 4"):
-        check_world({**cfg, "simulator": {**own, "memory_frames": 5}})
-    # its weights would be read for this alone
-    check_world({**cfg, "simulator": {**own, "memory_frames": 5, "checkpoint": "released"}})
-
-
 def leaves(section: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Every value and its dotted path; sections are values, too."""
     for key, value in section.items():
@@ -353,46 +263,6 @@ def test_every_experiment_composes(name: str, tmp_path: Path) -> None:
     cfg = load_config([f"experiment={name}"])
     graph = build_loop(cfg, tmp_path)
     assert ("tokenizer" in graph.nodes) == ("codec" in cfg["simulator"])
-
-
-def test_keys_change_with_what_matters_only(tmp_path: Path) -> None:
-    def build(*words: str) -> dict[str, str]:
-        graph = build_loop(load_config(["experiment=smoke", *words]), tmp_path)
-        return {name: graph.key(name) for name in graph.nodes}
-
-    base = build()
-    same = {name for name, key in build("evaluate.episodes=30").items() if base[name] == key}
-    assert {"rl-2", "measure"} <= same and "evaluate-after" not in same
-    same = {name for name, key in build("simulator.width=32").items() if base[name] == key}
-    assert {"collect", "imitation", "deploy-1"} <= same and "simulator-1" not in same
-    same = {name for name, key in build("simulator_fit.refresh.fit.steps=11").items() if base[name] == key}
-    assert {"simulator-1", "rl-1"} <= same and "simulator-2" not in same
-    assert build("simulator.ray_map=false")["imitation"] != base["imitation"]
-    assert base == build("launch=ray", "track=disabled")
-    same = {name for name, key in build("+task.variants={harder: {hold: 1.0}}").items() if base[name] == key}
-    assert {"collect", "rl-2", "evaluate-after"} <= same
-
-
-def test_who_serves_a_judge_leaves_keys_alone(tmp_path: Path) -> None:
-    def build(*words: str) -> dict[str, str]:
-        model = ("judge=vlm", "judge.chat.model=some")
-        graph = build_loop(load_config(["experiment=smoke", *model, *words]), tmp_path)
-        return {name: graph.key(name) for name in graph.nodes}
-
-    base = build()
-    served = ("judge.chat.url=http://elsewhere:1/v1", "judge.asking.retries=9", "judge.asking.cache=other")
-    assert build(*served, "judge.budget.calls=7", "judge.budget.input_price=1.5") == base
-    for word in ("judge.chat.model=other", "judge.votes.count=3"):
-        same = {name for name, key in build(word).items() if base[name] == key}
-        assert {"clone-1", "simulator-1"} <= same and not {"judge-1", "rl-1"} & same, word
-
-
-def test_the_loop_without_rl_shares_what_comes_before(tmp_path: Path) -> None:
-    cfg = load_config(["experiment=smoke"])
-    loop, without = build_loop(cfg, tmp_path), build_loop(cfg, tmp_path, with_rl=False)
-    shared = {name for name in without.nodes if without.key(name) == loop.key(name)}
-    assert {"collect", "imitation", "deploy-1", "simulator-1", "clone-1", "evaluate-before"} <= shared
-    assert "rl-1" not in without.nodes and not {"deploy-2", "evaluate-after"} & shared
 
 
 def doubled(kind: Any, section: Mapping[str, Any], key: str) -> Iterator[str]:

@@ -1,10 +1,7 @@
-"""Clips and their sampling, splits, caches, and what learners never see."""
+"""Clips and their sampling, and what learners never see."""
 
 from __future__ import annotations
 
-import errno
-import json
-import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +20,6 @@ from envs.episodes.angles import check_radians
 from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
 from envs.episodes.privileged import read_privileged
-from envs.episodes.splits import range_of, write_splits
 from envs.geometry.cameras import follow_wrists
 from envs.simulators.inputs import build_inputs
 from envs.specs import WorldSpec
@@ -231,122 +227,6 @@ def test_missing_calibration_is_named(tmp_path: Path) -> None:
     spec = WorldSpec(replace(ARM_DELTAS, cameras=cameras), SIZE, 4, ray_map=True)
     with pytest.raises(EpisodeError, match=r"no calibration.*calibrated=false"):
         ClipStore([tmp_path / "set"], spec)
-
-
-# -- splits
-def test_splits_of_a_set_that_names_none_go_by_number(store: ClipStore) -> None:
-    parts = {name: store.split(name).tolist() for name in ("train", "held_out", "calibration")}
-    assert sorted(number for part in parts.values() for number in part) == list(range(20))
-    for begin in (0, 8):
-        mine = {name: [n for n in part if begin <= n < begin + 8] for name, part in parts.items()}
-        assert (len(mine["held_out"]), len(mine["calibration"])) == (1, 2)
-
-
-def test_tasks_that_were_recorded_by_turns_are_in_every_split() -> None:
-    for tasks in (2, 4, 8):
-        for name in ("train", "held_out", "calibration"):
-            mine = range_of({"train": "0:160"}, name, 160, Path("set"))
-            assert {number % tasks for number in mine} == set(range(tasks)), (tasks, name)
-
-
-def test_episodes_that_train_does_not_name_are_in_no_split() -> None:
-    names = ("train", "held_out", "calibration")
-    for said, used in (("0:8", range(8)), ("2:5,8:12", [2, 3, 4, 8, 9, 10, 11]), ("0:99", range(16))):
-        parts = [range_of({"train": said}, name, 16, Path("set")) for name in names]
-        assert sorted(number for part in parts for number in part) == list(used)
-        whole = [range_of({}, name, 16, Path("set")) for name in names]
-        assert all({*part} <= {*every} for part, every in zip(parts, whole, strict=True))
-    with pytest.raises(EpisodeError, match="'train' must be among them, as"):
-        range_of({"train": "all"}, "held_out", 16, Path("set"))
-
-
-def test_splits_are_those_of_each_data_set(dataset: Path, tmp_path: Path) -> None:
-    root = tmp_path / "set"
-    shutil.copytree(dataset, root)
-    write_splits(root, {"train": 12, "held_out": 5, "calibration": 3})
-    store = ClipStore([dataset, root], SPEC)
-    first = range_of({"train": "0:20"}, "held_out", 20, dataset)
-    assert store.split("held_out").tolist() == [*first, *range(32, 37)]
-    with pytest.raises(EpisodeError, match=r"'test' must be among them"):
-        store.split("test")
-
-
-# -- caches
-def test_a_cache_is_made_once_and_again_when_the_data_change(dataset: Path, tmp_path: Path) -> None:
-    root, cache = tmp_path / "set", tmp_path / "cache"
-    shutil.copytree(dataset, root)
-    ClipStore([root], SPEC, cache)
-    (made,) = cache.glob("*/*/frames.npy")
-    before = made.stat().st_mtime_ns, made.stat().st_ino
-    assert made.stat().st_blocks * 512 >= made.stat().st_size  # reserved, not sparse
-    ClipStore([root], replace(SPEC, chunk=7), cache)  # the length of a chunk changes nothing
-    assert (made.stat().st_mtime_ns, made.stat().st_ino) == before
-    held = ClipStore([root], SPEC, cache)
-    LeRobotWriter(root, BIMANUAL_POSES.at(SIZE)).write([moving_square(BIMANUAL_POSES, 20)])
-    assert len(ClipStore([root], SPEC, cache)) == 21
-    assert held.frames(torch.tensor([0])).any()  # whoever had the old one open keeps it
-    assert len(list(cache.glob("*/*"))) == 1 and not list(cache.glob("*/.*"))
-
-
-def test_a_cache_sees_rows_behind_links_and_pictures_beside_them(tmp_path: Path) -> None:
-    root, bulk, cache = tmp_path / "set", tmp_path / "bulk", tmp_path / "cache"
-    LeRobotWriter(root, ARM_DELTAS.at(SIZE)).write([moving_square(ARM_DELTAS, 0)])
-    spec = world_spec(ARM_DELTAS.at(SIZE), SIZE)
-    (root / "data/chunk-000").rename(bulk)
-    (root / "data/chunk-000").symlink_to(bulk)
-    (bulk / "round").symlink_to(root / "data")  # as endless as it looks
-    assert ClipStore([root], spec, cache).episodes[0]["success"]
-    (path,) = bulk.glob("*.parquet")
-    table = pq.read_table(path)
-    at = table.column_names.index("next.success")
-    never = pa.array([False] * len(table))
-    pq.write_table(table.set_column(at, "next.success", never), path)
-    assert ClipStore([root], spec, cache).episodes[0]["success"] is False
-    (made,) = cache.glob("*/*/info.json")
-    before = made.stat().st_ino
-    (root / "images").mkdir()
-    (root / "images/frame-000000.png").write_bytes(b"new")
-    ClipStore([root], spec, cache)
-    assert made.stat().st_ino != before
-
-
-def test_a_half_made_cache_is_not_used(dataset: Path, tmp_path: Path) -> None:
-    ClipStore([dataset], SPEC, tmp_path)
-    (marker,) = tmp_path.glob("*/*/info.json")
-    marker.write_text(marker.read_text()[:40])
-    assert len(ClipStore([dataset], SPEC, tmp_path)) == 20
-    assert json.loads(marker.read_text())["episodes"]
-
-
-def test_data_in_a_folder_that_cannot_be_written(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root = tmp_path / "read_only" / "set"
-    shutil.copytree(dataset, root)
-    (tmp_path / "read_only" / ".cache-set").write_text("here no folder can be made")
-    monkeypatch.delenv("WORLDLOOP_CACHE", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
-    before = sorted((tmp_path / "read_only").rglob("*"))
-    assert len(ClipStore([root], SPEC)) == 20
-    assert (
-        list((tmp_path / "home").rglob("frames.npy"))
-        and sorted((tmp_path / "read_only").rglob("*")) == before
-    )
-    monkeypatch.setenv("WORLDLOOP_CACHE", str(tmp_path / "said"))
-    ClipStore([root], SPEC)
-    assert list((tmp_path / "said").rglob("frames.npy"))
-
-
-def test_a_full_disk_is_said_before_anything_is_mapped(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "posix_fallocate", full)
-    with pytest.raises(OSError, match=r"a cache of 0\.00 GB does not fit.*WORLDLOOP_CACHE"):
-        ClipStore([dataset], SPEC, tmp_path)
-    assert not list(tmp_path.rglob("*.npy"))
 
 
 # -- what only physics knows

@@ -18,10 +18,8 @@ import pytest
 
 from envs.embodiment import Embodiment
 from envs.episodes import Episode, EpisodeError, LeRobotDataset, LeRobotWriter
-from envs.episodes.clips import ClipStore
-from envs.episodes.splits import keep_in_splits, read_splits, write_splits
 from envs.episodes.video import read_clip, read_video, write_video
-from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, EMBODIMENTS, world_spec
+from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, EMBODIMENTS
 from tests.envs.episodes.lerobot_sets import SETS, write_set
 from tests.moving_square import SIZE, moving_square
 
@@ -308,57 +306,6 @@ def test_a_clip_is_read_from_the_middle_of_a_video(tmp_path: Path) -> None:
         read_clip(tmp_path / "long.mp4", 85 / 12.5, 20, 12.5)
 
 
-def test_splits_stand_in_info_json(dataset: Path, tmp_path: Path) -> None:
-    root = tmp_path / "set"
-    shutil.copytree(dataset, root)
-    write_splits(root, {"train": 12, "held_out": 5, "calibration": 3})
-    info = json.loads((root / "meta/info.json").read_text())
-    assert info["splits"] == {"train": "0:12", "held_out": "12:17", "calibration": "17:20"}
-    with pytest.raises(EpisodeError, match="do not add up to 20"):
-        write_splits(root, {"train": 12})
-
-
-def test_fewer_episodes_can_be_kept_in_splits(dataset: Path, tmp_path: Path) -> None:
-    root = tmp_path / "set"
-    shutil.copytree(dataset, root)
-    whole = read_splits(root)  # by number, as the set names none
-    assert whole["held_out"] == [7, 14] and len(whole["train"]) == 13
-    keep_in_splits(root, {"train": whole["train"][:4], "held_out": whole["held_out"], "calibration": []})
-    info = json.loads((root / "meta/info.json").read_text())
-    assert info["splits"] == {"train": "0:2,3:5", "held_out": "7:8,14:15", "calibration": "0:0"}
-    assert read_splits(root) == {"train": [0, 1, 3, 4], "held_out": [7, 14], "calibration": []}
-
-
-def test_appending_leaves_splits_as_they_are(tmp_path: Path) -> None:
-    root, robot = tmp_path / "set", ARM_DELTAS.at(SIZE)
-    writer, made = LeRobotWriter(root, robot), [moving_square(ARM_DELTAS, seed) for seed in range(9)]
-
-    def splits() -> dict[str, str]:
-        found: dict[str, str] = json.loads((root / "meta/info.json").read_text())["splits"]
-        return found
-
-    def members(name: str) -> list[int]:
-        store = ClipStore([root], world_spec(robot, SIZE), tmp_path / "cache")
-        return [int(store.episodes[number]["seed"]) for number in store.split(name).tolist()]
-
-    writer.write(made[:1])
-    info = json.loads((root / "meta/info.json").read_text())
-    del info["splits"]  # whoever wrote it said nothing
-    (root / "meta/info.json").write_text(json.dumps(info))
-    writer.write(made[1:4])
-    assert splits() == {"train": "0:4"}  # as LeRobot writes it
-    write_splits(root, {"train": 2, "held_out": 1, "calibration": 1})
-    writer.write(made[4:6])
-    LeRobotWriter(root, robot).write(made[6:7])
-    assert splits() == {"train": "0:2,4:7", "held_out": "2:3", "calibration": "3:4"}
-    writer = LeRobotWriter(root, robot)
-    writer.write(made[7:8], split="held_out")
-    writer.write(made[8:], split="mine")
-    assert splits() == {"train": "0:2,4:7", "held_out": "2:3,7:8", "calibration": "3:4", "mine": "8:9"}
-    assert members("train") == [0, 1, 4, 5, 6] and members("held_out") == [2, 7]
-    assert members("calibration") == [3] and members("mine") == [8]
-
-
 def test_appending_leaves_files_behind_links_as_they_are(tmp_path: Path) -> None:
     root, robot, bulk = tmp_path / "set", ARM_DELTAS.at(SIZE), tmp_path / "bulk"
     LeRobotWriter(root, robot).write([moving_square(ARM_DELTAS, 0)])
@@ -370,22 +317,6 @@ def test_appending_leaves_files_behind_links_as_they_are(tmp_path: Path) -> None
     LeRobotWriter(root, robot).write([moving_square(ARM_DELTAS, 1)])
     assert all(path.read_bytes() == content for path, content in before.items())
     assert [episode.seed for episode in LeRobotDataset(root)] == [0, 1]
-
-
-def test_an_interrupted_description_knows_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    root, robot = tmp_path / "set", ARM_DELTAS.at(SIZE)
-    writer = LeRobotWriter(root, robot)
-    writer.write([moving_square(ARM_DELTAS, seed) for seed in range(3)])
-
-    def fail(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as broken, pytest.raises(KeyboardInterrupt):
-        broken.setattr(writer, "_describe", fail)
-        writer.write([moving_square(ARM_DELTAS, 3)], split="held_out")
-    assert LeRobotWriter(root, robot).episodes == 4
-    info = json.loads((root / "meta/info.json").read_text())
-    assert info["splits"] == {"train": "0:3", "held_out": "3:4"} and info["total_episodes"] == 4
 
 
 def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
