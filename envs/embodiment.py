@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
 from math import inf
 from typing import Any
 
@@ -228,7 +229,7 @@ class Embodiment:
         """Positions of the grippers in the action vector."""
         return tuple(arm.gripper for arm in self.arms if arm.gripper is not None)
 
-    @property
+    @cached_property  # asked for each chunk
     def changes(self) -> tuple[int, ...]:
         """Positions of an action's numbers that are 0 while the robot stays as it is: of changes all but
         grippers, else velocities by their names, such as x.vel of a base beside positions of an arm.
