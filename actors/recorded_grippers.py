@@ -6,7 +6,7 @@ import json
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,6 @@ from envs.files import files_below
 log = logging.getLogger(__name__)
 _BEYOND = 0.5  # of a range, by which recorded values that are of it may leave it
 _FILLED = 0.1  # of a range, that recorded values which are of it fill at least
-_warned: set[tuple[str, str]] = set()  # data sets and grippers that this process has warned of
 
 
 def with_recorded_grippers(robot: Embodiment, folders: Sequence[Path]) -> Embodiment:
@@ -61,15 +60,14 @@ def _goes_with(guess: tuple[float, float], least: float, most: float) -> bool:
     return inside and most - least >= _FILLED * width
 
 
+@cache  # once in a process
 def _warn(folder: str, name: str, guess: tuple[float, float], found: tuple[float, float]) -> None:
-    if (folder, name) not in _warned:
-        _warned.add((folder, name))
-        log.warning(
-            "%s: %s goes from %.4g to %.4g, which is not the range of a gripper open at %.4g and closed at"
-            " %.4g, as names say it; taken to be open at %.4g and closed at %.4g. Say gripper_range in"
-            " features.action.info.worldloop.arms of meta/info.json if it is another.",
-            *(folder, name, min(found), max(found), *guess, *found),
-        )
+    log.warning(
+        "%s: %s goes from %.4g to %.4g, which is not the range of a gripper open at %.4g and closed at"
+        " %.4g, as names say it; taken to be open at %.4g and closed at %.4g. Say gripper_range in"
+        " features.action.info.worldloop.arms of meta/info.json if it is another.",
+        *(folder, name, min(found), max(found), *guess, *found),
+    )
 
 
 def _bounds(folder: Path, size: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:

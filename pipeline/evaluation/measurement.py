@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import cache
 from typing import Any
 
 import torch
@@ -20,9 +21,6 @@ _LAST = 4  # frames at the end of an episode
 _CHUNKS = 10  # of an episode at most, by which speed is measured
 
 
-_told: set[str] = set()  # what this process has said of episodes
-
-
 def followed(store: ClipStore, episodes: Tensor) -> Tensor:
     """Those of episodes int64 [N] in which something follows the first frame; of the others nothing can be
     generated or judged, and how many they are is told once in a process.
@@ -30,11 +28,13 @@ def followed(store: ClipStore, episodes: Tensor) -> Tensor:
     more = store.length[episodes] > 1
     if not more.all():
         names = sorted({str(store.parts[store.episodes[n]["dataset"]].folder) for n in episodes[~more]})
-        said = f"{int((~more).sum())} episodes of a single frame are left out ({', '.join(names)})"
-        if said not in _told:
-            _told.add(said)
-            tqdm.write(said)
+        _say(f"{int((~more).sum())} episodes of a single frame are left out ({', '.join(names)})")
     return episodes[more]
+
+
+@cache  # once in a process
+def _say(text: str) -> None:
+    tqdm.write(text)
 
 
 def groups(store: ClipStore, episodes: Tensor) -> dict[str, Tensor]:
