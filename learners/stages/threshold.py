@@ -16,6 +16,8 @@ def as_likely_as_not(score: Tensor, true: Tensor) -> float | None:
 
     The likelihood is logistic in the logit of the score (Platt 1999, with his targets, which keep it finite
     where scores part the outcomes): it uses all of them, where a threshold of best accuracy jumps with a few.
+    Outcomes that are mostly true weigh no more than the others: the better the examples, the more lenient
+    the threshold would be, and it is used on what is not as good.
 
     Args:
         score: float64 [N] in 0..1.
@@ -30,12 +32,14 @@ def as_likely_as_not(score: Tensor, true: Tensor) -> float | None:
     logits = torch.logit(score.clamp(0.01, 0.99)).numpy()
     if logits.min() == logits.max():  # any slope fits a constant
         return None
-    targets = torch.where(true, (hits + 1) / (hits + 2), 1 / (len(true) - hits + 2)).double().numpy()
+    misses = len(true) - hits
+    targets = torch.where(true, (hits + 1) / (hits + 2), 1 / (misses + 2)).double().numpy()
+    weights = torch.where(true, min(1.0, misses / hits), 1.0).double().numpy()
 
     def misfit(line: Any) -> tuple[float, Any]:
         logit = line[0] * logits + line[1]
-        value = (np.logaddexp(0, logit) - targets * logit).mean()
-        gap = expit(logit) - targets
+        value = (weights * (np.logaddexp(0, logit) - targets * logit)).mean()
+        gap = weights * (expit(logit) - targets)
         return float(value), [(gap * logits).mean(), gap.mean()]
 
     slope, offset = minimize(misfit, [1.0, 0.0], jac=True).x

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -162,6 +163,18 @@ def test_the_threshold_lies_where_success_is_as_likely_as_not() -> None:
     succeeded = torch.rand(4000, generator=generator) < (2 * (logit - 0.8)).sigmoid()
     assert calibrate(judge, runs(logit.sigmoid().tolist()), succeeded)
     assert float(torch.logit(judge.threshold)) == pytest.approx(0.8, abs=0.1)
+
+
+@pytest.mark.parametrize("mostly", [True, False])
+def test_examples_that_mostly_succeed_make_no_judge_lenient(mostly: bool) -> None:
+    generator = torch.Generator().manual_seed(0)
+    succeeded = torch.rand(8000, generator=generator) < (0.9 if mostly else 0.1)
+    logit = (2.0 * succeeded - 1 + torch.randn(8000, generator=generator)).clamp(-4, 4)
+    judge = RuleJudge(hold=2)
+    assert calibrate(judge, runs(logit.sigmoid().tolist()), succeeded)
+    # logit of success = 2 x + log odds of these examples, which count for nothing where they speak for it
+    as_likely = 0.0 if mostly else 0.5 * math.log(9)
+    assert float(torch.logit(judge.threshold)) == pytest.approx(as_likely, abs=0.1)
 
 
 def test_scores_that_part_the_outcomes_still_give_a_finite_threshold() -> None:
