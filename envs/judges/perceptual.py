@@ -9,6 +9,8 @@ comparable to any.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -86,7 +88,7 @@ def _halved(pictures: Tensor) -> Tensor:
     return functional.avg_pool2d(even, 2)
 
 
-def _doubled(pictures: Tensor, size: tuple[int, int]) -> Tensor:
+def _doubled(pictures: Tensor, size: Sequence[int]) -> Tensor:
     """Pictures twice as large, bilinear, cut to `size` where that is odd."""
     wide = functional.interpolate(pictures, scale_factor=2, mode="bilinear", align_corners=False)
     return wide[..., : size[0], : size[1]]

@@ -24,8 +24,8 @@ from envs.specs import Status, WorldSpec, text_to_bytes
 from envs.targets import build, target
 from tests.embodiments import EMBODIMENTS, INSTRUCTIONS, world_spec
 from tests.envs.judges.chat_server import MODEL, hashing, serving
-from tests.envs.judges.nearing import nearing
 from tests.envs.judges.tiny_vlm import save_tiny_vlm
+from tests.envs.nearing import nearing
 from tests.sections import CONFIGS, offered, section
 
 EXAMPLES = CONFIGS.parent / "examples/configs"

@@ -15,8 +15,8 @@ from envs.judges.golden_goal import GoldenGoalJudge
 from envs.specs import Status
 from envs.targets import ConfigError, build
 from tests.embodiments import ARM_DELTAS, world_spec
-from tests.envs.judges.nearing import nearing
 from tests.envs.judges.test_conformance import TINY_TEXT_WORLD
+from tests.envs.nearing import nearing
 from tests.moving_square import SIZE, picture
 from tests.sections import merged, section
 
