@@ -58,6 +58,12 @@ class GoalJudge(Judge):
         """The goals of episodes that began with `first` uint8 [B, V, 3, H, W], on its device."""
         raise NotImplementedError
 
+    def as_goals(self, frames: Tensor) -> Tensor:
+        """Frames uint8 [B, T, V, 3, H, W] of some cameras as a goal would show them, so that what making
+        goals does to pictures is no distance from them; here as they are.
+        """
+        return frames
+
     def done(
         self, frames: Tensor, instruction: list[str], progress: Tensor, features: Tensor | None = None
     ) -> Tensor:
@@ -90,8 +96,10 @@ class GoalJudge(Judge):
         return Judgement(*(part.to(frames.device) for part in (success, progress, status)))
 
     def _away(self, frames: Tensor, goals: Tensor) -> Tensor:
-        """Distance [B, T] of frames [B, T, V, 3, H, W] from goals [B, V, 3, H, W], mean over the cameras."""
-        seen = frames[:, :, self.chosen]
+        """Distance [B, T] of frames [B, T, V, 3, H, W], as goals show them, from goals [B, V, 3, H, W], mean
+        over the cameras.
+        """
+        seen = self.as_goals(frames[:, :, self.chosen])
         wanted = goals[:, None, self.chosen].expand_as(seen)
         lead = seen.shape[:3]
         pairs = zip(seen.flatten(0, 2).split(_AT_ONCE), wanted.flatten(0, 2).split(_AT_ONCE), strict=True)

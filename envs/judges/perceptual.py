@@ -9,6 +9,8 @@ comparable to any.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -65,9 +67,8 @@ class PerceptualDistance(nn.Module):
         for _ in range(self.levels):
             if min(here.shape[-2:]) < 2 * _SMALLEST:
                 break
-            low = self._blurred(here)[..., ::2, ::2]
-            wide = functional.interpolate(low, here.shape[-2:], mode="bilinear", align_corners=False)
-            band = here - wide
+            low = _halved(self._blurred(here))
+            band = here - _doubled(low, here.shape[-2:])
             out.append(band / (self.contrast + self._blurred(band.abs())))
             here = low
         return [*out, here]
@@ -76,3 +77,18 @@ class PerceptualDistance(nn.Module):
         padded = functional.pad(pictures, (2, 2, 2, 2), mode="reflect")
         kernel = self.kernel.to(pictures.device).expand(pictures.shape[1], 1, -1, -1)
         return functional.conv2d(padded, kernel, groups=pictures.shape[1])
+
+
+def _halved(pictures: Tensor) -> Tensor:
+    """Means of 2 x 2 pixels [N, 3, ceil(h / 2), ceil(w / 2)] of pictures [N, 3, h, w]. They lie between
+    those, where `_doubled` takes them to be; samples of every other pixel would lie half a pixel off.
+    """
+    height, width = pictures.shape[-2:]
+    even = functional.pad(pictures, (0, width % 2, 0, height % 2), mode="replicate")
+    return functional.avg_pool2d(even, 2)
+
+
+def _doubled(pictures: Tensor, size: Sequence[int]) -> Tensor:
+    """Pictures twice as large, bilinear, cut to `size` where that is odd."""
+    wide = functional.interpolate(pictures, scale_factor=2, mode="bilinear", align_corners=False)
+    return wide[..., : size[0], : size[1]]

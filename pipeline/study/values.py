@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.evaluation.result import result_of
+from pipeline.evaluation.value.page import order_text
 from pipeline.stages.measured.values import estimated_values, true_values
 from pipeline.study.columns import Cell, Cfg, Column, Measured
 from pipeline.study.methods import Made
@@ -37,7 +38,10 @@ class PolicyValues(Column):
     def read(self, cfg: Cfg, folders: Sequence[Path]) -> Measured:
         """See Column.read."""
         found = result_of(folders[0])
-        cells: dict[str, Cell] = {label: {"value": found.get(key)} for label, key in _FIGURES.items()}
+        chance = found.get("chance", {})
+        cells: dict[str, Cell] = {
+            label: {"value": found.get(key), "chance": chance.get(key)} for label, key in _FIGURES.items()
+        }
         cells["order kept"] = found.get("order", {"kept": 0, "pairs": 0})
         cells["confusion, all episodes"] = found.get("micro", {})
         return Measured(cells)
@@ -45,11 +49,12 @@ class PolicyValues(Column):
     def text(self, cell: Cell) -> str:
         """See Column.text."""
         if "pairs" in cell:
-            return f"{cell['kept']:.0f} of {cell['pairs']:.0f} pairs"
+            return order_text(cell)
         if "tp" in cell:
             return "TP {tp:.0f}, FP {fp:.0f}, FN {fn:.0f}, TN {tn:.0f}".format(**cell)
-        value = cell.get("value")
-        return "-" if value is None else f"{value:.2f}"
+        value, chance = cell.get("value"), cell.get("chance")
+        more = "" if chance is None else f" (by chance {chance:.2f})"
+        return "-" if value is None else f"{value:.2f}{more}"
 
     def merit(self, cell: Cell) -> float | None:
         """See Column.merit."""

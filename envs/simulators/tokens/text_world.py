@@ -163,6 +163,11 @@ class TextWorld(nn.Module):
         return GoldenTrajectory(*(part.to(first.device) for part in (frames, every, goal, ended)))
 
     @torch.no_grad()
+    def redraw(self, frames: Tensor) -> Tensor:
+        """Frames uint8 [B, T, V, 3, H, W] of any cameras as `imagine` would draw them."""
+        return self.video.redraw(frames)
+
+    @torch.no_grad()
     def done_along(self, frames: Tensor, instruction: Sequence[str]) -> Tensor:
         """What `imagine` would say of frames uint8 [B, T, V, 3, H, W] if it had made them: whether the task
         is done, float32 [B, T], by each frame and those before it in the window.

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from envs.ranges import Count, NonNegative, Share
+from envs.simulators.base import to_bytes
 from envs.simulators.tokenizers.lfq import LookupFreeTokenizer
 from envs.simulators.tokens.blocks import Memory
 from envs.simulators.tokens.conditioning import Conditioning
@@ -124,6 +125,14 @@ class TokenVideo(nn.Module):
         grids = tokens.unflatten(2, (v.views, v.rows, v.columns))
         flat = grids.flatten(0, 2).split(_AT_ONCE)
         return torch.cat([self.codec.decode(part) for part in flat]).unflatten(0, grids.shape[:3])
+
+    @torch.no_grad()
+    def redraw(self, frames: Tensor) -> Tensor:
+        """Frames uint8 [B, T, V, 3, H, W] of any cameras, as the tokenizer keeps them."""
+        device = next(self.codec.parameters()).device
+        flat = frames.flatten(0, 2).to(device).split(_AT_ONCE)
+        kept = [to_bytes(self.codec.decode(self.codec.encode(part.float() / 255))) for part in flat]
+        return torch.cat(kept).unflatten(0, frames.shape[:3]).to(frames.device)
 
     # -- frames to come
     def next_frame(self, memory: Memory, cond: Tensor, beside: Tensor | None, draws: Draws) -> Tensor:

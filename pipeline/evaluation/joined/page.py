@@ -12,6 +12,7 @@ from pipeline.evaluation.fidelity.page import FIGURES as FIDELITY
 from pipeline.evaluation.fidelity.page import collapse_text
 from pipeline.evaluation.report import templates
 from pipeline.evaluation.value.page import FIGURES as VALUES
+from pipeline.evaluation.value.page import figure_text, order_text
 
 Found = Mapping[str, Any]
 MISSING = "unmeasured"
@@ -124,12 +125,9 @@ def _scene_notes(found: Found) -> Iterator[str]:
 def _values(found: Found) -> Iterator[Row]:
     known = found["agreement"]
     for key, title, form in VALUES:
-        value = known.get(key) if known else None
-        scale = 100 if key == "difference" else 1
-        yield Row(f"{title} {_AGREE[key]}", MISSING if value is None else form.format(scale * value))
+        yield Row(f"{title} {_AGREE[key]}", figure_text(known, key, form) or MISSING)
     if known:
-        order = known["order"]
-        yield Row("pairs of policies in order ↑", f"{order['kept']} of {order['pairs']}")
+        yield Row("pairs of policies in order ↑", order_text(known["order"]))
         yield Row("verdicts that are right ↑", f"{100 * known['micro']['accuracy']:.1f}%")
         for side, bias in known["bias"].items():
             yield Row(f"estimated less true, {side} of distribution, points", f"{100 * bias['mean']:+.1f}")

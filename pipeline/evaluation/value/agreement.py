@@ -20,6 +20,7 @@ from scipy.stats import pearsonr, spearmanr
 from torch import Tensor
 
 from pipeline.evaluation.statistics import confusion, rate_entry
+from pipeline.evaluation.value.chance import by_chance, intervals, mmrv, told_apart
 
 ALL = "all"  # in place of a task: all of them together
 _COUNTS = ("tp", "fp", "fn", "tn")
@@ -136,11 +137,12 @@ def agreement(cells: Sequence[Cell]) -> dict[str, Any]:
 
     Returns:
         policies, cells; pearson and spearman over cells, None where one side does not vary; mmrv, the mean
-        over tasks; order {"kept", "pairs"} of the pairs of policies of one task whose true values differ, and
-        kept, whether all pairs keep their order, None without pairs; micro {"tp", "fp", "fn", "tn",
-        "accuracy"} of all episodes and macro, the mean over cells of the shares of each; difference, the mean
-        of |estimated - true|; bias by "in" and "out" of distribution (see `bias`); tasks, the same of each if
-        there are several. {} if no cell knows its true value, or none of those could be judged.
+        over tasks; order {"kept", "pairs", "all"} of the pairs of policies of one task (see `order`), and
+        kept, whether all that truth tells apart keep their order, None without any; micro {"tp", "fp", "fn",
+        "tn", "accuracy"} of all episodes and macro, the mean over cells of the shares of each; difference,
+        the mean of |estimated - true|; bias by "in" and "out" of distribution (see `bias`); intervals and
+        chance of these (see chance.py); tasks, the same of each if there are several. {} if no cell knows its
+        true value, or none of those could be judged.
     """
     known = [cell for cell in cells if cell.true is not None and cell.rates]
     if not known:
@@ -154,10 +156,10 @@ def agreement(cells: Sequence[Cell]) -> dict[str, Any]:
 
 def _together(cells: Sequence[Cell], tasks: Sequence[Sequence[Cell]]) -> dict[str, Any]:
     true, estimated = _values(cells)
-    orders = [order(*_values(some)) for some in tasks]
-    kept = {name: sum(one[name] for one in orders) for name in ("kept", "pairs")}
+    orders = [order(*_values(some), told_apart(some)) for some in tasks]
+    kept = {name: sum(one[name] for one in orders) for name in ("kept", "pairs", "all")}
     tables = [cell.table for cell in cells]
-    return {
+    found: dict[str, Any] = {
         "policies": len({cell.policy for cell in cells}),
         "cells": len(cells),
         "pearson": correlation(pearsonr, true, estimated),
@@ -174,6 +176,8 @@ def _together(cells: Sequence[Cell], tasks: Sequence[Sequence[Cell]]) -> dict[st
             if (some := [cell for cell in cells if cell.inside is inside])
         },
     }
+    figures = {**found, **{f"bias_{name}": side["mean"] for name, side in found["bias"].items()}}
+    return {**found, "intervals": intervals(tasks, figures), "chance": by_chance(tasks)}
 
 
 def _values(cells: Sequence[Cell]) -> tuple[np.ndarray, np.ndarray]:
@@ -190,21 +194,14 @@ def correlation(kind: Callable[..., Any], true: np.ndarray, estimated: np.ndarra
     return float(kind(true, estimated).statistic)
 
 
-def mmrv(true: np.ndarray, estimated: np.ndarray) -> float:
-    """Mean maximum rank violation of values [N]: for each policy the largest true difference to another that
-    the estimates put on the other side of it, averaged. 0 is a ranking kept, and small ones matter little.
+def order(true: np.ndarray, estimated: np.ndarray, apart: np.ndarray) -> dict[str, int]:
+    """{"kept", "pairs", "all"}: of all pairs of values [N] those whose true ones differ beyond chance, as
+    `apart` bool [N, N] says, and of these those whose estimates differ the same way.
     """
-    true, estimated = np.asarray(true, float), np.asarray(estimated, float)
-    gap = np.abs(true[:, None] - true[None])
-    swapped = (estimated[:, None] < estimated[None]) != (true[:, None] < true[None])
-    return float((gap * swapped).max(1).mean())
-
-
-def order(true: np.ndarray, estimated: np.ndarray) -> dict[str, int]:
-    """{"kept", "pairs"}: of the pairs whose true values differ, those whose estimates differ the same way."""
-    pairs = [(a, b) for a, b in combinations(range(len(true)), 2) if true[a] != true[b]]
+    every = list(combinations(range(len(true)), 2))
+    pairs = [(a, b) for a, b in every if apart[a, b] and true[a] != true[b]]
     kept = sum((true[a] - true[b]) * (estimated[a] - estimated[b]) > 0 for a, b in pairs)
-    return {"kept": int(kept), "pairs": len(pairs)}
+    return {"kept": int(kept), "pairs": len(pairs), "all": len(every)}
 
 
 def micro(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from pipeline.evaluation.judging import cost_text, facts_text
 from pipeline.evaluation.report import templates
 from pipeline.evaluation.statistics import percent_line
 from pipeline.evaluation.value.agreement import ALL
+from pipeline.evaluation.value.chance import RESAMPLES
 
 _SERIES = ("in distribution", "out of distribution")
 # Figures of an agreement: key, heading and form.
@@ -34,13 +35,14 @@ def build_page(result: Mapping[str, Any]) -> str:
         .render(
             result=result,
             verdict=verdict(result),
-            notes=[ranking(result), *result["notes"], *judge_lines(result)],
+            notes=[ranking(result), *chance_lines(found), *result["notes"], *judge_lines(result)],
             cells=[*result["cells"], *(result["overall"] if len(tasks) > 1 else [])],
             charts=_charts(result["cells"], tasks),
-            figures=[title for _, title, _ in FIGURES],
+            figures=_titles(),
+            order_text=order_text,
             agreements=[
-                (ALL, _figures(found), found),
-                *((t, _figures(row), row) for t, row in rows.items()),
+                (ALL, _figures(found), _sides(found), found),
+                *((t, _figures(row), _sides(row), row) for t, row in rows.items()),
             ]
             if found
             else [],
@@ -66,7 +68,8 @@ def table_text(result: Mapping[str, Any]) -> str:
     for policy, whole in overall.items():
         cells = [found[policy, task] for task in tasks] + ([whole] if len(tasks) > 1 else [])
         lines.append(f"| {policy} | {' | '.join(_cell_text(cell) for cell in cells)} |")
-    lines += ["", verdict(result), ranking(result), *result["notes"], *judge_lines(result)]
+    said = [verdict(result), ranking(result), *chance_lines(result["agreement"])]
+    lines += ["", *said, *result["notes"], *judge_lines(result)]
     return "\n".join(lines)
 
 
@@ -93,16 +96,42 @@ def verdict(result: Mapping[str, Any]) -> str:
     found = result["agreement"]
     if not found:
         return "Estimated values alone: without true ones nobody knows how far they can be trusted."
-    kept = found["order"]
     agreement = ", ".join(f"{title} {value}" for title, value in zip(_titles(), _figures(found), strict=True))
-    sides = [
-        f"{100 * side['mean']:+.1f} points {_SERIES[name == 'out']}" for name, side in found["bias"].items()
-    ]
+    sides = [f"{text} points {_SERIES[name == 'out']}" for name, text in _sides(found).items()]
     if found["kept"] is None:
-        order = "no ranking to keep (true values of a task are all equal)"
+        order = f"no ranking to keep ({order_text(found['order'])})"
     else:
-        order = f"ranking {'' if found['kept'] else 'not '}kept ({kept['kept']} of {kept['pairs']} pairs)"
+        order = f"ranking {'' if found['kept'] else 'not '}kept ({order_text(found['order'])})"
     return f"{order}; {agreement}; estimated less true {', '.join(sides)}"
+
+
+def order_text(order: Mapping[str, int]) -> str:
+    """Of how many pairs of policies the order is kept; older results count all pairs that differ at all."""
+    if "all" not in order:
+        return f"{order['kept']:.0f} of {order['pairs']:.0f} pairs"
+    if not order["all"]:
+        return "no task has two policies to compare"
+    if not order["pairs"]:
+        return f"true values differ beyond chance in none of {order['all']:.0f} pairs"
+    return f"{order['kept']:.0f} of {order['pairs']:.0f} pairs told apart in truth, of {order['all']:.0f}"
+
+
+def chance_lines(found: Mapping[str, Any]) -> list[str]:
+    """How intervals and what chance shows were found; [] of an agreement without."""
+    if "intervals" not in found:
+        return []
+    if found["intervals"]:
+        brackets = (
+            f"In brackets 95% by resampling starts ({RESAMPLES} times, the same for all policies), less what"
+            " noise adds; figures without do not change with the starts, or cannot be told."
+        )
+    else:
+        brackets = "No figure changes with the starts, so nothing is known of how sure they are."
+    return [
+        f"{brackets} By chance: what a perfect world shows in the mean with as many episodes, if each"
+        " succeeds at its policy's true rate, in truth and in imagination; less where equal starts end alike."
+        " Pairs are told apart by McNemar's test, p < .05."
+    ]
 
 
 def _titles() -> list[str]:
@@ -111,12 +140,30 @@ def _titles() -> list[str]:
 
 def _figures(found: Mapping[str, Any]) -> list[str]:
     """The texts of FIGURES; "-" for what cannot be said."""
-    out = []
-    for key, _, form in FIGURES:
-        value = found[key]
-        scale = 100 if key == "difference" else 1
-        out.append("-" if value is None else form.format(scale * value))
-    return out
+    return [figure_text(found, key, form) or "-" for key, _, form in FIGURES]
+
+
+def figure_text(found: Mapping[str, Any], key: str, form: str) -> str:
+    """A figure of FIGURES with its interval, and what chance shows, as far as known; "" if it is not."""
+    value, scale = found.get(key), 100 if key == "difference" else 1
+    if value is None:
+        return ""
+    chance = found.get("chance", {}).get(key)
+    more = "" if chance is None else f" (by chance {form.format(scale * chance)})"
+    return form.format(scale * value) + _interval(found, key, form, scale) + more
+
+
+def _interval(found: Mapping[str, Any], key: str, form: str, scale: int) -> str:
+    ends = found.get("intervals", {}).get(key)
+    return f" [{', '.join(form.format(scale * end) for end in ends)}]" if ends else ""
+
+
+def _sides(found: Mapping[str, Any]) -> dict[str, str]:
+    """Biases in points by "in" and "out" of distribution, with their intervals."""
+    return {
+        name: f"{100 * side['mean']:+.1f}{_interval(found, f'bias_{name}', '{:+.1f}', 100)}"
+        for name, side in found["bias"].items()
+    }
 
 
 def _cell_text(cell: Mapping[str, Any]) -> str:

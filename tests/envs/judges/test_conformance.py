@@ -18,13 +18,14 @@ from torch import Tensor
 
 from envs.embodiment import Embodiment
 from envs.judges import Judge, Judgement, MissingFeatures, RuleJudge
-from envs.judges.golden_goal_action import ActionGoldenGoalJudge
+from envs.judges.golden_goal import GoldenGoalJudge
 from envs.simulators.features import pooled_size
 from envs.specs import Status, WorldSpec, text_to_bytes
 from envs.targets import build, target
 from tests.embodiments import EMBODIMENTS, INSTRUCTIONS, world_spec
 from tests.envs.judges.chat_server import MODEL, hashing, serving
 from tests.envs.judges.tiny_vlm import save_tiny_vlm
+from tests.envs.nearing import nearing
 from tests.sections import CONFIGS, offered, section
 
 EXAMPLES = CONFIGS.parent / "examples/configs"
@@ -195,6 +196,8 @@ def test_every_weight_is_learned_or_at_least_used(name: str, judge: Judge, spec:
     """What is trained gets a gradient from the loss; what is frozen changes the judgement when it changes."""
     frames, first, texts, seen = clips(judge, spec, 6, 1)
     first = first.flip(0)
+    if isinstance(judge, GoldenGoalJudge):  # which pays noise nothing
+        frames = nearing(judge, first, texts)[:, None]
     trained = [(key, value) for key, value in judge.named_parameters() if value.requires_grad]
     frozen = [(key, value) for key, value in judge.named_parameters() if not value.requires_grad]
     if trained:
@@ -224,10 +227,8 @@ def test_what_is_submitted_is_fetched(judge: Judge, spec: WorldSpec) -> None:
 
 def test_first_frame_instruction_and_every_view_matter(name: str, judge: Judge, spec: WorldSpec) -> None:
     frames, first, texts, seen = clips(judge, spec, 2, 3)
-    if isinstance(
-        judge, ActionGoldenGoalJudge
-    ):  # success asks neither words nor pictures, and noise nears no goal
-        frames[:, 1:] = (judge.goals(first, texts).frames // 2 + first // 2)[:, None]
+    if isinstance(judge, GoldenGoalJudge):
+        frames[:, 1:] = nearing(judge, first, texts)[:, None]
     scores, ignored = judge.score(frames, first, texts, *seen), IGNORES.get(name, ())
     assert same(judge.score(frames, 255 - first, texts, *seen), scores) == ("first frame" in ignored)
     assert same(judge.score(frames, first, texts[::-1], *seen), scores) == (not judge.reads_instruction)

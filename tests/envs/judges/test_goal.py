@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 import torch
 
+from envs.judges.goal import Goals
 from envs.judges.goal_image import GoalImageJudge
 from envs.judges.golden_goal import GoldenGoalJudge
 from envs.specs import Status
 from envs.targets import ConfigError, build
 from tests.embodiments import ARM_DELTAS, world_spec
 from tests.envs.judges.test_conformance import TINY_TEXT_WORLD
+from tests.envs.nearing import nearing
 from tests.moving_square import SIZE, picture
 from tests.sections import merged, section
 
@@ -93,20 +95,53 @@ def test_goals_are_imagined_once_for_each_first_frame_and_instruction() -> None:
     assert few.imagined == 3 and len(few._known) == 1
 
 
+class Reached(GoldenGoalJudge):
+    """Its goals are what its text world draws of given frames."""
+
+    ends: torch.Tensor
+
+    def goals(self, first: torch.Tensor, instruction: list[str]) -> Goals:
+        known = torch.ones(len(first), dtype=torch.bool)
+        return Goals(self.text_world.redraw(self.ends[:, None])[:, 0], known)
+
+
+@pytest.mark.parametrize("cameras", ["all", "main"])
+def test_what_shows_the_goal_is_all_the_way_there_however_coarse_the_tokenizer_is(cameras: str) -> None:
+    torch.manual_seed(0)
+    target = f"{Reached.__module__}.{Reached.__name__}"
+    options = section("judge/golden_goal", text_world=TINY_TEXT_WORLD, _target_=target, cameras=cameras)
+    options.pop("rewards")
+    judge: Reached = build(options, "judge", spec=SPEC).eval()
+    frames, first = episodes()
+    judge.ends = frames[:, -1]
+    assert float((judge.as_goals(frames) - frames.float()).abs().mean()) > 5  # it keeps little of a frame
+    progress = judge.score(frames, first, TEXTS).progress
+    assert torch.equal(progress[:, 0], torch.zeros(2)) and torch.equal(progress[:, -1], torch.ones(2))
+    one = judge.score(frames[:, -1:], first, TEXTS).progress
+    assert torch.allclose(one, progress[:, -1:], atol=1e-5)
+
+
+def test_frames_are_compared_with_a_given_picture_as_they_are(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "goal.png"), np.zeros((8, 8, 3), np.uint8))
+    judge, (frames, _) = GoalImageJudge(SPEC, 1, 0.9, METRIC, str(tmp_path / "goal.png")), episodes()
+    assert judge.as_goals(frames) is frames
+
+
 def test_other_weights_imagine_other_goals() -> None:
-    judge, (frames, first) = golden(), episodes()
-    before = judge.score(frames, first, TEXTS)
+    judge, (_, first) = golden(), episodes()
+    before = judge.goals(first, TEXTS).frames
     weights = {name: value + 0.1 for name, value in judge.text_world.state_dict().items()}
     judge.text_world.load_state_dict(weights)
-    assert not torch.equal(judge.score(frames, first, TEXTS).progress, before.progress)
+    assert not torch.equal(judge.goals(first, TEXTS).frames, before)
     assert judge.imagined == 4 and not any(p.requires_grad for p in judge.parameters())
     assert not judge.train().text_world.training
 
 
 @pytest.mark.parametrize("fallback", ["drop", "last_frame", "progress_only"])
 def test_a_text_world_that_never_says_done_is_counted_and_handled_as_asked(fallback: str) -> None:
-    judge, (frames, first) = golden(fallback, threshold=1.0), episodes()
-    judged = judge.score(frames, first, TEXTS)
+    judge, shape = golden(fallback, threshold=1.0), episodes()[1].shape
+    first = torch.randint(0, 256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    judged = judge.score(nearing(judge, first, TEXTS)[:, None], first, TEXTS)
     assert judge.facts()["goals_unfinished"] == judge.facts()["goals"] == 2
     status = Status.ABSTAIN if fallback == "drop" else Status.OK
     assert judged.status.tolist() == [status.value] * 2

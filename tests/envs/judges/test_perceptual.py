@@ -45,3 +45,21 @@ def test_more_noise_is_further_away_and_gradients_are_finite(picture: torch.Tens
     assert learned.grad is not None and torch.isfinite(learned.grad).all()
     bytes_ = (picture * 255).round().to(torch.uint8)
     assert float(distance(bytes_, picture)) < 0.02
+
+
+@pytest.mark.parametrize("size", [(64, 64), (49, 66), (47, 81), (17, 16)])
+def test_levels_are_in_register(size: tuple[int, int]) -> None:
+    """A slope of light is the same at all scales, so that no band holds any of it but at the edges."""
+    distance, (height, width) = PerceptualDistance(), size
+    down, across = torch.arange(height) / height, torch.arange(width) / width
+    ramp = (0.6 * down[:, None] + 0.4 * across).expand(1, 3, -1, -1)
+    *bands, _ = distance.bands(ramp)
+    assert len(bands) == (1 if min(size) < 32 else 2 if min(size) < 64 else 3)
+    assert bands[0].shape[-2:] == size
+    assert all(float(band[..., 6:-6, 6:-6].abs().max()) < 1e-3 for band in bands)
+
+
+def test_a_mirror_image_has_mirrored_bands(picture: torch.Tensor) -> None:
+    distance = PerceptualDistance()
+    for band, other in zip(distance.bands(picture), distance.bands(picture.flip(-1, -2)), strict=True):
+        assert torch.allclose(band.flip(-1, -2), other, atol=1e-5)

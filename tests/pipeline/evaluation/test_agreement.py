@@ -17,10 +17,10 @@ from pipeline.evaluation.value.agreement import (
     correlation,
     macro,
     micro,
-    mmrv,
     order,
     overall,
 )
+from pipeline.evaluation.value.chance import mmrv
 from pipeline.evaluation.value.page import build_page, ranking, table_text, verdict
 
 TRUE = np.array([0.9, 0.5, 0.1])
@@ -56,8 +56,11 @@ def test_correlations_are_those_of_the_textbook() -> None:
 
 
 def test_pairs_that_tie_in_truth_say_nothing_and_those_that_tie_in_estimates_are_not_kept() -> None:
-    assert order(np.array([0.5, 0.5, 0.1]), np.array([0.3, 0.6, 0.2])) == {"kept": 2, "pairs": 2}
-    assert order(TRUE, np.array([0.4, 0.4, 0.1])) == {"kept": 2, "pairs": 3}
+    every = ~np.eye(3, dtype=bool)
+    some = order(np.array([0.5, 0.5, 0.1]), np.array([0.3, 0.6, 0.2]), every)
+    assert some == {"kept": 2, "pairs": 2, "all": 3}
+    assert order(TRUE, np.array([0.4, 0.4, 0.1]), every) == {"kept": 2, "pairs": 3, "all": 3}
+    assert order(TRUE, np.array([0.4, 0.4, 0.1]), ~every) == {"kept": 0, "pairs": 0, "all": 3}
 
 
 def test_micro_counts_episodes_and_macro_cells() -> None:
@@ -99,9 +102,9 @@ def test_values_are_compared_on_the_starts_that_were_judged() -> None:
 def test_kind_outside_and_hard_inside() -> None:
     """As WPE found: under-estimated where the world knows policies, over-estimated under noise."""
     cells = [
-        cell("good", "1111", "1110", "1110"),
-        cell("fair", "1100", "1000", "1000"),
-        cell("noise", "0000", "0000", "1000", inside=False),
+        cell("good", 4 * "1111", 4 * "1110", 4 * "1110"),
+        cell("fair", 4 * "1100", 4 * "1000", 4 * "1000"),
+        cell("noise", 4 * "0000", 4 * "0000", 4 * "1000", inside=False),
     ]
     found = agreement(cells)
     assert found["kept"] and found["mmrv"] == 0.0 and found["spearman"] == 1.0 and "tasks" not in found
@@ -111,10 +114,10 @@ def test_kind_outside_and_hard_inside() -> None:
 
 
 def test_orders_are_compared_within_tasks_alone() -> None:
-    easy = [cell("a", "1111", "1111"), cell("b", "1110", "0111")]
-    hard = [cell("a", "0000", "0000", task="pull"), cell("b", "1000", "1111", task="pull")]
+    easy = [cell("a", 6 * "1111", 6 * "1111"), cell("b", 6 * "1110", 6 * "0111")]
+    hard = [cell("a", 6 * "0000", 6 * "0000", task="pull"), cell("b", 6 * "1000", 6 * "1111", task="pull")]
     found = agreement([*easy, *hard, cell("c", None, "1111")])
-    assert found["order"] == {"kept": 2, "pairs": 2} and found["kept"] and found["cells"] == 4
+    assert found["order"] == {"kept": 2, "pairs": 2, "all": 2} and found["kept"] and found["cells"] == 4
     assert set(found["tasks"]) == {"pull", "push"} and found["tasks"]["pull"]["difference"] == 0.375
     assert bias(np.array([0.2]), np.array([0.2]))["exact"] == 1
 
@@ -139,10 +142,12 @@ def result_of(*cells: Cell) -> dict[str, Any]:
 
 def test_where_all_true_values_are_equal_there_is_no_ranking_to_keep() -> None:
     said = result_of(cell("a", "10", "11"), cell("b", "01", "00"))
-    assert said["agreement"]["order"] == {"kept": 0, "pairs": 0} and said["agreement"]["kept"] is None
+    assert (
+        said["agreement"]["order"] == {"kept": 0, "pairs": 0, "all": 1} and said["agreement"]["kept"] is None
+    )
     assert verdict(said).startswith("no ranking to keep") and "0 of 0" not in build_page(said)
-    other = result_of(cell("a", "11", "11"), cell("b", "01", "11"))
-    assert verdict(other).startswith("ranking not kept (0 of 1 pairs)")
+    other = result_of(cell("a", 3 * "11", 3 * "11"), cell("b", 3 * "00", 3 * "11"))
+    assert verdict(other).startswith("ranking not kept (0 of 1 pairs told apart in truth, of 1)")
 
 
 def test_policies_have_a_value_over_all_starts_and_a_ranking_without_truth() -> None:
