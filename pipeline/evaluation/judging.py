@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
@@ -41,6 +42,17 @@ def labelled(store: ClipStore, episodes: Tensor) -> Tensor:
 def episode_success(store: ClipStore, episodes: Tensor) -> Tensor:
     """Recorded success bool [N] of labelled episodes."""
     return torch.tensor([bool(store.episodes[n]["success"]) for n in episodes.tolist()], dtype=torch.bool)
+
+
+@contextmanager
+def thinned(judge: Judge, every: int) -> Iterator[Judge]:
+    """The judge of video that shows every so-manyth frame alone: so many of these stand for `hold` of all."""
+    hold = judge.hold
+    judge.hold = max(1, round(hold / every))
+    try:
+        yield judge
+    finally:
+        judge.hold = hold
 
 
 @torch.no_grad()
