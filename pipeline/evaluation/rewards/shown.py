@@ -42,7 +42,7 @@ def shown_table(judge: Judge, store: ClipStore, episodes: Tensor, frames: str) -
     parts, every = [], {ALL: 1, ENDS: judge.hold}.get(frames) or int(frames)
     with thinned(judge, every):
         for some in tqdm(torch.arange(len(episodes)).split(_BATCH), desc=f"judge {frames}", leave=False):
-            parts.append(judge_recorded(judge, store, episodes[some], rows[some]))
+            parts.append(judge_recorded(judge, store, episodes[some], rows[some], valid[some]))
         scores = Scores(*(torch.cat(values) for values in zip(*parts, strict=True)))
         table = judge_table(judge, scores, valid, store, episodes)
     lost = {
