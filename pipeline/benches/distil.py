@@ -219,7 +219,7 @@ def _verdicts(cfg: Cfg, inputs: Inputs, simulator: Simulator, store: ClipStore) 
     """
     held, bf16 = labelled(store, store.split("held_out"))[:_JUDGED], cfg["simulator"]["bf16"]
     made, judge = replay(simulator, store, held, bf16=bf16), build_judge(cfg, inputs.weights("judge"))
-    scores = judge_frames(judge.eval(), made.frames, store, held, made.features)
+    scores = judge_frames(judge.eval(), made.frames, made.valid, store, held, made.features)
     found = judge_table(judge, scores, made.valid, store, held)
     count = {name: float(found.get(name, 0)) for name in ("tp", "fp", "fn", "tn")}
     judged = sum(count.values())

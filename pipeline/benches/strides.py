@@ -23,6 +23,7 @@ from envs.simulators.replay import replay
 from pipeline.cli.words import root_of
 from pipeline.evaluation.fidelity.strides import VERDICTS, common_stride
 from pipeline.evaluation.fidelity.verdicts import judged, verdict_tables, verdict_text
+from pipeline.evaluation.judging import thinned
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.loop import check_physics
@@ -95,7 +96,7 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     began = time.perf_counter()
     made = replay(simulator, store, held, bf16=bf16, stride=stride)
     seconds = (time.perf_counter() - began) / len(held)
-    true, judge = store.frames(made.rows), build_judge(cfg, inputs.weights("judge")).eval()
+    true = store.frames(made.rows)
     error = torch.stack(
         [
             ((a.float() - b.float()) / 255).square().mean((-4, -3, -2, -1))
@@ -106,10 +107,12 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     shown = stride * torch.arange(1, psnr.shape[1] + 1)
     seen = made.pictured(store).valid
     alike = seen & (shown % common == 0)
+    with thinned(build_judge(cfg, inputs.weights("judge")).eval(), stride) as judge:
+        verdicts = verdict_tables(judge, store, held, [judged(judge, store, held, made)], made.valid)
     return {
         "covers": stride * store.spec.chunk / store.fps,
         "seconds": seconds,
         "psnr": float(psnr[seen].mean()),
         "psnr_common": float(psnr[alike].mean()),
-        "verdicts": verdict_tables(judge, store, held, [judged(judge, store, held, made)], made.valid),
+        "verdicts": verdicts,
     }

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
@@ -22,7 +23,7 @@ from envs.initial_states import DecisionPoints
 from envs.judges.base import Judge, ask
 from envs.physics.env import PhysicsEnv
 from envs.rng import resampling_generator
-from envs.specs import CHUNK, IMAGE, LOST, PROGRESS, SUCCESS, to_chunk
+from envs.specs import CHUNK, LOST, PROGRESS, SUCCESS, Status, to_chunk
 
 _RESAMPLES = 400  # of the moments, for intervals
 
@@ -32,8 +33,9 @@ class Branches:
     """Futures of N moments, G of each, by the number of chunks D since then; all float32.
 
     imagined [D, N, G]: the judge's progress on generated frames; seen [D, N, G]: the same judge's on the true
-    frames of the same actions; outcome [N, G]: whether the true episode succeeded in the end, the policy
-    going on in physics after the D chunks. Moments in one of whose futures physics crashed are left out.
+    frames of the same actions, by the same rule; outcome [N, G]: whether the true episode succeeded in the
+    end, the policy going on in physics after the D chunks. Moments in one of whose futures physics crashed
+    are left out.
     """
 
     imagined: Tensor
@@ -54,7 +56,7 @@ def branch(
 
     Args:
         world: imagined, of len(which) * futures slots that begin at DecisionPoints, D chunks long.
-        physics: of the episodes' own task; of any number of slots.
+        physics: of the episodes' own task, that records; of any number of slots.
         policy: whose stochastic chunks are tried.
         judge: of the imagined world.
         which: of the decision points, int64 [N], with at least D chunks of the task left.
@@ -63,33 +65,39 @@ def branch(
     assert isinstance(points, DecisionPoints)
     slots = which.repeat_interleave(futures)
     with set_exploration_type(ExplorationType.RANDOM):
-        imagined, chunks = _imagine(world, policy, slots)
-        width = physics.batch_size[0]
-        parts = [
-            carry_out(physics, policy, judge, points, some, made)
-            for some, made in tqdm(
-                list(zip(slots.split(width), chunks.split(width, 1), strict=True)),
-                desc="carried out",
-                unit="batch",
-                dynamic_ncols=True,
-                leave=False,
-            )
-        ]
-    seen, outcome = (torch.cat(values, -1) for values in zip(*parts, strict=True))
+        begun, imagined, chunks = _imagine(world, policy, slots)
+        width, seen, outcomes = physics.batch_size[0], [], []
+        for part in tqdm(
+            torch.arange(len(slots)).split(width),
+            desc="carried out",
+            unit="batch",
+            dynamic_ncols=True,
+            leave=False,
+        ):
+            some = slots[part]
+            frames, outcome = carry_out(physics, policy, points, some, chunks[:, part])
+            first = points.store.frames(points.store.start[points.episode[some]])
+            texts = [points.instructions[number] for number in some.tolist()]
+            seen.append(watched(judge, frames, first, texts, begun[part]))
+            outcomes.append(outcome)
+    true, outcome = torch.cat(seen, 1), torch.cat(outcomes)
     shape = (len(which), futures)
     whole = outcome.reshape(shape).isfinite().all(1)
     return Branches(
         imagined.unflatten(-1, shape)[:, whole],
-        seen.unflatten(-1, shape)[:, whole],
+        true.unflatten(-1, shape)[:, whole],
         outcome.reshape(shape)[whole],
     )
 
 
-def _imagine(world: EnvBase, policy: SafePolicyWrapper, slots: Tensor) -> tuple[Tensor, Tensor]:
-    """Progress [D, W] and the chunks [D, W, K, A] that led to it; a success stays one."""
+def _imagine(world: EnvBase, policy: SafePolicyWrapper, slots: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Progress [W] at the moments, that [D, W] of what follows, and the chunks [D, W, K, A] that led to it; a
+    success stays one.
+    """
     base = world.base_env
     base.schedule(slots.tolist())
     now, progress, chunks = world.reset(), [], []
+    begun = now[PROGRESS].squeeze(-1).cpu()
     won = torch.zeros(len(slots), dtype=torch.bool)
     for _ in range(base.horizon // base.chunk):
         after = world.step(policy(now))
@@ -97,33 +105,28 @@ def _imagine(world: EnvBase, policy: SafePolicyWrapper, slots: Tensor) -> tuple[
         progress.append(torch.where(won, 1.0, after["next", PROGRESS].squeeze(-1).cpu()))
         chunks.append(after[CHUNK].cpu())
         now = step_mdp(after)
-    return torch.stack(progress), torch.stack(chunks)
+    return begun, torch.stack(progress), torch.stack(chunks)
 
 
 def carry_out(
     physics: PhysicsEnv,
     policy: SafePolicyWrapper,
-    judge: Judge,
     points: DecisionPoints,
     which: Tensor,
     chunks: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Progress [D, W] as the judge sees it and outcome [W] of the decision points `which` [W], followed by
-    chunks [D, W, K, A]; an outcome is NaN where physics crashed.
+    """Carry out chunks [D, W, K, A] from the decision points `which` [W], and go on by the policy.
 
-    A success that the judge has seen stays one, as in imagination; physics shows a chunk's last frame, which
-    stands for the others.
+    Returns:
+        The frames of these chunks, uint8 [D, W, K, V, 3, H, W], of an episode that is over its last one; and
+        the outcome float32 [W], NaN where physics crashed, whose frames are black.
     """
     store, count, depth = points.store, len(which), len(chunks)
     which = torch.cat((which, which[-1:].expand(physics.batch_size[0] - count)))  # fills the batch
     episode, moment = points.episode[which], points.frame[which]
     seeds = [int(store.episodes[number]["seed"]) for number in episode.tolist()]
-    first = store.frames(store.start[episode])
-    texts = [store.instructions[number] for number in episode.tolist()]
-    seen = torch.full((depth, len(which)), torch.nan)
     over = torch.zeros(len(which), dtype=torch.bool)
-    won, lost, told = over.clone(), over.clone(), over.clone()
-    run = torch.zeros(len(which), dtype=torch.int64)
+    won, lost = over.clone(), over.clone()
     physics.schedule(seeds)
     now = physics.reset()
     for begin in range(0, physics.horizon, physics.chunk):
@@ -135,18 +138,42 @@ def carry_out(
             chunk[mine] = chunks[number, mine].to(chunk.device)
         acted[CHUNK] = chunk
         after = physics.step(acted)
-        judgement = ask(judge, after["next", IMAGE].unsqueeze(1), first, texts)
-        done, run = judge.streak(judgement.success.cpu().expand(-1, physics.chunk), run)
-        told |= done.any(1)
-        progress = torch.where(told, 1.0, judgement.progress[:, 0].cpu())
         won |= ~over & after["next", SUCCESS].squeeze(-1)
         lost |= after["next", LOST].squeeze(-1)
-        for number in range(depth):
-            at = since == number
-            seen[number, at] = progress[at]
         over |= after["next", "done"].squeeze(-1)
         now = step_mdp(after)
-    return seen[:, :count], won.float().masked_fill(lost, torch.nan)[:count]
+    spec = physics.spec
+    frames = torch.zeros(depth, count, spec.chunk, spec.views, 3, *spec.size, dtype=torch.uint8)
+    for slot, track in physics.tracks:
+        if slot < count:
+            ahead = int(moment[slot]) + torch.arange(1, depth * spec.chunk + 1)
+            seen = [track.rows["frames"][row] for row in ahead.clamp(max=len(track) - 1).tolist()]
+            frames[:, slot] = torch.from_numpy(np.stack(seen)).unflatten(0, (depth, spec.chunk))
+    physics.tracks.clear()
+    return frames, won.float().masked_fill(lost, torch.nan)[:count]
+
+
+def watched(judge: Judge, frames: Tensor, first: Tensor, texts: list[str], begun: Tensor) -> Tensor:
+    """Progress [D, W] after each of the chunks uint8 [D, W, K, V, 3, H, W] as an imagined world has it
+    (JudgeReward): `hold` successes in a row among all frames since the moment are one that stays, and a chunk
+    that was not judged changes nothing.
+
+    Args:
+        first: uint8 [W, V, 3, H, W], of the episodes.
+        texts: their W instructions.
+        begun: progress [W] at the moment.
+    """
+    device, out = judge.threshold.device, []
+    run = torch.zeros(len(begun), dtype=torch.int64, device=device)
+    won = torch.zeros(len(begun), dtype=torch.bool)
+    for chunk in frames:
+        judgement = ask(judge, chunk.to(device), first.to(device), texts)
+        done, run = judge.streak(judgement.success.to(device), run)
+        known = judgement.status.cpu() == Status.OK.value
+        won |= done.any(1).cpu() & known
+        begun = torch.where(won, 1.0, torch.where(known, judgement.progress[:, -1].cpu(), begun))
+        out.append(begun)
+    return torch.stack(out)
 
 
 def _recorded(store: ClipStore, episode: Tensor, begin: int, physics: PhysicsEnv) -> Tensor:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
@@ -43,42 +44,71 @@ def episode_success(store: ClipStore, episodes: Tensor) -> Tensor:
     return torch.tensor([bool(store.episodes[n]["success"]) for n in episodes.tolist()], dtype=torch.bool)
 
 
+@contextmanager
+def thinned(judge: Judge, every: int) -> Iterator[Judge]:
+    """The judge of video that shows every so-manyth frame alone: so many of these stand for `hold` of all."""
+    hold = judge.hold
+    judge.hold = max(1, round(hold / every))
+    try:
+        yield judge
+    finally:
+        judge.hold = hold
+
+
 @torch.no_grad()
 def judge_frames(
     judge: Judge,
     frames: Tensor,
+    valid: Tensor,
     store: ClipStore,
     episodes: Tensor,
     features: Tensor | None = None,
     batch: int = 16,
 ) -> Scores:
-    """What the judge says of frames uint8 [N, T, V, 3, H, W] of these episodes.
+    """What the judge says of frames uint8 [N, T, V, 3, H, W] of these episodes. Past an episode's end it is
+    shown the last frame again, so that what did not happen decides nothing.
 
     Args:
+        valid: bool [N, T], frames that exist, the first ones.
         features: float32 [N, C, D] of their chunks, see Judge.score; used by a judge that reads them.
     """
-    device = judge.threshold.device
-    scores = []
+    device, scores = judge.threshold.device, []
+    if judge.reads_features and features is not None:
+        features = until_end(features, valid[:, :: store.spec.chunk])
     for begin in range(0, len(episodes), batch):
         some = slice(begin, begin + batch)
         first = store.frames(store.start[episodes[some]])
         texts = [store.instructions[n] for n in episodes[some].tolist()]
         seen = (features[some].to(device),) if judge.reads_features and features is not None else ()
-        verdict = ask(judge, frames[some].to(device), first.to(device), texts, *seen)
+        shown = until_end(frames[some], valid[some])
+        verdict = ask(judge, shown.to(device), first.to(device), texts, *seen)
         scores.append([value.cpu() for value in verdict])
     return Scores(*(torch.cat(parts) for parts in zip(*scores, strict=True)))
 
 
+def until_end(values: Tensor, valid: Tensor) -> Tensor:
+    """Values [N, T, ...] with the last of those that exist, bool [N, T], in place of all that follow it."""
+    times = torch.arange(valid.shape[1])
+    last = torch.where(valid, times, 0).amax(1, keepdim=True)
+    return values[torch.arange(len(values))[:, None], torch.minimum(times, last)]
+
+
 def judge_recorded(
-    judge: Judge, store: ClipStore, episodes: Tensor, rows: Tensor, features: Tensor | None = None
+    judge: Judge,
+    store: ClipStore,
+    episodes: Tensor,
+    rows: Tensor,
+    valid: Tensor,
+    features: Tensor | None = None,
 ) -> Scores:
     """What the judge says of the recorded frames `rows` [N, T] of these episodes; those of which there is no
     picture show no success.
 
     Args:
-        features: as of `judge_frames`.
+        valid, features: as of `judge_frames`.
     """
-    scores = judge_frames(judge, store.frames(rows), store, episodes, features)
+    rows = until_end(rows, valid)
+    scores = judge_frames(judge, store.frames(rows), valid, store, episodes, features)
     seen = store.arrays["present"][rows]
     return scores._replace(success=torch.where(seen, scores.success, 0.0))
 
@@ -122,8 +152,8 @@ def judge_both(
     """
     known = features_of_episodes(simulator, store, episodes, bf16) if judge.reads_features else None
     return Views(
-        judge_recorded(judge, store, episodes, made.rows, known),
-        judge_frames(judge, made.frames, store, episodes, made.features),
+        judge_recorded(judge, store, episodes, made.rows, made.valid, known),
+        judge_frames(judge, made.frames, made.valid, store, episodes, made.features),
     )
 
 

@@ -75,7 +75,7 @@ def gap(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         simulator = world.base_env.simulator
         decoder = build_state_decoder(cfg, simulator, inputs.weights("state"))
         made = replay(simulator, store, held, decoder, bf16=cfg["simulator"]["bf16"])
-        scores = judge_frames(judge, made.frames, store, held, made.features)
+        scores = judge_frames(judge, made.frames, made.valid, store, held, made.features)
         write_film(folder / "media/held-out.mp4", paired_frames(store, held, made, 0), store.fps, rest=REST)
         result["replayed"] = judge_table(judge, scores, made.valid, store, held)
     return {**result, "judged_by": judge.facts(), "alarms": too_kind(result)}

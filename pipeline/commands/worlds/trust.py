@@ -78,7 +78,7 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
         *(cfg, simulator, decoder, judge, points, len(which) * futures),
         horizon=depth * int(cfg["task"]["chunk"]),
     )
-    physics = build_physics(cfg, at_once(cfg, min(_SIDE_BY_SIDE, len(which) * futures)))
+    physics = build_physics(cfg, at_once(cfg, min(_SIDE_BY_SIDE, len(which) * futures)), record=True)
     policy = SafePolicyWrapper(build_policy(cfg, inputs.weights("policy")), physics.spec, physics.mode)
     seed_process(cfg["seed"])
     try:

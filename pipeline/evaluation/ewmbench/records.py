@@ -89,8 +89,8 @@ class Records:
 
 
 def _written(tracks: Tensor) -> dict[str, Any]:
-    """Shape and numbers to a hundredth of a pixel; null where nothing was found."""
-    flat = [round(value, 2) if np.isfinite(value) else None for value in tracks.flatten().tolist()]
+    """Shape and numbers with all digits, so that figures stay when they are read; null for nothing found."""
+    flat = [value if np.isfinite(value) else None for value in tracks.flatten().tolist()]
     return {"shape": list(tracks.shape), "pixels": flat}
 
 

@@ -22,6 +22,7 @@ from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.fidelity.frames import by_frame, frame_errors, summary
 from pipeline.evaluation.fidelity.frechet import Moments, frechet
 from pipeline.evaluation.fidelity.verdicts import judged
+from pipeline.evaluation.judging import thinned
 from pipeline.evaluation.objects.error import object_offsets, object_summary
 from pipeline.graph.kept import Kept, Tensors
 
@@ -174,7 +175,8 @@ class OpenLoop:
             hands = self.hands.measure(self.store, episodes, shown, true)
             out |= {f"hand/{name}": values for name, values in hands.items()}
         if self.judge is not None:
-            said = judged(self.judge, self.store, episodes, made)
+            with thinned(self.judge, self.stride) as judge:
+                said = judged(judge, self.store, episodes, made)
             out |= {f"judge/{name}": values for name, values in said.items()}
         return out
 

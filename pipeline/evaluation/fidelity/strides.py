@@ -10,8 +10,9 @@ from typing import Any
 from envs.simulators.base import Simulator
 from envs.simulators.replay import replay
 from pipeline.evaluation.fidelity.frames import summary
-from pipeline.evaluation.fidelity.open_loop import OpenLoop
+from pipeline.evaluation.fidelity.open_loop import Measured, OpenLoop
 from pipeline.evaluation.fidelity.verdicts import verdict_tables, verdict_text
+from pipeline.evaluation.judging import thinned
 
 HEADINGS = ("stride", "a chunk covers", "s per episode", "frames reached")
 VERDICTS = ("verdicts right", "of the same recorded frames")
@@ -45,12 +46,17 @@ def by_stride(loop: OpenLoop, simulator: Simulator, strides: Sequence[int]) -> l
                 "seconds": found.seconds / len(loop.episodes),
                 "frames": stride * float(found.valid.sum(1).float().mean()),
                 **summary(errors, found.valid[:, every - 1 :: every]),
-                "verdicts": {}
-                if loop.judge is None
-                else verdict_tables(loop.judge, loop.store, loop.episodes, found.judged, found.valid),
+                "verdicts": _verdicts(own, found),
             }
         )
     return rows
+
+
+def _verdicts(loop: OpenLoop, found: Measured) -> dict[str, Any]:
+    if loop.judge is None:
+        return {}
+    with thinned(loop.judge, loop.stride) as judge:
+        return verdict_tables(judge, loop.store, loop.episodes, found.judged, found.valid)
 
 
 def stride_cells(row: Mapping[str, Any], texts: Sequence[str]) -> list[str]:

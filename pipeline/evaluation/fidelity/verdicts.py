@@ -18,9 +18,9 @@ def judged(judge: Judge, store: ClipStore, episodes: Tensor, made: Replay) -> di
     """Scores of episodes int64 [N], as tensors by names such as generated/success. A judge that reads a
     simulator's features is shown generated frames alone: recordings have features at their own rate only.
     """
-    videos = {"generated": judge_frames(judge, made.frames, store, episodes, made.features)}
+    videos = {"generated": judge_frames(judge, made.frames, made.valid, store, episodes, made.features)}
     if not judge.reads_features:
-        videos["recorded"] = judge_recorded(judge, store, episodes, made.rows)
+        videos["recorded"] = judge_recorded(judge, store, episodes, made.rows, made.valid)
     return {f"{name}/{field}": v for name, some in videos.items() for field, v in some._asdict().items()}
 
 

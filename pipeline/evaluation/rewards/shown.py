@@ -14,7 +14,7 @@ from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge
 from envs.specs import Status
 from envs.targets import ConfigError
-from pipeline.evaluation.judging import Scores, judge_recorded, judge_table
+from pipeline.evaluation.judging import Scores, judge_recorded, judge_table, thinned
 
 ALL, ENDS = "all", "ends"
 _BATCH = 16  # episodes judged at once
@@ -38,17 +38,13 @@ def shown_table(judge: Judge, store: ClipStore, episodes: Tensor, frames: str) -
         shown, how many frames of an episode in the mean; abstained and errors, in episodes; and what
         judge_table says.
     """
-    rows, valid = thinned(store, episodes, frames)
-    parts, held = [], judge.hold
-    # So many of the frames that are left stand for `hold` of all.
-    judge.hold = 1 if frames == ENDS else max(1, round(held / (1 if frames == ALL else int(frames))))
-    try:
+    rows, valid = shown_rows(store, episodes, frames)
+    parts, every = [], {ALL: 1, ENDS: judge.hold}.get(frames) or int(frames)
+    with thinned(judge, every):
         for some in tqdm(torch.arange(len(episodes)).split(_BATCH), desc=f"judge {frames}", leave=False):
-            parts.append(judge_recorded(judge, store, episodes[some], rows[some]))
+            parts.append(judge_recorded(judge, store, episodes[some], rows[some], valid[some]))
         scores = Scores(*(torch.cat(values) for values in zip(*parts, strict=True)))
         table = judge_table(judge, scores, valid, store, episodes)
-    finally:
-        judge.hold = held
     lost = {
         name: int((scores.status == status.value).sum())
         for name, status in (("abstained", Status.ABSTAIN), ("errors", Status.ERROR))
@@ -56,7 +52,7 @@ def shown_table(judge: Judge, store: ClipStore, episodes: Tensor, frames: str) -
     return {"shown": 1 + float(valid.sum(1).float().mean()), **table, **lost}
 
 
-def thinned(store: ClipStore, episodes: Tensor, frames: str) -> tuple[Tensor, Tensor]:
+def shown_rows(store: ClipStore, episodes: Tensor, frames: str) -> tuple[Tensor, Tensor]:
     """Some rows of each episode but its first, int64 [N, T], the last repeated up to the longest, and which
     are no repeats, bool [N, T]; see check_frames.
     """

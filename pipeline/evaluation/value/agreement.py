@@ -96,7 +96,8 @@ class Cell:
 
     def row(self) -> dict[str, Any]:
         """The cell in numbers: policy, task, inside, estimated, standard_error, episodes, dropped, and, where
-        they are known, true (a rate entry), true_value and confusion.
+        they are known, true (a rate entry), true_value, matched_value (see `matched`; None of nothing
+        judged) and confusion.
         """
         known = {} if self.true is None else {"true": rate_entry(self.true), "true_value": self.value}
         return {
@@ -108,7 +109,11 @@ class Cell:
             "episodes": self.imagined.numel(),
             "dropped": int((~self.judged).sum()),
             **known,
-            **({"confusion": self.table} if known else {}),
+            **(
+                {"matched_value": self.matched if self.rates else None, "confusion": self.table}
+                if known
+                else {}
+            ),
         }
 
 

@@ -170,12 +170,24 @@ def _cell_text(cell: Mapping[str, Any]) -> str:
     value, error = cell["estimated"], cell["standard_error"]
     estimated = "nothing judged" if value is None else f"{100 * value:.0f}"
     spread = "" if error is None or value is None else f" +- {100 * error:.1f}"
-    true = f"{percent_line(cell['true'], 0).rstrip('%')} -> " if "true" in cell else ""
-    return f"{true}{estimated}{spread}"
+    return f"{_true_text(cell)}{estimated}{spread}"
+
+
+def _true_text(cell: Mapping[str, Any]) -> str:
+    """The true value on the judged starts, which the estimated one is of, and, where it is another, that on
+    all of them; "" if nobody knows it.
+    """
+    if "true" not in cell:
+        return ""
+    whole, matched = percent_line(cell["true"], 0).rstrip("%"), cell["matched_value"]
+    own = whole if matched is None else f"{100 * matched:.0f}"
+    return f"{own} -> " if own == whole else f"{own} (all starts {whole}) -> "
 
 
 def _charts(cells: Sequence[Mapping[str, Any]], tasks: Sequence[str]) -> list[Markup]:
-    """Estimated over true values: of all tasks, and of each of several; [] where no true value is known."""
+    """Estimated over true values, both of the judged starts: of all tasks, and of each of several; [] where
+    no true value is known.
+    """
     known = [cell for cell in cells if "true" in cell and cell["estimated"] is not None]
     if not known:
         return []
@@ -188,4 +200,4 @@ def _charts(cells: Sequence[Mapping[str, Any]], tasks: Sequence[str]) -> list[Ma
 def _point(cell: Mapping[str, Any]) -> Point:
     label = f"{cell['policy']}, {cell['task']}: {_cell_text(cell)} percent"
     series = 0 if cell["inside"] else 1
-    return Point(label, cell["true_value"], cell["estimated"], cell["standard_error"] or 0.0, series)
+    return Point(label, cell["matched_value"], cell["estimated"], cell["standard_error"] or 0.0, series)

@@ -26,7 +26,7 @@ from envs.episodes.splits import TRAIN, write_splits
 from envs.episodes.write_behind import WriteBehind
 from envs.rng import Purpose, episode_seeds
 from pipeline.evaluation.by_task import tasks_of_seeds
-from pipeline.evaluation.statistics import rate, rate_entry
+from pipeline.evaluation.statistics import rate_entry
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.collect import SPLITS, run_recorded
@@ -107,15 +107,23 @@ def level_name(level: Level) -> str:
 
 
 def kept(rates: Rates, mode: Rates) -> float:
-    """The share of its mode's successes that a policy keeps, 0..1, as the mean over those tasks in which the
-    mode succeeds at all: what a hard task loses must not be made up for by an easy one.
+    """The share of its mode's successes that a policy keeps, 0..1.
+
+    It is the mean over tasks of min(1, its rate over the mode's), so that what a hard task loses is not made
+    up for by an easy one, over the mean of min(1, the mode's rate over its), for chance takes as much from
+    either. Tasks in which neither succeeds say nothing; half a success and half a failure more on both sides
+    let single episodes decide little.
     """
-    shares = [
-        min(1.0, (rate(rates[task]) or 0.0) / (rate(mode[task]) or 1.0))
+    ratios = [
+        _shrunk(rates[task]) / _shrunk(mode[task])
         for task in mode
-        if mode[task]["successes"]
+        if rates[task]["successes"] or mode[task]["successes"]
     ]
-    return sum(shares) / len(shares)
+    return min(1.0, sum(min(1.0, one) for one in ratios) / sum(min(1.0, 1 / one) for one in ratios))
+
+
+def _shrunk(entry: Mapping[str, Any]) -> float:
+    return (entry["successes"] + 0.5) / (entry["episodes"] + 1)
 
 
 def _tried(cfg: Cfg, inputs: Inputs, seeds: list[int], behind: WriteBehind, level: Level | None) -> Rates:

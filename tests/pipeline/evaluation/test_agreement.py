@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -97,6 +98,12 @@ def test_values_are_compared_on_the_starts_that_were_judged() -> None:
     some = Cell("a", "push", True, bools("1100").repeat(2, 1), judged, bools("1100"))
     assert some.value == 0.5 and some.matched == some.estimated == pytest.approx(0.75)
     assert agreement([some])["difference"] == 0.0 and some.row()["true_value"] == 0.5
+    said = result_of(some)
+    assert "| a | 75 (all starts 50) -> 75 +- 25.0 |" in table_text(said)
+    page = build_page(said)
+    assert "a, push: 75 (all starts 50) -&gt; 75" in page and page.count("75.0%") == 2
+    whole = build_page(result_of(cell("a", "1110", "1110", "1110")))  # .75 in truth and imagination, too
+    assert re.findall(r'<rect [^>]* rx="4">', page) == re.findall(r'<rect [^>]* rx="4">', whole)
 
 
 def test_kind_outside_and_hard_inside() -> None:

@@ -1,40 +1,80 @@
-"""Futures of one moment: carried out as they were recorded, and correlated within moments alone."""
+"""Futures of one moment: carried out as recorded, judged as imagined ones, and correlated within moments."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from actors.factory import build_physics, build_policy, build_pool, open_clips
+from actors.factory import (
+    build_judge,
+    build_physics,
+    build_policy,
+    build_pool,
+    build_simulator,
+    build_state_decoder,
+    build_world,
+    open_clips,
+)
 from actors.policies.safe import SafePolicyWrapper
 from actors.world_config import world_spec
 from envs.episodes import Episode, LeRobotWriter
 from envs.initial_states import DecisionPoints
-from envs.judges.base import Judge, Judgement
-from envs.specs import Status, to_chunk
+from envs.judges.base import Judge, Judgement, ask
+from envs.specs import PROGRESS, SUCCESS, Rewards, Status, to_chunk
+from envs.transforms.judge_reward import JudgeReward
 from pipeline.config import load_config
-from pipeline.evaluation.branches import Branches, agreement, carry_out
+from pipeline.evaluation.branches import Branches, agreement, branch, carry_out, watched
+from tests.worlds import scripted_set
 
 
-class Unmoved(Judge):
-    """Progress .3 of whatever it is shown; success in its third and fourth look, and never again."""
-
-    def __init__(self, hold: int):
-        super().__init__(hold)
-        self.looks = 0
+class Brightness(Judge):
+    """Takes a frame's brightness for success, half of it for progress; clips that begin dark it leaves."""
 
     def score(
         self, frames: Tensor, first: Tensor, instruction: list[str], features: Tensor | None = None
     ) -> Judgement:
         """See Judge.score."""
-        self.looks += 1
-        same = torch.ones(frames.shape[:2])
-        status = torch.full((len(frames),), Status.OK.value)
-        return Judgement(0.9 * same if self.looks in (3, 4) else 0 * same, 0.3 * same, status)
+        bright = frames.float().mean((-4, -3, -2, -1)) / 255
+        status = torch.where(bright[:, 0] > 0, Status.OK.value, Status.ABSTAIN.value)
+        return Judgement(bright, bright / 2, status)
+
+
+def shown(*chunks: list[int]) -> Tensor:
+    """One episode's chunks of frames of these grey levels, uint8 [D, 1, K, 1, 3, 2, 2]."""
+    grey = torch.tensor(chunks, dtype=torch.uint8)[:, None, :, None, None, None, None]
+    return grey.expand(-1, -1, -1, 1, 3, 2, 2)
+
+
+@pytest.mark.parametrize(
+    ("chunks", "progress"),
+    [
+        (([51, 204, 204, 51], [102] * 4), [1.0, 1.0]),  # over before the chunk ends
+        (([51, 51, 51, 204], [204, 51, 51, 102]), [0.4, 1.0]),  # from one chunk into the next
+        (([51, 204, 51, 204], [51, 204, 51, 51]), [0.4, 0.1]),  # never two in a row
+        (([51] * 4, [0, 204, 204, 204], [51] * 4), [0.1, 0.1, 0.1]),
+        (([0, 204, 204, 204], [51, 51, 51, 102]), [0.25, 0.2]),
+    ],
+)
+def test_true_frames_are_judged_by_the_rule_of_imagined_ones(
+    chunks: tuple[list[int], ...], progress: list[float]
+) -> None:
+    judge, frames, first = Brightness(hold=2), shown(*chunks), shown([0])[0, :, 0]
+    found = watched(judge, frames, first, ["do"], torch.tensor([0.25]))
+    assert found.squeeze(-1).tolist() == pytest.approx(progress)
+    rule, won = JudgeReward(judge, Rewards(progress=1.0, success=1.0)), False
+    rule._run, rule._begun = torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.int64)
+    rule._progress = torch.tensor([[0.25]])
+    for chunk, value in zip(frames, progress, strict=True):
+        after = TensorDict({"truncated": torch.zeros(1, 1, dtype=torch.bool)}, [1])
+        rule._decide(ask(judge, chunk, first, ["do"]), after)
+        won = won or bool(after[SUCCESS])
+        assert (1.0 if won else float(after[PROGRESS])) == pytest.approx(value)
 
 
 def test_what_was_recorded_is_carried_out_again(tmp_path: Path) -> None:
@@ -51,8 +91,8 @@ def test_what_was_recorded_is_carried_out_again(tmp_path: Path) -> None:
     store = open_clips(cfg, [tmp_path / "set"])
     points = DecisionPoints(store, torch.arange(3))
     which = (points.frame == 4).nonzero().flatten()
-    policy, judge = build_policy(cfg), Unmoved(hold=spec.chunk + 1).eval()
-    physics = build_physics(cfg, 4)
+    policy = build_policy(cfg)
+    physics = build_physics(cfg, 4, record=True)
     try:
         actor = SafePolicyWrapper(policy, spec, physics.mode)
         depth = int(store.length.max() - 2) // spec.chunk
@@ -64,13 +104,40 @@ def test_what_was_recorded_is_carried_out_again(tmp_path: Path) -> None:
         now = commands[start + torch.minimum(begins[:, None], last)]
         chunks = to_chunk(commands[rows], now, physics.mode)
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            seen, outcome = carry_out(physics, actor, judge, points, which, chunks)
+            frames, outcome = carry_out(physics, actor, points, which, chunks)
     finally:
         physics.close()
     recorded = [bool(store.episodes[int(number)]["success"]) for number in points.episode[which]]
     assert outcome.bool().tolist() == recorded == [True, True, False]
-    # Nothing of the outcome is in what the judge has seen, and what it took for a success stays one.
-    assert depth == 4 and seen.tolist() == [pytest.approx([value] * 3) for value in (0.3, 0.3, 1.0, 1.0)]
+    assert depth == 4
+    for number, track in enumerate(tracks):
+        last = len(track) - 1
+        made = frames[:, number].flatten(0, 1).float()
+        errors = [
+            float((made - torch.from_numpy(np.stack(true))).abs().mean())
+            for shift in (0, 1)
+            if (true := [track.rows["frames"][min(5 + shift + k, last)] for k in range(len(made))])
+        ]
+        assert errors[0] < 0.01 < 1 < errors[1]  # the frames of the same times, and of the next
+
+
+def test_futures_are_imagined_and_carried_out(tmp_path: Path) -> None:
+    cfg = load_config(["experiment=smoke", "task.size=[32,32]", "judge=learned"])
+    store = open_clips(cfg, [scripted_set(cfg, tmp_path / "set", 2)])
+    simulator, judge = build_simulator(cfg).eval(), build_judge(cfg).eval()
+    points = DecisionPoints(store, torch.arange(2))
+    decoder = build_state_decoder(cfg, simulator)
+    world = build_world(cfg, simulator, decoder, judge, points, 6, horizon=2 * int(cfg["task"]["chunk"]))
+    physics = build_physics(cfg, 4, record=True)
+    try:
+        actor = SafePolicyWrapper(build_policy(cfg), physics.spec, physics.mode)
+        found = branch(world, physics, actor, judge, torch.tensor([0, 3, 1]), 2)
+    finally:
+        physics.close()
+    assert found.imagined.shape == found.seen.shape == (2, 3, 2) and found.outcome.shape == (3, 2)
+    for part in (found.imagined, found.seen):
+        assert bool(((part >= 0) & (part <= 1)).all())
+    assert len(agreement(found)) == 2
 
 
 def test_only_what_differs_within_a_moment_counts() -> None:

@@ -9,14 +9,17 @@ import torch
 
 from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge, Judgement
+from envs.judges.fitted import FittedJudge
 from envs.physics.suite import scene_of
 from envs.simulators.base import Simulator
 from envs.simulators.replay import Replay
 from pipeline.evaluation.by_task import by_scene, scenes_of_seeds
 from pipeline.evaluation.disagreement import compared, curves, worst
-from pipeline.evaluation.judging import judge_both, judge_recorded
+from pipeline.evaluation.judging import judge_both, judge_frames, judge_recorded
 from pipeline.evaluation.statistics import rate_entry
+from tests.embodiments import ARM_DELTAS, world_spec
 from tests.envs.physics.sections import Counting
+from tests.moving_square import SIZE
 
 FRAMES = 6
 NOBODY: Simulator = None  # type: ignore[assignment]  # no judge here reads its features
@@ -98,13 +101,55 @@ def test_frames_that_do_not_exist_count_for_nothing() -> None:
     assert row["generated"] == 0.0 and not row["claims"] and len(curves(views, made, 0)["recorded"]) == 3
 
 
+class Doubtful(FittedJudge):
+    """Takes a frame's brightness for the logit of success, from -8 to 8."""
+
+    reads_features = True
+
+    def __init__(self) -> None:
+        super().__init__(hold=2, margin=0.3, discount=1.0)
+        self.read = torch.zeros(0)
+
+    def score(
+        self,
+        frames: torch.Tensor,
+        first: torch.Tensor,
+        instruction: list[str],
+        features: torch.Tensor | None = None,
+    ) -> Judgement:
+        assert features is not None
+        self.read = features
+        bright = frames.float().mean((-4, -3, -2, -1)) / 255
+        return self.judgement((16 * bright - 8).unsqueeze(-1).expand(*bright.shape, 2))
+
+
+def test_a_judge_is_shown_nothing_past_an_episodes_end() -> None:
+    """It would abstain for what did not happen, and a model asked about a clip would look at its last
+    picture.
+    """
+    store: ClipStore = Store()  # type: ignore[assignment]
+    store.spec = world_spec(ARM_DELTAS.at(SIZE), SIZE, chunk=2)
+    judge, made = Doubtful(), replayed([[0, 0, 128, 128, 128], [0, 0, 0, 255, 128]])
+    valid = torch.arange(5) < torch.tensor([[2], [4]])
+    features = torch.arange(6.0).reshape(2, 3, 1)
+    scores = judge_frames(judge, made.frames, valid, store, torch.arange(2), features)
+    assert scores.judged.tolist() == [True, True]
+    assert scores.success.round().tolist() == [[0] * 5, [0, 0, 0, 1, 1]]
+    assert judge.read.squeeze(-1).tolist() == [[0, 0, 0], [3, 4, 4]]
+    whole = judge_frames(judge, made.frames, torch.ones_like(valid), store, torch.arange(2), features)
+    assert whole.judged.tolist() == [False, True]
+    rows = torch.arange(2)[:, None] * FRAMES + torch.arange(1, FRAMES)  # as long strides show an end
+    dark = judge_recorded(judge, store, torch.arange(2), rows, torch.arange(5).expand(2, -1) < 3, features)
+    assert dark.success.round().sum() == 0
+
+
 def test_recorded_frames_without_a_picture_show_no_success() -> None:
     store: ClipStore = Store()  # type: ignore[assignment]
     store.pictures[:] = 255  # type: ignore[attr-defined]
     rows = torch.arange(1, FRAMES)[None]
     for dark, found in ((FRAMES, 1.0), (2, 0.0)):
         store.arrays["present"][dark::2] = False
-        scores = judge_recorded(Brightness(), store, torch.tensor([0]), rows)
+        scores = judge_recorded(Brightness(), store, torch.tensor([0]), rows, torch.ones(1, 5) > 0)
         assert Brightness().confidence(scores.success).tolist() == [found]
 
 

@@ -16,10 +16,11 @@ from torch.nn import functional
 
 from envs.episodes import LeRobotWriter
 from envs.episodes.clips import ClipStore
+from envs.judges.base import Judge, Judgement
 from envs.judges.perceptual import PerceptualDistance
 from envs.rng import constant_generator
 from envs.simulators.base import Simulator
-from envs.specs import WorldSpec
+from envs.specs import Status, WorldSpec
 from envs.targets import ConfigError
 from pipeline.commands.worlds.fidelity import build_extractors
 from pipeline.evaluation.fidelity.extractors import I3D, Extractor, Inception, PyramidClips, PyramidFrames
@@ -31,6 +32,7 @@ from pipeline.evaluation.fidelity.masks import read_labels
 from pipeline.evaluation.fidelity.open_loop import OpenLoop
 from pipeline.evaluation.fidelity.page import collapse_text
 from pipeline.evaluation.fidelity.strides import by_stride, stride_cells
+from pipeline.evaluation.judging import thinned
 from tests.embodiments import BIMANUAL_POSES, world_spec
 from tests.moving_square import SIZE, moving_square, picture
 
@@ -248,6 +250,32 @@ def test_strides_are_compared_at_the_frames_that_all_of_them_show(store: ClipSto
     assert len({row["arm_mse"] for row in rows}) == 1 and rows[0]["arm_mse"] is not None
     assert all(row["seconds"] > 0 and row["verdicts"] == {} for row in rows)
     assert stride_cells(rows[0], ["x"])[3:] == ["12.0", "x", "-", "-"]
+
+
+class Done(Judge):
+    """Takes every frame for a success."""
+
+    def score(
+        self, frames: Tensor, first: Tensor, instruction: list[str], features: Tensor | None = None
+    ) -> Judgement:
+        """See Judge.score."""
+        sure = torch.ones(frames.shape[:2])
+        return Judgement(sure, sure, torch.full((len(frames),), Status.OK.value))
+
+
+def test_so_many_fewer_frames_of_a_stride_make_an_episode_a_success(store: ClipStore) -> None:
+    judge = Done(hold=4)
+    loop = OpenLoop(store, torch.arange(8), False, judge=judge)
+    rows = by_stride(loop, Drawing(store.spec, "right"), [1, 4])  # 12 frames, and 3
+    for row in rows:
+        counts = [
+            {name: found[name] for name in ("tp", "fp", "fn", "tn")} for found in row["verdicts"].values()
+        ]
+        assert counts == [{"tp": 4, "fp": 4, "fn": 0, "tn": 0}] * 2
+    assert judge.hold == 4
+    for every, hold in ((1, 4), (2, 2), (3, 1), (8, 1)):
+        with thinned(judge, every) as same:
+            assert same is judge and judge.hold == hold
 
 
 def test_collapse_is_seen_and_nothing_else_taken_for_it(store: ClipStore) -> None:

@@ -20,6 +20,7 @@ from pipeline.stages.measured.explore import Level, find_level, kept
 from pipeline.study.methods import add_rl_in_physics
 
 WORDS = ["experiment=soak", "track=disabled", "explore.levels=[[1.0,1.0],[0.5,0.5]]", "explore.episodes=3"]
+_LUCK = ([30] * 5, [9, 9, 9, 9, 90])  # successes in 100 of five tasks
 LEVELS: list[Level] = [(1.0, 1.0), (1.0, 0.5), (0.5, 0.5)]
 
 
@@ -52,9 +53,39 @@ def test_easy_tasks_do_not_make_up_for_hard_ones() -> None:
         return {task: rate_entry(torch.arange(100) < count) for task, count in won.items()}
 
     mode = rates(90, 10)
-    assert kept(rates(90, 1), mode) == pytest.approx(0.55)  # 91 of 100 successes
-    assert kept(rates(45, 9), mode) == pytest.approx(0.7)
+    assert kept(rates(90, 1), mode) == pytest.approx((1 + 1.5 / 10.5) / 2)  # .57, with 91 of 100 successes
+    assert kept(rates(45, 9), mode) == pytest.approx(0.7, abs=0.005)
     assert kept(rates(99, 10, 5), mode) == 1.0  # more than the mode is no more than all
+    even, lucky = (
+        {str(n): rate_entry(torch.arange(100) < won) for n, won in enumerate(some)} for some in _LUCK
+    )
+    assert kept(lucky, even) < 0.6  # with 126 of 150 successes
+
+
+@pytest.mark.parametrize(
+    ("rate", "share", "least", "most"),
+    [
+        (0.05, 1.0, 0.85, 1.0),  # .45 where the mode's lucky tasks alone were looked at
+        (0.1, 1.0, 0.9, 1.0),
+        (0.5, 1.0, 0.99, 1.0),
+        (0.1, 0.2, 0.0, 0.2),
+        (0.5, 0.4, 0.0, 0.1),
+    ],
+)
+def test_a_level_that_loses_nothing_is_kept_however_rare_success_is(
+    rate: float, share: float, least: float, most: float
+) -> None:
+    """Five tasks of twenty episodes each, 400 times; a level that loses most of them is not."""
+    generator = torch.Generator().manual_seed(0)
+
+    def trial(chance: float) -> dict[str, dict[str, Any]]:
+        draws = torch.rand(5, 20, generator=generator) < chance
+        return {str(task): rate_entry(row) for task, row in enumerate(draws)}
+
+    pairs = [(trial(rate * share), trial(rate)) for _ in range(400)]
+    known = [(some, mode) for some, mode in pairs if any(one["successes"] for one in mode.values())]
+    passed = sum(kept(some, mode) >= 0.6 for some, mode in known) / len(known)
+    assert least <= passed <= most
 
 
 def test_trials_are_recorded_and_the_policy_goes_on_with_what_was_found(
