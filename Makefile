@@ -5,8 +5,8 @@ BIN := $(VENV)/bin
 # Extra words for pip, such as an index with CPU builds of torch: make quickstart PIP_ARGS="--extra-index-url URL"
 PIP_ARGS ?=
 SEED ?= 0
-# Processes that share the test files. Many tests wait for others, so two take little more than half of one's time.
-TEST_WORKERS ?= 2
+# Processes that share the test files: one more than two cores, for the one that has all Rays mostly waits for them.
+TEST_WORKERS ?= 3
 METAWORLD := metaworld==3.1.1
 ALOHA := dm_control==1.0.41 gym-aloha==0.1.5
 OGBENCH := dm_control==1.0.41 ogbench==1.2.2
