@@ -92,7 +92,7 @@ class Shared(IntEnum):
     """What is drawn once for all microbatches of a training step; each has numbers of its own."""
 
     DEPTH = 1  # of the chunk in its clip that is learned from
-    STEPS = 2  # of a student's chunk, and the one of them that it learns
+    STEPS = 2  # of a student, the one that it learns at
 
 
 def shared_generator(seed: int, step: int, drawn: Shared) -> torch.Generator:

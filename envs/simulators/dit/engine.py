@@ -153,10 +153,6 @@ class DiTSimulator(LatentWorld):
             )
         return {**section, "denoising": {**own, "sampler": "distilled", "steps": steps}}
 
-    def few_steps(self, steps: int) -> Distilled:
-        """See Stepwise."""
-        return few_steps(steps, self.diffusion.shift)
-
     def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
         """See Simulator.normalise; action vectors take their units."""
         self.action_vector.normalise(commands, moves)

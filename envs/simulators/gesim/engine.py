@@ -195,10 +195,6 @@ class GESimulator(LatentWorld):
             )
         return {**section, "sampling": {"kind": "distilled", "steps": steps}}
 
-    def few_steps(self, steps: int) -> Distilled:
-        """See Stepwise."""
-        return Distilled(DISTILLED[:steps])
-
     def conditioning(self, inputs: TensorDict, latent_hw: tuple[int, int]) -> Tensor:
         """See LatentWorld: full-size pose and ray maps, memory resized frame by frame, the future in time
         too, without antialiasing.
