@@ -158,7 +158,9 @@ class FlowStateDecoder(StateDecoder):
         self, features: Tensor, history: TensorDict, future: TensorDict, generator: torch.Generator
     ) -> Tensor:
         """See StateDecoder.loss; the past is disturbed, for in rollouts it is decoded, too."""
-        past, told = history["states"], self.tokens.states
+        told = self.tokens.states
+        # orientations told the nearest way, or what lies between two of them would be none
+        past = told.turns.nearest(history["states"], history["states"][:, -1:])
         noise = torch.randn(past.shape, generator=generator).to(past.device)
         disturbed = disturb_history(past, generator) + _DISTURBANCE * told.std * noise
         kept = slice(self.every - 1, None, self.every)  # as in `decode`; the disturbance shifts by frames

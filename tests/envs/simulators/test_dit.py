@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from envs.simulators import memory
 from envs.simulators.dit.engine import DiTSimulator
@@ -169,6 +170,27 @@ def test_state_tokens_mean_what_the_robot_says() -> None:
         # only absolute joints and deltas are told as they are
         unmoved = torch.allclose(moved, clean, atol=1e-5)
         assert unmoved == (not absolute and not robot.delta)
+
+
+def test_a_disturbed_past_lies_between_orientations_however_these_are_told(dit: DiTSimulator) -> None:
+    expert = expert_of(dit)
+    clips, yaw = clip(dit.spec, 64, 3), torch.tensor([3.1, -3.12, 3.13])
+    clips["history", "states"][..., 5] = yaw  # it turns to and fro where yaw jumps from pi to -pi
+    past = clips["history", "states"]
+    expert.normalise(torch.randn(50, 14), torch.randn(50, 14), past.flatten(0, 1))
+    seen: list[Tensor] = []
+    clean = expert.tokens.clean
+
+    def watch(commands: Tensor, past_commands: Tensor, past_states: Tensor) -> tuple[Tensor, Tensor]:
+        seen.append(past_states)
+        return clean(commands, past_commands, past_states)
+
+    expert.tokens.clean = watch  # type: ignore[method-assign]
+    inputs = build_inputs(dit.spec, clips, 0, generator=torch.Generator().manual_seed(0))
+    features = expert.read(expert.look(dit, inputs))
+    expert.loss(features, clips["history"], clips["future"], torch.Generator().manual_seed(0))
+    assert (seen[0][..., 5].cos() < -0.99).all()
+    assert not torch.equal(seen[0], past) and (seen[0] - past)[..., :5].abs().max() > 0.5  # disturbed
 
 
 def test_cross_view_attention_in_every_third_block_only() -> None:
