@@ -73,7 +73,7 @@ class Denoising:
         sampler: "euler", or "distilled" for the jumps of a few-step student (see samplers.py).
         steps: of the sampler, per chunk.
         shift: of the noise levels in training and sampling; above 1 favours noise.
-        foreground: extra loss weight of what differs from the picture's median colour.
+        foreground: extra loss weight of where the last remembered frame differs from its median colour.
         augment: chance that a clip's memory is augmented in training.
     """
 

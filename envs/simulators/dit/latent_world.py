@@ -71,11 +71,6 @@ class LatentWorld(Stepwise):
         tokens = (memory_frames + self.ahead) * (spec.size[0] // unit[0]) * (spec.size[1] // unit[1])
         self.feature_shape = (spec.views, tokens, net.shape.width)
 
-    @property
-    def foreground(self) -> float:
-        """Extra loss weight of what differs from the median colour; the autoencoder's stage uses it too."""
-        return self.diffusion.foreground
-
     # -- what a subclass gives
     def conditioning(self, inputs: TensorDict, latent_hw: tuple[int, int]) -> Tensor:
         """Channels [B, V, C, M + T', h, w] beside the latents at latent_hw = (h, w): a memory mask, and the
@@ -155,7 +150,7 @@ class LatentWorld(Stepwise):
         mixed = level[:, None, None, None, None, None]
         output, _ = self._run((1 - mixed) * clean + mixed * noise, level, self._given(inputs, memory))
         error = self.diffusion.prediction.error(output, clean, noise, memory[:, :, :, -1:])
-        weight = self._weight(truth, valid)
+        weight = self._weight(inputs, valid)
         value = (error.square() * weight).sum() / (weight.sum() * clean.shape[2]).clamp(min=1)
         return value, {}
 
@@ -172,8 +167,8 @@ class LatentWorld(Stepwise):
 
     def chunk_of(self, clip: TensorDict, generator: torch.Generator) -> tuple[TensorDict, Tensor]:
         """See Stepwise; weights [B, V, 1, T', h, w] are those of `loss`."""
-        inputs, truth, valid = self._drawn(clip, generator)
-        return inputs, self._weight(truth, valid)
+        inputs, _, valid = self._drawn(clip, generator)
+        return inputs, self._weight(inputs, valid)
 
     def prepare(self, inputs: TensorDict) -> Given:
         """See Stepwise."""
@@ -213,11 +208,12 @@ class LatentWorld(Stepwise):
             text = self.net.text_keys(self.prompt)
         return Given(memory, self.conditioning(inputs, latent_hw), self.actions(inputs), fps, text)
 
-    def _weight(self, truth: Tensor, valid: Tensor) -> Tensor:
-        """Loss weights [B, V, 1, T', h, w] of true frames [B, K, V, 3, H, W] and valid [B, K]."""
-        weight = foreground_weight(truth, self.foreground) * valid[:, :, None, None, None, None]
-        pooled = F.avg_pool2d(self.codec.pool_time(weight).flatten(0, 2), STRIDE)
-        return pooled.unflatten(0, (len(truth), self.ahead, -1)).permute(0, 2, 3, 1, 4, 5)
+    def _weight(self, inputs: TensorDict, valid: Tensor) -> Tensor:
+        """Loss weights [B, V, 1, T', h, w] by the last remembered frame, and valid [B, K]."""
+        last = unit(inputs["memory", "frames"][:, -1])
+        weight = F.avg_pool2d(foreground_weight(last, self.diffusion.foreground).flatten(0, 1), STRIDE)
+        known = self.codec.pool_time(valid.to(weight))[:, None, None, :, None, None]
+        return weight.unflatten(0, last.shape[:2])[:, :, :, None] * known
 
     def _run(
         self, future: Tensor, level: Tensor, given: Given, layers: list[Tensor] | None = None

@@ -110,7 +110,7 @@ class Training:
 
     Args:
         shift: of the noise levels drawn; above 1 favours noise.
-        foreground: extra loss weight of what differs from the picture's median colour.
+        foreground: extra loss weight of where the last remembered frame differs from its median colour.
         augment: chance that a clip's memory is augmented.
         checkpointing: compute blocks anew in the backward pass, for memory.
     """

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from envs.simulators import memory
@@ -108,6 +109,28 @@ def test_every_weight_learns_and_nothing_of_the_autoencoder(robot: str) -> None:
     dead = [n for n, p in expert.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
     # of one key's bias the softmax over all keys takes no notice
     assert all(name.endswith("to_k.bias") for name in dead), dead
+
+
+def test_what_is_to_be_said_does_not_decide_what_it_weighs(dit: DiTSimulator) -> None:
+    clips = clip(dit.spec, 2, 3)
+    clips["future", "valid"][1, 3:] = False
+    other = clips.clone()
+    other["future", "frames"] = clips["future", "frames"].flip(-1)
+
+    def weights(data: TensorDict) -> tuple[Tensor, Tensor]:
+        """Of a chunk in steps, and of the loss: twice its second derivative by what is said."""
+        said: list[Tensor] = []
+        hook = dit.net.proj_out.register_forward_hook(lambda layer, args, out: said.append(out) or out)
+        loss = dit.loss(data, torch.Generator().manual_seed(0))[0]
+        hook.remove()
+        (first,) = torch.autograd.grad(loss, said[-1:], create_graph=True)
+        (second,) = torch.autograd.grad(first.sum(), said[-1:])
+        return dit.chunk_of(data, torch.Generator().manual_seed(0))[1], second
+
+    for mine, others in zip(weights(clips), weights(other), strict=True):
+        assert torch.equal(mine, others) and len(mine[mine > 0].unique()) > 1
+    chunk = dit.chunk_of(clips, torch.Generator().manual_seed(0))[1]
+    assert (chunk[1, :, :, 3:] == 0).all() and (chunk[1, :, :, :3] >= 1).all()
 
 
 @pytest.mark.parametrize("prediction", ["velocity", "clean"])
