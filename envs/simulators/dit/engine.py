@@ -14,12 +14,13 @@ from torch import Tensor
 from envs.conditioning import ActionVector, render_ray_map
 from envs.ranges import Count, Natural, NonNegative, Positive, Share
 from envs.simulators.dit.diffusion import Diffusion
-from envs.simulators.dit.latent_world import LatentWorld
+from envs.simulators.dit.latent_world import LatentWorld, unit
 from envs.simulators.dit.network import MultiViewDiT
 from envs.simulators.dit.prediction import PREDICTIONS
 from envs.simulators.dit.shape import DiTShape
 from envs.simulators.samplers import Distilled, Euler, Sampler, shifted_levels
 from envs.simulators.tokenizers.autoencoder import STRIDE, Autoencoder
+from envs.simulators.tokenizers.detail import restore_detail
 from envs.specs import WorldSpec
 from envs.targets import OptionsOf, options
 
@@ -136,6 +137,12 @@ class DiTSimulator(LatentWorld):
         with torch.no_grad():
             # It starts from no change, or no flow: random output takes long to unlearn.
             trunk.proj_out.weight.mul_(0.05)
+
+    def show(self, latents: Tensor, newest: Tensor, inputs: TensorDict) -> Tensor:
+        """See LatentWorld.show; what the autoencoder lost of the newest remembered frame is restored."""
+        decoded = self.decode(torch.cat([newest, latents], 3))  # one frame each
+        last = unit(inputs["memory", "frames"][:, -1:])
+        return restore_detail(decoded[:, 1:], decoded[:, :1], last)
 
     @classmethod
     def stepped_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:

@@ -104,6 +104,12 @@ class LatentWorld(Stepwise):
         clips = self.codec.decode_clips(latents.flatten(0, 1)).float()
         return clips.unflatten(0, latents.shape[:2]).transpose(1, 2)
 
+    def show(self, latents: Tensor, newest: Tensor, inputs: TensorDict) -> Tensor:
+        """Frames float [B, K, V, 3, H, W] of a chunk's latents [B, V, C, T', h, w], where the newest
+        remembered one is [B, V, C, 1, h, w], and of inputs of `predict`.
+        """
+        return self.decode(latents)
+
     # -- contract
     def repeated(self) -> Iterator[tuple[nn.Module, bool]]:
         """See Repeated; the blocks of a large trunk keep a GPU busy, those of a small one do not."""
@@ -113,8 +119,8 @@ class LatentWorld(Stepwise):
 
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; noise comes from (seed, chunk_index), features from the last step."""
-        latents, features = self._denoise(inputs)
-        return to_bytes(self.decode(latents)), features
+        latents, features, newest = self._denoise(inputs)
+        return to_bytes(self.show(latents, newest, inputs)), features
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is decoded to pixels."""
@@ -245,8 +251,12 @@ class LatentWorld(Stepwise):
         at, base = level[:, None, None, None, None, None], given.memory[:, :, :, -1:]
         return self.diffusion.prediction.velocity(output, z, at, base), features
 
-    def _denoise(self, inputs: TensorDict, layers: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
-        """Future latents [B, V, C, T', h, w] and the features of the last step."""
+    def _denoise(
+        self, inputs: TensorDict, layers: list[Tensor] | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Future latents [B, V, C, T', h, w], the features of the last step, and the newest remembered latent
+        [B, V, C, 1, h, w].
+        """
         if self.compiled == "graphs" and not self.training:  # in training `fit` says when a step begins
             begin_step()
         given = self.prepare(inputs)
@@ -259,7 +269,7 @@ class LatentWorld(Stepwise):
             kept[:] = [features]
             return found
 
-        return self.sampler(velocity, self.noise(inputs, given)), kept[0]
+        return self.sampler(velocity, self.noise(inputs, given)), kept[0], given.memory[:, :, :, -1:]
 
 
 def unit(frames: Tensor) -> Tensor:

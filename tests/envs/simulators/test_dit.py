@@ -133,6 +133,16 @@ def test_what_is_to_be_said_does_not_decide_what_it_weighs(dit: DiTSimulator) ->
     assert (chunk[1, :, :, 3:] == 0).all() and (chunk[1, :, :, :3] >= 1).all()
 
 
+def test_where_nothing_changes_the_newest_frame_stays_as_it_was(dit: DiTSimulator) -> None:
+    torch.nn.init.zeros_(dit.net.proj_out.weight)  # its network says no change
+    clips = clip(dit.spec, 2, 3, chunks=2)
+    state = dit.reset(first_of(dit.spec, clips), torch.tensor([1, 2]))
+    for step in range(2):
+        frames, _, state = dit.step(state, future_of(dit.spec, clips, step))
+        # The autoencoder has learned nothing: decoded, the frame would be noise.
+        assert torch.equal(frames, clips["memory", "frames"][:, 0, :1].expand_as(frames))
+
+
 @pytest.mark.parametrize("prediction", ["velocity", "clean"])
 def test_loss_falls_and_frames_come_nearer(prediction: str) -> None:
     world = make("one_arm_deltas", prediction=prediction, augment=0.0)
