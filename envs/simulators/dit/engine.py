@@ -18,7 +18,7 @@ from envs.simulators.dit.latent_world import LatentWorld, unit
 from envs.simulators.dit.network import MultiViewDiT
 from envs.simulators.dit.prediction import PREDICTIONS
 from envs.simulators.dit.shape import DiTShape
-from envs.simulators.samplers import Distilled, Euler, Sampler, shifted_levels
+from envs.simulators.samplers import Euler, Sampler, few_steps
 from envs.simulators.tokenizers.autoencoder import STRIDE, Autoencoder
 from envs.simulators.tokenizers.detail import restore_detail
 from envs.specs import WorldSpec
@@ -92,13 +92,6 @@ class Denoising:
         if self.sampler == "distilled":
             sampler = few_steps(self.steps, self.shift)
         return Diffusion(sampler, prediction, TIME_SCALE, self.shift, self.foreground, self.augment)
-
-
-def few_steps(steps: int, shift: float) -> Distilled:
-    """The sampler of a student of so many steps: jumps from the levels at which Euler steps would begin. The
-    released student's are four of shift 5.
-    """
-    return Distilled(tuple(shifted_levels(steps, shift)[:-1]))
 
 
 class DiTSimulator(LatentWorld):
