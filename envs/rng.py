@@ -8,6 +8,7 @@ asks for one of its generators, so that physics workers do without.
 from __future__ import annotations
 
 from enum import IntEnum
+from hashlib import blake2b
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,9 +58,22 @@ def episode_rng(seed: int, stream: Stream) -> np.random.Generator:
 
 
 # -- imagined episodes and their policies
-def noise_generator(seed: int, chunk_index: int) -> torch.Generator:
-    """The generator of all randomness of one chunk of one imagined episode, whatever batch it is in."""
-    return _generator((int(seed) * 1_000_003 + int(chunk_index)) & _MASK)
+class Noise(IntEnum):
+    """What is drawn of a chunk of an imagined episode; each has numbers of its own."""
+
+    VIDEO = 0
+    STATE = 1  # of a robot
+    GOLDEN = 2  # trajectory of a text world
+
+
+def noise_generator(seed: int, chunk_index: int, drawn: Noise = Noise.VIDEO) -> torch.Generator:
+    """The generator of one kind of randomness of one chunk of one imagined episode, whatever batch it is in.
+
+    It is seeded with a hash: torch's generators on a CPU keep 32 bits of a seed, so whatever is added to one
+    is another episode's.
+    """
+    told = f"{int(drawn)} {int(seed)} {int(chunk_index)}".encode()
+    return _generator(int.from_bytes(blake2b(told, digest_size=4).digest(), "big"))
 
 
 def sampling_seed(seed: int, iteration: int, shard: int) -> int:
@@ -92,7 +106,7 @@ class Shared(IntEnum):
     """What is drawn once for all microbatches of a training step; each has numbers of its own."""
 
     DEPTH = 1  # of the chunk in its clip that is learned from
-    STEPS = 2  # of a student's chunk, and the one of them that it learns
+    STEPS = 2  # of a student, the one that it learns at
 
 
 def shared_generator(seed: int, step: int, drawn: Shared) -> torch.Generator:

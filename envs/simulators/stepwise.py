@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.simulators.base import Simulator
-from envs.simulators.samplers import Distilled, Sampler
+from envs.simulators.samplers import Sampler
 
 
 def lost_jumps(sampler: Sampler) -> str:
@@ -42,11 +42,7 @@ class Stepwise(Simulator, abc.ABC):
     @property
     @abc.abstractmethod
     def sampler(self) -> Sampler:
-        """The way from noise to data that `predict` takes."""
-
-    @abc.abstractmethod
-    def few_steps(self, steps: int) -> Distilled:
-        """The sampler of a student of so many steps."""
+        """The way from noise to data that `predict` takes; a student's is Distilled."""
 
     @abc.abstractmethod
     def chunk_of(self, clip: TensorDict, generator: torch.Generator) -> tuple[TensorDict, Tensor]:

@@ -109,9 +109,9 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
     """The stages, the names of those that measure, by the titles of their rows, and by those of rows that are
     left out why the engine cannot take so many steps.
 
-    A student learns to take any number of steps up to distill.steps, so there is one of each method, with as
-    many updates. "not distilled" has the weights of the teacher jump as students do: a jump that nobody has
-    taught ends in the mean of all that may come, which PSNR likes, and which has no detail.
+    A student learns at the levels of its own steps, so there is one of each method for each number of them,
+    with as many updates. "not distilled" has the weights of the teacher jump as students do: a jump that
+    nobody has taught ends in the mean of all that may come, which PSNR likes, and which has no detail.
     """
     check_physics(cfg, "bench distil")
     engine, most = target(cfg["simulator"], "simulator"), cfg["distill"]["steps"]
@@ -152,19 +152,16 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
             left[f"teacher, {steps}"] = str(error)
             continue
         measured(f"teacher, {steps}", f"teacher-{steps}", teacher, section, 0)
-    few = {
-        steps: acting({**cfg, "distill": {**cfg["distill"], "steps": steps}})["simulator"]
-        for steps in STUDENT
-        if steps <= most
-    }
-    for steps, section in few.items():
+    few = [steps for steps in STUDENT if steps <= most]
+    for steps in few:
+        section = acting({**cfg, "distill": {**cfg["distill"], "steps": steps}})["simulator"]
         measured(f"not distilled, {steps}", f"undistilled-{steps}", teacher, section, 0)
     for name, section in _methods(cfg["distill"]).items():
-        roles = {"data": data, "simulator": teacher}
-        own = graph.under({**cfg, "distill": section})
-        student = own.add(f"student-{name}", world.student, roles, phase="first")
         for steps in few:
-            measured(f"{name}, {steps}", f"{name}-{steps}", student, few[steps], steps)
+            own = graph.under({**cfg, "distill": {**section, "steps": steps}})
+            roles = {"data": data, "simulator": teacher}
+            student = own.add(f"student-{name}-{steps}", world.student, roles, phase="first")
+            measured(f"{name}, {steps}", f"{name}-{steps}", student, acting(own.cfg)["simulator"], steps)
     return graph, rows, left
 
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from envs.rng import (
+    Noise,
     Purpose,
     Shared,
     Stream,
@@ -51,7 +52,9 @@ def test_a_start_is_what_the_seed_alone_draws() -> None:
 
 
 def test_generators_of_chunks_steps_and_iterations() -> None:
-    assert drawn(noise_generator(9, 2)) == drawn(iteration_generator(9, 2)) == [252, 120, 984, 977]
+    noise = [drawn(noise_generator(9, 2, kind))[:2] for kind in Noise]
+    assert noise == [[178, 802], [197, 208], [814, 256]] and drawn(noise_generator(9, 2))[:2] == noise[0]
+    assert drawn(iteration_generator(9, 2)) == [252, 120, 984, 977]
     assert drawn(step_generator(9, 2, 1)) == [386, 313, 466, 870]
     assert [drawn(shared_generator(9, 2, shared))[:2] for shared in Shared] == [[905, 623], [482, 556]]
     assert (update_seed(9, 2), sampling_seed(9, 2, 3)) == (18_000_029, 3_000_071_294)
@@ -59,6 +62,17 @@ def test_generators_of_chunks_steps_and_iterations() -> None:
     assert torch.randint(1000, (4,)).tolist() == [530, 694, 631, 773]
     for generator in (order_generator, episode_stream, resampling_generator, constant_generator):
         assert torch.randperm(8, generator=generator(3)).tolist() == [2, 4, 3, 5, 1, 0, 6, 7]
+
+
+def test_no_noise_of_an_episode_is_another_ones() -> None:
+    seeds = [high + low for high in (0, 2**32, 2**40, 2**41) for low in range(30)]
+    made = {
+        tuple(drawn(noise_generator(seed, chunk, kind))): (seed, chunk, kind)
+        for seed in seeds
+        for chunk in range(3)
+        for kind in Noise
+    }
+    assert len(made) == len(seeds) * 3 * len(Noise)
 
 
 def test_episode_seeds_of_every_purpose() -> None:

@@ -13,6 +13,7 @@ from envs.judges import Judge
 from envs.simulators.base import WORLD_OPTIONS, Simulator
 from envs.simulators.dit.engine import DiTSimulator
 from envs.simulators.state_experts.base import StateDecoder
+from envs.simulators.stepwise import Stepwise
 from envs.specs import ActionMode, WorldSpec
 from envs.targets import build, target
 from tests.sections import offered
@@ -55,7 +56,7 @@ def stepwise_engines() -> list[str]:
     """The small configs of configs/simulator whose engine denoises in steps."""
     small = [name for name in offered("simulator") if name.endswith(("_small", "_tiny"))]
     kinds = {name: target(section_of("simulator", name), "simulator") for name in small}
-    return [name for name in small if hasattr(kinds[name], "few_steps")]
+    return [name for name in small if issubclass(kinds[name], Stepwise)]
 
 
 def stepwise_pair(name: str, spec: WorldSpec) -> tuple[Simulator, Simulator]:

@@ -65,7 +65,7 @@ from pipeline.loop import build_loop
             r"distill\.steps=2, but UNetSimulator does not denoise in steps.*simulator=dit",
         ),
         (["simulator=dit", "distill.steps=5"], r"more than the teacher's simulator\.denoising\.steps=4"),
-        (["simulator=gesim", "task=lerobot", "task.data=[x]", "distill.steps=5"], r"distilled sampler has 4"),
+        (["simulator=gesim", "task=lerobot", "task.data=[x]", "distill.steps=5"], r"GE-Sim takes at most 4"),
         (
             ["simulator=dit", "distill.steps=2", "distiller=dmd2_gesim", "distill.first.fit={lr: 1e-4}"],
             r"distill\.first\.fit\.lr=0\.0001 is more than 10 times .*say distill\.first\.fit\.lr=2e-06",

@@ -20,7 +20,8 @@ class Diffusion:
         prediction: what the network says.
         time_scale: what levels are multiplied with for the network.
         shift: of the levels drawn in training; above 1 favours noise.
-        foreground: extra loss weight of what differs from the picture's median colour.
+        foreground: extra loss weight of where the last remembered frame differs from its median colour.
+            By what is still to be said itself, things would be drawn wherever they may be.
         augment: chance that a clip's memory is augmented in training.
     """
 

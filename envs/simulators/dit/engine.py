@@ -14,12 +14,13 @@ from torch import Tensor
 from envs.conditioning import ActionVector, render_ray_map
 from envs.ranges import Count, Natural, NonNegative, Positive, Share
 from envs.simulators.dit.diffusion import Diffusion
-from envs.simulators.dit.latent_world import LatentWorld
+from envs.simulators.dit.latent_world import LatentWorld, unit
 from envs.simulators.dit.network import MultiViewDiT
 from envs.simulators.dit.prediction import PREDICTIONS
 from envs.simulators.dit.shape import DiTShape
-from envs.simulators.samplers import Distilled, Euler, Sampler, shifted_levels
+from envs.simulators.samplers import Euler, Sampler, few_steps
 from envs.simulators.tokenizers.autoencoder import STRIDE, Autoencoder
+from envs.simulators.tokenizers.detail import restore_detail
 from envs.specs import WorldSpec
 from envs.targets import OptionsOf, options
 
@@ -73,7 +74,7 @@ class Denoising:
         sampler: "euler", or "distilled" for the jumps of a few-step student (see samplers.py).
         steps: of the sampler, per chunk.
         shift: of the noise levels in training and sampling; above 1 favours noise.
-        foreground: extra loss weight of what differs from the picture's median colour.
+        foreground: extra loss weight of where the last remembered frame differs from its median colour.
         augment: chance that a clip's memory is augmented in training.
     """
 
@@ -91,13 +92,6 @@ class Denoising:
         if self.sampler == "distilled":
             sampler = few_steps(self.steps, self.shift)
         return Diffusion(sampler, prediction, TIME_SCALE, self.shift, self.foreground, self.augment)
-
-
-def few_steps(steps: int, shift: float) -> Distilled:
-    """The sampler of a student of so many steps: jumps from the levels at which Euler steps would begin. The
-    released student's are four of shift 5.
-    """
-    return Distilled(tuple(shifted_levels(steps, shift)[:-1]))
 
 
 class DiTSimulator(LatentWorld):
@@ -137,6 +131,12 @@ class DiTSimulator(LatentWorld):
             # It starts from no change, or no flow: random output takes long to unlearn.
             trunk.proj_out.weight.mul_(0.05)
 
+    def show(self, latents: Tensor, newest: Tensor, inputs: TensorDict) -> Tensor:
+        """See LatentWorld.show; what the autoencoder lost of the newest remembered frame is restored."""
+        decoded = self.decode(torch.cat([newest, latents], 3))  # one frame each
+        last = unit(inputs["memory", "frames"][:, -1:])
+        return restore_detail(decoded[:, 1:], decoded[:, :1], last)
+
     @classmethod
     def stepped_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
         """See Simulator.stepped_section."""
@@ -152,10 +152,6 @@ class DiTSimulator(LatentWorld):
                 " a student takes fewer"
             )
         return {**section, "denoising": {**own, "sampler": "distilled", "steps": steps}}
-
-    def few_steps(self, steps: int) -> Distilled:
-        """See Stepwise."""
-        return few_steps(steps, self.diffusion.shift)
 
     def normalise(self, commands: Tensor, moves: Tensor, states: Tensor) -> None:
         """See Simulator.normalise; action vectors take their units."""

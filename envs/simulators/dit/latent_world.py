@@ -71,11 +71,6 @@ class LatentWorld(Stepwise):
         tokens = (memory_frames + self.ahead) * (spec.size[0] // unit[0]) * (spec.size[1] // unit[1])
         self.feature_shape = (spec.views, tokens, net.shape.width)
 
-    @property
-    def foreground(self) -> float:
-        """Extra loss weight of what differs from the median colour; the autoencoder's stage uses it too."""
-        return self.diffusion.foreground
-
     # -- what a subclass gives
     def conditioning(self, inputs: TensorDict, latent_hw: tuple[int, int]) -> Tensor:
         """Channels [B, V, C, M + T', h, w] beside the latents at latent_hw = (h, w): a memory mask, and the
@@ -109,6 +104,12 @@ class LatentWorld(Stepwise):
         clips = self.codec.decode_clips(latents.flatten(0, 1)).float()
         return clips.unflatten(0, latents.shape[:2]).transpose(1, 2)
 
+    def show(self, latents: Tensor, newest: Tensor, inputs: TensorDict) -> Tensor:
+        """Frames float [B, K, V, 3, H, W] of a chunk's latents [B, V, C, T', h, w], where the newest
+        remembered one is [B, V, C, 1, h, w], and of inputs of `predict`.
+        """
+        return self.decode(latents)
+
     # -- contract
     def repeated(self) -> Iterator[tuple[nn.Module, bool]]:
         """See Repeated; the blocks of a large trunk keep a GPU busy, those of a small one do not."""
@@ -118,8 +119,8 @@ class LatentWorld(Stepwise):
 
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; noise comes from (seed, chunk_index), features from the last step."""
-        latents, features = self._denoise(inputs)
-        return to_bytes(self.decode(latents)), features
+        latents, features, newest = self._denoise(inputs)
+        return to_bytes(self.show(latents, newest, inputs)), features
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is decoded to pixels."""
@@ -155,7 +156,7 @@ class LatentWorld(Stepwise):
         mixed = level[:, None, None, None, None, None]
         output, _ = self._run((1 - mixed) * clean + mixed * noise, level, self._given(inputs, memory))
         error = self.diffusion.prediction.error(output, clean, noise, memory[:, :, :, -1:])
-        weight = self._weight(truth, valid)
+        weight = self._weight(inputs, valid)
         value = (error.square() * weight).sum() / (weight.sum() * clean.shape[2]).clamp(min=1)
         return value, {}
 
@@ -172,8 +173,8 @@ class LatentWorld(Stepwise):
 
     def chunk_of(self, clip: TensorDict, generator: torch.Generator) -> tuple[TensorDict, Tensor]:
         """See Stepwise; weights [B, V, 1, T', h, w] are those of `loss`."""
-        inputs, truth, valid = self._drawn(clip, generator)
-        return inputs, self._weight(truth, valid)
+        inputs, _, valid = self._drawn(clip, generator)
+        return inputs, self._weight(inputs, valid)
 
     def prepare(self, inputs: TensorDict) -> Given:
         """See Stepwise."""
@@ -213,11 +214,12 @@ class LatentWorld(Stepwise):
             text = self.net.text_keys(self.prompt)
         return Given(memory, self.conditioning(inputs, latent_hw), self.actions(inputs), fps, text)
 
-    def _weight(self, truth: Tensor, valid: Tensor) -> Tensor:
-        """Loss weights [B, V, 1, T', h, w] of true frames [B, K, V, 3, H, W] and valid [B, K]."""
-        weight = foreground_weight(truth, self.foreground) * valid[:, :, None, None, None, None]
-        pooled = F.avg_pool2d(self.codec.pool_time(weight).flatten(0, 2), STRIDE)
-        return pooled.unflatten(0, (len(truth), self.ahead, -1)).permute(0, 2, 3, 1, 4, 5)
+    def _weight(self, inputs: TensorDict, valid: Tensor) -> Tensor:
+        """Loss weights [B, V, 1, T', h, w] by the last remembered frame, and valid [B, K]."""
+        last = unit(inputs["memory", "frames"][:, -1])
+        weight = F.avg_pool2d(foreground_weight(last, self.diffusion.foreground).flatten(0, 1), STRIDE)
+        known = self.codec.pool_time(valid.to(weight))[:, None, None, :, None, None]
+        return weight.unflatten(0, last.shape[:2])[:, :, :, None] * known
 
     def _run(
         self, future: Tensor, level: Tensor, given: Given, layers: list[Tensor] | None = None
@@ -249,8 +251,12 @@ class LatentWorld(Stepwise):
         at, base = level[:, None, None, None, None, None], given.memory[:, :, :, -1:]
         return self.diffusion.prediction.velocity(output, z, at, base), features
 
-    def _denoise(self, inputs: TensorDict, layers: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
-        """Future latents [B, V, C, T', h, w] and the features of the last step."""
+    def _denoise(
+        self, inputs: TensorDict, layers: list[Tensor] | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Future latents [B, V, C, T', h, w], the features of the last step, and the newest remembered latent
+        [B, V, C, 1, h, w].
+        """
         if self.compiled == "graphs" and not self.training:  # in training `fit` says when a step begins
             begin_step()
         given = self.prepare(inputs)
@@ -263,7 +269,7 @@ class LatentWorld(Stepwise):
             kept[:] = [features]
             return found
 
-        return self.sampler(velocity, self.noise(inputs, given)), kept[0]
+        return self.sampler(velocity, self.noise(inputs, given)), kept[0], given.memory[:, :, :, -1:]
 
 
 def unit(frames: Tensor) -> Tensor:

@@ -180,19 +180,15 @@ class Blockwise(Stepwise):
     @property
     def sampler(self) -> Sampler:
         """See Stepwise."""
-        steps = self.denoising.steps
+        levels = self.schedule.levels(self.denoising.steps)
         if self.denoising.sampler == "distilled":
-            return self.few_steps(steps)
-        return DDIM(self.schedule.levels(steps))
+            return Distilled(tuple(levels[:-1]))
+        return DDIM(levels)
 
     @property
     def lost_in_training(self) -> str:
         """See Simulator."""
         return lost_jumps(self.sampler)
-
-    def few_steps(self, steps: int) -> Distilled:
-        """See Stepwise."""
-        return Distilled(tuple(self.schedule.levels(steps)[:-1]))
 
     def chunk_of(self, clip: TensorDict, generator: torch.Generator) -> tuple[TensorDict, Tensor]:
         """See Stepwise; weights [B, n, V, 1, h, w] are those of `loss`."""

@@ -27,12 +27,13 @@ from envs.simulators.dit.network import MultiViewDiT
 from envs.simulators.dit.prediction import Velocity
 from envs.simulators.dit.shape import DiTShape
 from envs.simulators.gesim.checkpoint import CheckpointError, load_released
-from envs.simulators.samplers import DISTILLED, EDM, Distilled, Sampler
+from envs.simulators.samplers import DISTILLED, EDM, Distilled, Sampler, few_steps
 from envs.simulators.tokenizers.wan import WanCodec
 from envs.specs import WorldSpec
 from envs.targets import OptionsOf
 
 _CONDITIONING = 3 + 6 + 1  # channels of pose map, ray map, memory mask
+_SHIFT = 5.0  # of the released student's levels, and of those of others
 
 
 @dataclass(frozen=True)
@@ -64,14 +65,16 @@ class Sampling:
     """How chunks are sampled.
 
     Args:
-        kind: "distilled" or "edm"; "" takes what the checkpoint was made for.
+        kind: "distilled" jumps from the first levels of the released four, as the released code does;
+            "student" from those of a student that was made for so many steps; "edm" does not jump; "" takes
+            what the checkpoint was made for.
         steps: of the sampler; 0 takes the released number, 4 or 15.
 
     Raises:
         ValueError: if the sampler cannot take so many steps.
     """
 
-    kind: Literal["", "distilled", "edm"]
+    kind: Literal["", "distilled", "student", "edm"]
     steps: Natural
 
     def __post_init__(self) -> None:
@@ -92,7 +95,8 @@ class Sampling:
         if self.kind == "edm" or (not self.kind and not distilled):
             _check_edm(self.steps)
             return EDM(self.steps or edm.steps, edm.sigma_max, edm.sigma_min, edm.rho)
-        return Distilled(DISTILLED[: self.steps or len(DISTILLED)])
+        steps = self.steps or len(DISTILLED)
+        return few_steps(steps, _SHIFT) if self.kind == "student" else Distilled(DISTILLED[:steps])
 
 
 def _check_edm(steps: int) -> None:
@@ -110,7 +114,7 @@ class Training:
 
     Args:
         shift: of the noise levels drawn; above 1 favours noise.
-        foreground: extra loss weight of what differs from the picture's median colour.
+        foreground: extra loss weight of where the last remembered frame differs from its median colour.
         augment: chance that a clip's memory is augmented.
         checkpointing: compute blocks anew in the backward pass, for memory.
     """
@@ -181,11 +185,11 @@ class GESimulator(LatentWorld):
 
     @classmethod
     def student_section(cls, section: Mapping[str, Any], steps: int) -> dict[str, Any]:
-        """See Simulator.student_section; the levels are the released student's first ones."""
-        if steps > len(DISTILLED):
+        """See Simulator.student_section; the levels are spread as the released student's are."""
+        if steps > len(DISTILLED):  # the teacher may be the released student
             raise ValueError(
-                f"distill.steps={steps}, but GE-Sim's distilled sampler has {len(DISTILLED)} levels;"
-                f" set distill.steps={len(DISTILLED)} or fewer"
+                f"distill.steps={steps}, but a student of GE-Sim takes at most {len(DISTILLED)}; set"
+                f" distill.steps={len(DISTILLED)} or fewer"
             )
         own = section["sampling"]
         if own["steps"] and steps > own["steps"]:
@@ -193,11 +197,7 @@ class GESimulator(LatentWorld):
                 f"distill.steps={steps} are more than the teacher's simulator.sampling.steps={own['steps']};"
                 " a student takes fewer"
             )
-        return {**section, "sampling": {"kind": "distilled", "steps": steps}}
-
-    def few_steps(self, steps: int) -> Distilled:
-        """See Stepwise."""
-        return Distilled(DISTILLED[:steps])
+        return {**section, "sampling": {"kind": "student", "steps": steps}}
 
     def conditioning(self, inputs: TensorDict, latent_hw: tuple[int, int]) -> Tensor:
         """See LatentWorld: full-size pose and ray maps, memory resized frame by frame, the future in time

@@ -19,7 +19,7 @@ from envs.conditioning.turns import Turns
 from envs.conditioning.units import LEAST_SPREAD, Units
 from envs.embodiment import ActionKind, Embodiment
 from envs.ranges import Count
-from envs.rng import noise_generator
+from envs.rng import Noise, noise_generator
 from envs.simulators.base import Simulator
 from envs.simulators.dit.engine import TIME_SCALE
 from envs.simulators.dit.latent_world import LatentWorld
@@ -29,7 +29,6 @@ from envs.simulators.samplers import Euler, Sampler
 from envs.simulators.state_experts.base import StateDecoder
 
 _SHIFTS = (-3, -2, -1, 1, 2, 3)
-_STREAM = 2**40 + 15  # added to episode seeds, for other noise than the video's
 _DISTURBANCE = 0.02  # noise on past states in training, in spreads: in rollouts they are decoded, too
 
 
@@ -158,7 +157,9 @@ class FlowStateDecoder(StateDecoder):
         self, features: Tensor, history: TensorDict, future: TensorDict, generator: torch.Generator
     ) -> Tensor:
         """See StateDecoder.loss; the past is disturbed, for in rollouts it is decoded, too."""
-        past, told = history["states"], self.tokens.states
+        told = self.tokens.states
+        # orientations told the nearest way, or what lies between two of them would be none
+        past = told.turns.nearest(history["states"], history["states"][:, -1:])
         noise = torch.randn(past.shape, generator=generator).to(past.device)
         disturbed = disturb_history(past, generator) + _DISTURBANCE * told.std * noise
         kept = slice(self.every - 1, None, self.every)  # as in `decode`; the disturbance shifts by frames
@@ -188,7 +189,7 @@ class FlowStateDecoder(StateDecoder):
     def _noise(self, seed: Tensor, chunk_index: Tensor) -> Tensor:
         rows = []
         for s, c in zip(seed.tolist(), chunk_index.tolist(), strict=True):
-            generator = noise_generator(int(s) + _STREAM, int(c))
+            generator = noise_generator(s, c, Noise.STATE)
             rows.append(torch.randn(self.chunk, self.tokens.state_dim, generator=generator))
         return torch.stack(rows)
 

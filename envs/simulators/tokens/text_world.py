@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from envs.ranges import Count, Share
-from envs.rng import noise_generator
+from envs.rng import Noise, noise_generator
 from envs.simulators.base import to_bytes
 from envs.simulators.tokenizers.lfq import LookupFreeTokenizer
 from envs.simulators.tokens.decoding import Draws
@@ -26,7 +26,6 @@ from envs.specs import WorldSpec, bytes_to_text
 from envs.targets import OptionsOf, build, options
 
 _KEY = "judge.text_world"
-_STREAM = 2**41 + 7  # added to episode seeds, for other draws than the simulator's
 
 
 class GoldenTrajectory(NamedTuple):
@@ -141,7 +140,7 @@ class TextWorld(nn.Module):
         device = next(self.parameters()).device
         cond, known = self.reader(instruction), self.video.net.memory()
         self.video.net.observe(self.video.encode(first[:, None].to(device)), cond, None, known)
-        draws = Draws([noise_generator(row + _STREAM, 0) for row in seed.tolist()], device)
+        draws = Draws([noise_generator(row, 0, Noise.GOLDEN) for row in seed.tolist()], device)
         ended, limit = torch.zeros(len(first), dtype=torch.bool, device=device), self.max_frames
         tokens: list[Tensor] = []
         done: list[Tensor] = []

@@ -4,7 +4,7 @@ no regression, no flow loss beside it, and memory that stays clean.
 The student makes a chunk, noise is mixed in, and the teacher and a critic say what they would make of it: the
 one in a world like the data, the other in one like the student's. The student moves along their difference.
 The critic is a copy of the teacher that learns to denoise what the student makes, several times as often. It
-does not know at which of its steps the student made it: what is matched is the mixture of them.
+does not know at which of its steps the student made it: what is matched is their mixture in equal shares.
 """
 
 from __future__ import annotations

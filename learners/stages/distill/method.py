@@ -90,18 +90,17 @@ class Method(nn.Module):
     def generated(self, inputs: TensorDict, step: int) -> Generated:
         """What the student makes of a chunk at a step of training.
 
-        Of a random number of steps, one to all of its own, it learns at a random one: what this step sees
-        comes from the student's own steps before, with the same noise each time, as when it samples (DMD2's
-        backward simulation). Both numbers are those of all microbatches of the step. Only the last of these
+        It learns at one of its steps, each as likely: what this step sees comes from the student's own steps
+        before, with the same noise each time, as when it samples (DMD2's backward simulation; GE-Sim 2.0 says
+        that the number of steps is random). The step is that of all microbatches. Only the last of these
         calls keeps gradients.
 
         Args:
             inputs: of `predict`, [B].
         """
         student, generator = self.student, shared_generator(self.config.seed, step, Shared.STEPS)
-        steps = 1 + int(torch.randint(self.steps, (1,), generator=generator))
-        number = int(torch.randint(steps, (1,), generator=generator))
-        sampler, given = student.few_steps(steps), student.prepare(inputs)
+        number = int(torch.randint(self.steps, (1,), generator=generator))
+        sampler, given = student.sampler, student.prepare(inputs)
         noise = student.noise(inputs, given)
 
         def velocity(z: Tensor, level: float) -> Tensor:

@@ -95,7 +95,7 @@ def check_pair(teacher: Simulator, student: Simulator) -> None:
     if not student.sampler.jumps:
         raise ValueError(
             "a student samples in distilled steps; set simulator.denoising.sampler=distilled (dit, forcing)"
-            " or simulator.sampling.kind=distilled (gesim)"
+            " or simulator.sampling.kind=student (gesim)"
         )
     many, few = teacher.sampler.evaluations, student.sampler.evaluations
     if few > many:

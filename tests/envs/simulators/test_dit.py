@@ -6,6 +6,8 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torch import Tensor
 
 from envs.simulators import memory
 from envs.simulators.dit.engine import DiTSimulator
@@ -109,6 +111,38 @@ def test_every_weight_learns_and_nothing_of_the_autoencoder(robot: str) -> None:
     assert all(name.endswith("to_k.bias") for name in dead), dead
 
 
+def test_what_is_to_be_said_does_not_decide_what_it_weighs(dit: DiTSimulator) -> None:
+    clips = clip(dit.spec, 2, 3)
+    clips["future", "valid"][1, 3:] = False
+    other = clips.clone()
+    other["future", "frames"] = clips["future", "frames"].flip(-1)
+
+    def weights(data: TensorDict) -> tuple[Tensor, Tensor]:
+        """Of a chunk in steps, and of the loss: twice its second derivative by what is said."""
+        said: list[Tensor] = []
+        hook = dit.net.proj_out.register_forward_hook(lambda layer, args, out: said.append(out) or out)
+        loss = dit.loss(data, torch.Generator().manual_seed(0))[0]
+        hook.remove()
+        (first,) = torch.autograd.grad(loss, said[-1:], create_graph=True)
+        (second,) = torch.autograd.grad(first.sum(), said[-1:])
+        return dit.chunk_of(data, torch.Generator().manual_seed(0))[1], second
+
+    for mine, others in zip(weights(clips), weights(other), strict=True):
+        assert torch.equal(mine, others) and len(mine[mine > 0].unique()) > 1
+    chunk = dit.chunk_of(clips, torch.Generator().manual_seed(0))[1]
+    assert (chunk[1, :, :, 3:] == 0).all() and (chunk[1, :, :, :3] >= 1).all()
+
+
+def test_where_nothing_changes_the_newest_frame_stays_as_it_was(dit: DiTSimulator) -> None:
+    torch.nn.init.zeros_(dit.net.proj_out.weight)  # its network says no change
+    clips = clip(dit.spec, 2, 3, chunks=2)
+    state = dit.reset(first_of(dit.spec, clips), torch.tensor([1, 2]))
+    for step in range(2):
+        frames, _, state = dit.step(state, future_of(dit.spec, clips, step))
+        # The autoencoder has learned nothing: decoded, the frame would be noise.
+        assert torch.equal(frames, clips["memory", "frames"][:, 0, :1].expand_as(frames))
+
+
 @pytest.mark.parametrize("prediction", ["velocity", "clean"])
 def test_loss_falls_and_frames_come_nearer(prediction: str) -> None:
     world = make("one_arm_deltas", prediction=prediction, augment=0.0)
@@ -169,6 +203,27 @@ def test_state_tokens_mean_what_the_robot_says() -> None:
         # only absolute joints and deltas are told as they are
         unmoved = torch.allclose(moved, clean, atol=1e-5)
         assert unmoved == (not absolute and not robot.delta)
+
+
+def test_a_disturbed_past_lies_between_orientations_however_these_are_told(dit: DiTSimulator) -> None:
+    expert = expert_of(dit)
+    clips, yaw = clip(dit.spec, 64, 3), torch.tensor([3.1, -3.12, 3.13])
+    clips["history", "states"][..., 5] = yaw  # it turns to and fro where yaw jumps from pi to -pi
+    past = clips["history", "states"]
+    expert.normalise(torch.randn(50, 14), torch.randn(50, 14), past.flatten(0, 1))
+    seen: list[Tensor] = []
+    clean = expert.tokens.clean
+
+    def watch(commands: Tensor, past_commands: Tensor, past_states: Tensor) -> tuple[Tensor, Tensor]:
+        seen.append(past_states)
+        return clean(commands, past_commands, past_states)
+
+    expert.tokens.clean = watch  # type: ignore[method-assign]
+    inputs = build_inputs(dit.spec, clips, 0, generator=torch.Generator().manual_seed(0))
+    features = expert.read(expert.look(dit, inputs))
+    expert.loss(features, clips["history"], clips["future"], torch.Generator().manual_seed(0))
+    assert (seen[0][..., 5].cos() < -0.99).all()
+    assert not torch.equal(seen[0], past) and (seen[0] - past)[..., :5].abs().max() > 0.5  # disturbed
 
 
 def test_cross_view_attention_in_every_third_block_only() -> None:

@@ -24,7 +24,7 @@ from envs.simulators.gesim.checkpoint import CheckpointError, load_released, loa
 from envs.simulators.gesim.engine import GESimulator, Sampling
 from envs.simulators.gesim.state_expert import GESimStateExpert
 from envs.simulators.inputs import build_inputs
-from envs.simulators.samplers import EDM, Distilled
+from envs.simulators.samplers import DISTILLED, EDM, Distilled
 from envs.simulators.state_experts.flow import StateExpert
 from envs.specs import CHUNK, STATE, ActionMode, Rewards, WorldSpec
 from envs.transforms import world_transforms
@@ -135,6 +135,16 @@ def test_one_step_of_the_undistilled_sampler_is_refused(tmp_path: Path) -> None:
         build(path, sampling={"kind": "", "steps": 1})
     assert Sampling("", 1).sampler(EDM(), True).evaluations == 1
     assert Sampling("edm", 2).sampler(EDM(), True) == EDM(2)
+
+
+def test_a_student_has_levels_of_its_own_and_a_released_one_its_first() -> None:
+    levels = {2: (1.0, 5 / 6), 3: (1.0, 10 / 11, 5 / 7), 4: (1.0, 15 / 16, 5 / 6, 5 / 8)}
+    for steps, own in levels.items():
+        section = GESimulator.student_section({"sampling": {"kind": "edm", "steps": 15}}, steps)
+        world = build(None, sampling=section["sampling"])
+        assert world.sampler.jumps and world.sampler.sigmas == pytest.approx(own, abs=1e-6)  # type: ignore[attr-defined]
+        released = build(None, sampling={"kind": "distilled", "steps": steps})
+        assert released.sampler == Distilled(DISTILLED[:steps])
 
 
 def test_a_thinned_state_expert_trains_on_the_history_that_it_decodes_from() -> None:

@@ -5,6 +5,7 @@ that denoises in steps has them.
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
@@ -56,9 +57,6 @@ class Bell(Stepwise):
     def sampler(self) -> Sampler:
         return self._sampler
 
-    def few_steps(self, steps: int) -> Distilled:
-        return Distilled(tuple(shifted_levels(steps, 1.0)[:-1]))
-
     def chunk_of(self, clip: TensorDict, generator: torch.Generator) -> tuple[TensorDict, Tensor]:
         seeds = torch.randint(2**40, (16,), generator=generator)
         return TensorDict({"seed": seeds}, [16]), torch.ones(16, 1)
@@ -82,6 +80,11 @@ class Bell(Stepwise):
             return self.sampler(lambda z, s: self.velocity(z, torch.full((len(z),), s), None), noise)
 
 
+def jumps(steps: int) -> Distilled:
+    """The sampler of a student of so many steps."""
+    return Distilled(tuple(shifted_levels(steps, 1.0)[:-1]))
+
+
 def learned(student: Bell, options: FitConfig) -> Tensor:
     """What a student makes at the steps that it learns, each as often as it is drawn."""
     method, nothing = Method(deepcopy(student), student, options), torch.Generator().manual_seed(0)
@@ -98,7 +101,7 @@ def test_a_student_makes_what_the_teacher_makes(
     store = tiny_store(ARM_DELTAS)
     torch.manual_seed(0)
     teacher = Bell(store.spec, Euler(32, 1.0))
-    student = Bell(store.spec, teacher.few_steps(count))
+    student = Bell(store.spec, jumps(count))
     student.load_state_dict(teacher.state_dict())
     assert float(teacher.sample().std()) == pytest.approx(0.5, abs=0.05)
     assert float(student.sample().std()) < (0.05 if count == 1 else 0.25)
@@ -110,6 +113,28 @@ def test_a_student_makes_what_the_teacher_makes(
     made = learned(student, options) if name == "dmd2" else student.sample()
     assert float(made.mean()) == pytest.approx(2.0, abs=0.12)
     assert float(made.std()) == pytest.approx(0.5, abs=0.2 if name == "dmd2" else 0.1)
+
+
+def test_each_level_that_a_student_samples_at_is_learned_as_often_and_no_other(tiny_store: Stores) -> None:
+    spec, options = tiny_store(ARM_DELTAS).spec, FitConfig(1, 1, 1e-3, bf16=False)
+    student = Bell(spec, jumps(4))
+    method, seen, counts = (
+        Method(Bell(spec, Euler(32, 1.0)), student, options),
+        list[float](),
+        Counter[float](),
+    )
+
+    def watch(z: Tensor, level: Tensor, given: None) -> Tensor:
+        seen.append(float(level[0]))
+        return Bell.velocity(student, z, level, given)
+
+    student.velocity = watch  # type: ignore[method-assign]
+    for step in range(400):
+        seen.clear()
+        method.generated(student.chunk_of(TensorDict(), torch.Generator())[0], step)
+        assert seen == list(jumps(4).sigmas[: len(seen)])
+        counts[seen[-1]] += 1
+    assert len(counts) == 4 and all(70 < times < 130 for times in counts.values())
 
 
 @pytest.mark.parametrize(

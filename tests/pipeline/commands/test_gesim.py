@@ -15,7 +15,7 @@ from actors.factory import build_simulator, build_state_decoder
 from envs.episodes import EpisodeError, LeRobotWriter
 from envs.episodes.formats.foreign import Cut, read_foreign
 from envs.simulators.dit.shape import DiTShape
-from envs.simulators.samplers import DISTILLED, Distilled
+from envs.simulators.samplers import few_steps
 from envs.targets import ConfigError
 from pipeline.benches.gesim.chunk import gesim
 from pipeline.benches.gesim.floor import count_flops, goal_line
@@ -93,7 +93,7 @@ def test_finetune_a_checkpoint_distil_it_again_and_serve_what_came_of_it(
     first = json.loads(next((graph.folder("simulator") / "metrics.jsonl").open()))
     assert first["simulator/loss"] > 0 and first["simulator/grad_norm"] > 0
     simulator = build_simulator(graph.cfg, graph.folder("student") / "weights.safetensors")
-    assert simulator.sampler == Distilled(DISTILLED[:2])
+    assert simulator.sampler == few_steps(2, 5.0)
     build_state_decoder(graph.cfg, simulator, graph.folder("state") / "weights.safetensors")
     assert verify_run(tmp_path / "runs/default").startswith("3 stages of")
     host = build_session_host(cfg, tmp_path / "runs/default", serve_config())
