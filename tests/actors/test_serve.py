@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,11 +14,12 @@ import torch
 
 from actors.serving.batching import Company
 from actors.serving.page import joint_table
+from actors.serving.session import Session, first_frame, next_chunk
 from envs.conditioning.joint_commands import JointCommands
 from envs.embodiment import EmbodimentError
 from envs.simulators.dit.engine import DiTSimulator
 from tests.actors.serving import POSES, Running, Stranger, make, tiny_world
-from tests.embodiments import ARM_DELTAS
+from tests.embodiments import ARM_DELTAS, BIMANUAL_JOINTS, world_spec
 
 JOINTS = np.zeros((4, 16), np.float32)
 
@@ -91,6 +93,18 @@ def test_worlds_without_calibration_ask_for_neither_cameras_nor_pose_maps(robot:
         assert state is not None and state.shape == (4, spec.state_dim)
     finally:
         server.stop()
+
+
+def test_what_a_client_does_not_say_of_the_state_is_its_first_command_by_names() -> None:
+    names = BIMANUAL_JOINTS.action_names
+    bare = replace(BIMANUAL_JOINTS, cameras=ARM_DELTAS.cameras, main_camera="")
+    last = replace(bare, state_names=(*names[8:], *names[:8]))
+    other = replace(bare, state_names=tuple(f"torque{k}" for k in range(16)))
+    for robot, wanted in ((last, [*range(8, 16), *range(8)]), (other, [0.0] * 16)):
+        spec = world_spec(robot)
+        session = Session("", 0, "", 0, 0.0, first=np.zeros((spec.views, 3, *spec.size), np.uint8))
+        future = next_chunk(session, torch.arange(16.0)[None], spec)
+        assert first_frame(session, future, spec)["state"][0].tolist() == wanted
 
 
 def test_the_same_client_run_twice(world: DiTSimulator) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from envs.commanded_states import joints_are_states
 from envs.embodiment import Embodiment
 from envs.simulators.dit.prediction import Velocity
 from envs.simulators.dit.state_network import StateDiT
@@ -24,7 +25,7 @@ class GESimStateExpert(FlowStateDecoder):
         checkpoint: as of the simulator.
 
     Raises:
-        CheckpointError: if the weights are of another robot.
+        CheckpointError: if the weights are of another robot, or of another order of its numbers.
     """
 
     def __init__(self, simulator: GESimulator, checkpoint: str | None):
@@ -60,11 +61,25 @@ class GESimStateExpert(FlowStateDecoder):
         """See StateDecoder.check; released weights know one robot.
 
         Raises:
-            CheckpointError: if they are asked to decode another's states.
+            CheckpointError: if they are asked to decode another's states, or the same in another order.
         """
-        if options["checkpoint"] and (robot.action_dim, robot.state_dim) != (JOINTS,) * 2:
+        if not options["checkpoint"]:
+            return
+        expert = f"the state expert of simulator.checkpoint={options['checkpoint']}"
+        if (robot.action_dim, robot.state_dim) != (JOINTS,) * 2:
             raise CheckpointError(
-                f"the state expert of simulator.checkpoint={options['checkpoint']} knows {JOINTS} joints, but"
-                f" {robot.robot} has actions of {robot.action_dim} and states of {robot.state_dim}; train one"
-                " of that size with simulator.state_expert.checkpoint=null"
+                f"{expert} knows {JOINTS} joints, but {robot.robot} has actions of {robot.action_dim} and"
+                f" states of {robot.state_dim}; train one of that size with"
+                " simulator.state_expert.checkpoint=null"
+            )
+        arms = sorted(robot.arms, key=lambda arm: arm.name == "right")
+        order = [n for arm in arms for n in (*arm.numbers, arm.gripper)]
+        alike = joints_are_states(robot) and robot.state_names == robot.action_names
+        if not alike or (order and order != list(range(JOINTS))):
+            raise CheckpointError(
+                f"{expert} takes joint targets and joint states in one order, seven of the left arm, its"
+                f" gripper, seven of the right arm, its gripper, but {robot.robot} has actions"
+                f" {list(robot.action_names)} ({robot.action_kind.value}, delta={robot.delta}) and states"
+                f" {list(robot.state_names)}; bring action and observation.state into that order, with the"
+                " same names, or train one for yours with simulator.state_expert.checkpoint=null"
             )
