@@ -45,6 +45,17 @@ def test_orders_that_differ_are_brought_about_by_names() -> None:
     assert np.array_equal(as_commands(GRIPPERS_LAST, as_states(GRIPPERS_LAST, commands)), commands)
 
 
+def test_grippers_are_counted_from_commands_to_readings() -> None:
+    arms = (replace(BIMANUAL_JOINTS.arms[0], gripper_readings=(35.0, 120.0)), BIMANUAL_JOINTS.arms[1])
+    robot, commands = replace(GRIPPERS_LAST, arms=arms), torch.zeros(2, 16)
+    commands[:, 7] = torch.tensor([1.0, 0.2])
+    states = as_states(robot, commands)
+    assert states[:, 14].tolist() == [120.0, 52.0] and not states[:, [*range(14), 15]].any()
+    assert torch.allclose(as_commands(robot, states), commands) and commands[0, 7] == 1.0
+    closed = first_command(robot, commands.numpy(), states.numpy())  # no reading is taken for a command
+    assert np.array_equal(closed, commands[0].numpy())
+
+
 def test_the_first_command_of_a_recording_is_its_first_state_by_names() -> None:
     action, states = np.arange(48.0).reshape(3, 16), -np.arange(48.0).reshape(3, 16)
     first = first_command(GRIPPERS_LAST, action, states)

@@ -59,11 +59,6 @@ def closed_share(readings: NDArray[np.float32]) -> NDArray[np.float32]:
     return (readings - _GRIPPER[0]) / _GRIPPER[1]
 
 
-def readings_of(closed: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Shares closed as AgiBot's gripper readings."""
-    return _GRIPPER[0] + _GRIPPER[1] * closed
-
-
 def flange_poses(
     position: NDArray[np.float32], xyzw: NDArray[np.float32], gripper: NDArray[np.float32]
 ) -> NDArray[np.float32]:

@@ -18,7 +18,8 @@ from envs.simulators.state_experts.flow import FlowStateDecoder
 
 class GESimStateExpert(FlowStateDecoder):
     """The released state expert, or an untrained one of its form where there are no weights (GE-Sim 1, or
-    none).
+    none). Commanded grippers are told to it as 0 open .. 1 closed, whatever the robot's own values are;
+    states as they are read, as its own are.
 
     Args:
         simulator: whose features it reads.
@@ -54,6 +55,12 @@ class GESimStateExpert(FlowStateDecoder):
             for name, units in (("action", self.tokens.actions), ("state", self.tokens.states)):
                 units.mean.copy_(stats[name][0])
                 units.std.copy_(stats[name][1])
+            for arm in robot.arms:  # released actions have grippers of 0 open .. 1 closed
+                if arm.gripper is not None:
+                    opened, closed = arm.gripper_range
+                    mean, std = self.tokens.actions.mean, self.tokens.actions.std
+                    mean[arm.gripper] = opened + (closed - opened) * mean[arm.gripper]
+                    std[arm.gripper] *= closed - opened  # below 0 where open is the larger value
             self.normalised = True
 
     @classmethod

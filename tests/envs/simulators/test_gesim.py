@@ -229,6 +229,21 @@ def test_released_statistics_know_one_order_of_joints(folder: Path) -> None:
     refuse(replace(BIMANUAL_JOINTS, state_names=tuple(f"torque{k}" for k in range(16))), "torque0")
 
 
+@pytest.mark.parametrize(("opened", "closed"), [(35.0, 120.0), (100.0, 0.0)])
+def test_released_statistics_know_grippers_as_closed_shares(
+    opened: float, closed: float, folder: Path
+) -> None:
+    def told(ends: tuple[float, float], commands: torch.Tensor) -> torch.Tensor:
+        arms = tuple(replace(arm, gripper_range=ends) for arm in BIMANUAL_JOINTS.arms)
+        spec = replace(SPEC, embodiment=replace(SPEC.embodiment, arms=arms))
+        return GESimStateExpert(build(folder, spec), str(folder)).tokens.actions(commands)
+
+    shares = torch.linspace(0, 1, 32).reshape(2, 16)
+    commands = shares.clone()
+    commands[:, [7, 15]] = opened + (closed - opened) * shares[:, [7, 15]]
+    assert torch.allclose(told((opened, closed), commands), told((0.0, 1.0), shares), atol=1e-5)
+
+
 def test_from_nothing_at_any_size_and_chunks_that_fit_the_autoencoder() -> None:
     assert build(None).feature_shape == (3, 6 * 2 * 3, 48)
     with pytest.raises(ValueError, match="1 \\+ a multiple of 4"):
