@@ -2,7 +2,7 @@
 
 Commands are the targets that the recording holds (action/*). Where it holds none for every frame, measured
 joints stand in for them, which is said aloud: a policy then learns where the robot was, not where it was
-sent. Flange poses are always the measured ones, which fit the pictures.
+sent. Flange poses are always the measured ones, which fit the pictures; their grippers are as commanded.
 """
 
 from __future__ import annotations
@@ -66,6 +66,7 @@ def _read(place: Path, number: int, cut: Cut) -> Episode:
     videos = [read_video(place / f"videos/{view}_color.mp4") for view in VIEWS]
     length = min(length, *(len(video) for video in videos), cut.frames or length)
     hands = read["effector/position"][:length]
+    flanges = read["end/position"][:length], read["end/orientation"][:length]
     joints, closed = sent or (read["joint/position"], closed_share(read["effector/position"]))
     return assemble(
         AGIBOT,
@@ -74,7 +75,7 @@ def _read(place: Path, number: int, cut: Cut) -> Episode:
         place,
         commands=_in_order(joints[:length], closed[:length]),
         states=_in_order(read["joint/position"][:length], hands),
-        poses=flange_poses(read["end/position"][:length], read["end/orientation"][:length], hands),
+        poses=flange_poses(*flanges, closed[:length]),
         c2w=np.stack([c2w[:length] for _, c2w in cameras], 1),
         intrinsic=np.stack([intrinsic for intrinsic, _ in cameras]),
         instruction=_task(root, task, name),

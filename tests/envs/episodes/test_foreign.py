@@ -247,13 +247,14 @@ def test_agibots_targets_are_commands_where_they_cover_every_frame(
     targets = np.arange(14.0) + 0.1 * np.arange(length)[:, None]
     with h5py.File(path, "a") as file:
         file["action/joint/position"] = targets
-        file["action/effector/position"] = np.tile([[0.0, 1.0]], (length, 1))
+        file["action/effector/position"] = np.tile([[0.25, 0.5]], (length, 1))
         file["action/joint/index"] = np.arange(length)
     assert convert(root, tmp_path / "lerobot", Cut()) == 1
     assert not recwarn.list
     (episode,) = LeRobotDataset(tmp_path / "lerobot")
     assert np.allclose(episode.commands[:, [*range(7), *range(8, 15)]], targets)
-    assert episode.commands[0, [7, 15]].tolist() == [0.0, 1.0]  # as GE-Sim and its clients command
+    assert episode.commands[0, [7, 15]].tolist() == [0.25, 0.5]  # as GE-Sim and its clients command
+    assert episode.poses is not None and episode.poses[0, :, 6].tolist() == [0.25, 0.5]
     assert episode.states[0, [7, 15]].tolist() == [35.0, 120.0]
     assert episode.embodiment.arms == AGIBOT.arms
     assert np.array_equal(episode.states[3, :7], np.arange(7))
