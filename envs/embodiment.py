@@ -43,15 +43,18 @@ class Arm:
         numbers: positions of its pose or joints in the action vector, in order.
         gripper: position of its gripper in the action vector, None without one.
         gripper_range: the gripper's values when open and when closed.
+        gripper_readings: those that a state has of it; None where they are the same.
     """
 
     name: str
     numbers: tuple[int, ...]
     gripper: int | None = None
     gripper_range: tuple[float, float] = (0.0, 1.0)
+    gripper_readings: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        _as_tuples(self, "numbers", "gripper_range")
+        read = ("gripper_readings",) if self.gripper_readings is not None else ()
+        _as_tuples(self, "numbers", "gripper_range", *read)
 
 
 @dataclass(frozen=True)
@@ -175,10 +178,10 @@ class Embodiment:
                         f" arm {arm.name} (numbers {list(arm.numbers)}, gripper {arm.gripper}); each is one's"
                     )
                 taken[number] = arm.name
-            if arm.gripper_range[0] == arm.gripper_range[1]:
-                raise EmbodimentError(
-                    f"{self.robot}: arm {arm.name} has gripper_range={arm.gripper_range}, which is empty"
-                )
+            for name in ("gripper_range", "gripper_readings"):
+                ends = getattr(arm, name)
+                if ends is not None and ends[0] == ends[1]:
+                    raise EmbodimentError(f"{self.robot}: arm {arm.name} has {name}={ends}, which is empty")
 
     # -- sizes
     @property

@@ -6,32 +6,34 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from aiohttp import web
 
 from actors.serving.access import json_answer
 from actors.serving.session import Session
 from actors.serving.sessions import SessionHost
+from envs.commanded_states import as_states, same_numbers
+from envs.embodiment import Embodiment
 from envs.simulators.remote.protocol import ProtocolError
 
 
 def joint_table(
-    action_names: Sequence[str],
-    action: Sequence[float] | None,
-    state_names: Sequence[str],
-    state: Sequence[float] | None,
+    robot: Embodiment, action: Sequence[float] | None, state: Sequence[float] | None
 ) -> list[dict[str, Any]]:
     """A row for every number of the last action and the last predicted state: name, action, state, and state
-    minus action where both have a number of that name. None is unknown.
+    minus action, in units of states, where both have a number of that name. None is unknown.
     """
     # Joint commands of a robot that takes poses are no numbers of its own.
-    commanded = (
-        dict(zip(action_names, action, strict=True)) if action and len(action) == len(action_names) else {}
-    )
-    predicted = dict(zip(state_names, state, strict=True)) if state else {}
+    known = action if action and len(action) == robot.action_dim else None
+    commanded = dict(zip(robot.action_names, known, strict=True)) if known else {}
+    wanted = commanded
+    if known and same_numbers(robot):
+        wanted = dict(zip(robot.state_names, as_states(robot, np.array(known)).tolist(), strict=True))
+    predicted = dict(zip(robot.state_names, state, strict=True)) if state else {}
     rows = []
-    for name in dict.fromkeys((*state_names, *action_names)):
+    for name in dict.fromkeys((*robot.state_names, *robot.action_names)):
         command, found = commanded.get(name), predicted.get(name)
-        gap = None if command is None or found is None else found - command
+        gap = None if command is None or found is None else found - wanted[name]
         rows.append({"name": name, "action": command, "state": found, "difference": gap})
     return rows
 
@@ -81,7 +83,7 @@ class LivePage:
             "has_preview": bool(session and session.preview),
             "state": state,
             "action": action,
-            "joints": joint_table(robot.action_names, action, robot.state_names, state),
+            "joints": joint_table(robot, action, state),
             "task": session.task if session else "",
         }
         # no client_id: who knows one may drive it

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
-from envs.embodiment import ActionKind, Embodiment
+from envs.commanded_states import as_states, joints_are_states
+from envs.embodiment import Embodiment
 from envs.episodes.pictures import resize_intrinsics
 from envs.specs import WorldSpec
 
@@ -111,9 +112,7 @@ def first_frame(session: Session, future: TensorDict, spec: WorldSpec) -> Tensor
     if session.joints is not None:
         joints = torch.from_numpy(session.joints)[None]
     else:
-        joint_targets = robot.action_kind is ActionKind.JOINTS and not robot.delta
-        commands_are_states = joint_targets and robot.action_dim == robot.state_dim
-        joints = command if commands_are_states else torch.zeros(1, robot.state_dim)
+        joints = as_states(robot, command) if joints_are_states(robot) else torch.zeros(1, robot.state_dim)
     first = {"frames": torch.from_numpy(session.first)[None], "command": command, "state": joints}
     if needs_cameras(spec):
         assert session.intrinsic is not None

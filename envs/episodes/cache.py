@@ -37,7 +37,7 @@ from envs.manifest import check_part
 from envs.specs import WorldSpec
 
 log = logging.getLogger(__name__)
-_FORM = "8"  # changes when what a cache holds does
+_FORM = "9"  # changes when what a cache holds does
 
 
 @dataclass
@@ -252,11 +252,11 @@ class _Builder:
         return numbers
 
     def _poses(self, episode: Episode) -> Tensor | None:
-        """Commanded flange poses [T, arms, 7], where the data or the robot's kinematics say them."""
-        if episode.poses is not None:
-            return torch.from_numpy(episode.poses)
+        """Flange poses [T, arms, 7]: of the commands, as in imagination, where these or the robot's
+        kinematics say them; else those recorded, if any.
+        """
         if not self.spec.embodiment.commands_poses:
-            return None
+            return None if episode.poses is None else torch.from_numpy(episode.poses)
         joints = self.spec.embodiment.action_kind is ActionKind.JOINTS
         check = check_radians if joints else check_poses
         check(self.spec.embodiment, episode.commands, self.data.root)

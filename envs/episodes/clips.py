@@ -77,22 +77,25 @@ class ClipStore(EpisodeStore):
 
     def commands(self, rows: Tensor, first: Tensor, stride: int) -> Tensor:
         """Commands [*rows.shape, A] of rows [B, ...] of which one in `stride` is shown: those in force there,
-        of changes the sum since the row shown before. Grippers are as they are at the row.
+        of changes the sum and of velocities the mean since the row shown before. Grippers are as they are at
+        the row.
 
         Args:
             first: rows [B] of the episodes' first frames, before which nothing was commanded.
         """
         commands, robot = self.arrays["commands"], self.spec.embodiment
         out = commands[rows]
-        if not robot.delta or stride == 1:
+        if stride == 1 or not robot.changes:
             return out
-        summed = torch.ones(robot.action_dim, dtype=torch.bool)
-        summed[list(robot.grippers)] = False
-        begin = first.reshape(-1, *[1] * (rows.ndim - 1))
+        changes = torch.zeros(robot.action_dim, dtype=torch.bool)
+        changes[list(robot.changes)] = True
+        begin, frames = first.reshape(-1, *[1] * (rows.ndim - 1)), torch.ones_like(rows)
         for back in range(1, stride):
-            earlier = rows - back
-            out = out + (earlier >= begin)[..., None] * summed * commands[earlier.clamp(min=0)]
-        return out
+            there = rows - back >= begin
+            out = out + there[..., None] * changes * commands[(rows - back).clamp(min=0)]
+            frames = frames + there
+        # a velocity that was held all the time is that one at any stride, also where an episode begins
+        return out if robot.delta else torch.where(changes, out / frames[..., None], out)
 
     def sample(self, episodes: Tensor, count: int, spec: ClipSpec, generator: torch.Generator) -> TensorDict:
         """`count` random clips of the given episodes, every frame that has a successor being equally likely

@@ -41,7 +41,8 @@ class Episode:
         intrinsic: float32 [V, 3, 3] in pixels; NaN for an uncalibrated camera.
         c2w: float32 [T, V, 4, 4] camera to world, OpenCV convention; NaN for an uncalibrated camera.
         poses: float32 [T, arms, 7] commanded flange poses [x, y, z, roll, pitch, yaw, gripper 0 open .. 1
-            closed], where the source knows them and the command does not say them.
+            closed], where the source knows them and the command does not say them. A source that knows
+            measured ones alone gives these, with the grippers as commanded.
         reward: float32 [T], of the action that led to each frame.
         privileged: float32 [T, ...] by name, what only physics knows; only evaluation reads it.
         present: bool [T], frames of which there is a picture; others are black. All by default.

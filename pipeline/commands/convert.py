@@ -151,11 +151,12 @@ def _common_size(source: Path) -> tuple[int, ...]:
 def _pose_maps(episode: Episode, style: PoseMapStyle) -> NDArray[np.uint8]:
     """Pose maps uint8 [T, V, 3, H, W]; uncalibrated cameras among others stay bare."""
     assert episode.c2w is not None and episode.intrinsic is not None
-    if episode.poses is None:
-        robot = episode.embodiment
+    robot = episode.embodiment
+    if robot.commands_poses:  # as worlds are told them
         kinematics = None if robot.kinematics is None else Kinematics(robot.kinematics)
         poses = end_effector_poses(robot, torch.from_numpy(episode.commands), kinematics)
     else:
+        assert episode.poses is not None
         poses = torch.from_numpy(episode.poses)
     c2w = torch.from_numpy(episode.c2w).nan_to_num().transpose(0, 1)
     intrinsic = torch.from_numpy(episode.intrinsic).nan_to_num()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,11 +14,13 @@ import torch
 
 from actors.serving.batching import Company
 from actors.serving.page import joint_table
+from actors.serving.session import Session, first_frame, next_chunk
 from envs.conditioning.joint_commands import JointCommands
 from envs.embodiment import EmbodimentError
+from envs.episodes.formats.agibot import AGIBOT
 from envs.simulators.dit.engine import DiTSimulator
 from tests.actors.serving import POSES, Running, Stranger, make, tiny_world
-from tests.embodiments import ARM_DELTAS
+from tests.embodiments import ARM_DELTAS, BIMANUAL_JOINTS, world_spec
 
 JOINTS = np.zeros((4, 16), np.float32)
 
@@ -93,6 +96,18 @@ def test_worlds_without_calibration_ask_for_neither_cameras_nor_pose_maps(robot:
         server.stop()
 
 
+def test_what_a_client_does_not_say_of_the_state_is_its_first_command_by_names() -> None:
+    names = BIMANUAL_JOINTS.action_names
+    bare = replace(BIMANUAL_JOINTS, cameras=ARM_DELTAS.cameras, main_camera="")
+    last = replace(bare, state_names=(*names[8:], *names[:8]))
+    other = replace(bare, state_names=tuple(f"torque{k}" for k in range(16)))
+    for robot, wanted in ((last, [*range(8, 16), *range(8)]), (other, [0.0] * 16)):
+        spec = world_spec(robot)
+        session = Session("", 0, "", 0, 0.0, first=np.zeros((spec.views, 3, *spec.size), np.uint8))
+        future = next_chunk(session, torch.arange(16.0)[None], spec)
+        assert first_frame(session, future, spec)["state"][0].tolist() == wanted
+
+
 def test_the_same_client_run_twice(world: DiTSimulator) -> None:
     for fixed in (True, False):
         server = make(world, fixed_seed=fixed)
@@ -126,11 +141,14 @@ def test_the_page_names_joints_and_keeps_watching_whom_it_watched(server: Runnin
     assert status("0").json()["session"] is None  # closed: nobody else is shown in its stead
     for query in ("\u00b2", "9" * 5000, "-1", "x"):
         assert status(query).status_code == 400 and "session" in status(query).json()["error"]
-    assert joint_table(("a", "b"), [1.0, 2.0], ("b", "c"), [2.5, 3.0]) == [
+    robot = replace(ARM_DELTAS, action_names=("a", "b"), state_names=("b", "c"), arms=())
+    assert joint_table(robot, [1.0, 2.0], [2.5, 3.0]) == [
         {"name": "b", "action": 2.0, "state": 2.5, "difference": 0.5},
         {"name": "c", "action": None, "state": 3.0, "difference": None},
         {"name": "a", "action": 1.0, "state": None, "difference": None},
     ]
+    table = joint_table(AGIBOT, [1.0] * 16, [2.0] * 7 + [120.0] * 9)
+    assert [row["difference"] for row in table[6:9]] == [1.0, 0.0, 119.0]  # a closed gripper is read as 120
 
 
 def test_free_running_clients_share_passes(world: DiTSimulator) -> None:

@@ -28,6 +28,12 @@ def test_contradictions_are_refused_by_name(changes: dict[str, Any], said: str) 
         replace(ARM_DELTAS, **changes)
 
 
+def test_grippers_open_where_they_are_not_closed() -> None:
+    for name in ("gripper_range", "gripper_readings"):
+        with pytest.raises(EmbodimentError, match=rf"arm arm has {name}=\(1\.0, 1\.0\), which is empty"):
+            replace(ARM_DELTAS, arms=(replace(ARM_DELTAS.arms[0], **{name: [1.0, 1.0]}),))
+
+
 def test_lists_are_taken_for_tuples() -> None:
     arms = [Arm("arm", [0, 1, 2], 3, [-1.0, 1.0])]  # type: ignore[arg-type]
     cameras = [Camera("corner", [32, 32]), Camera("behind", [32, 32])]  # type: ignore[arg-type]

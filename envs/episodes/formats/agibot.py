@@ -2,7 +2,7 @@
 
 Commands are the targets that the recording holds (action/*). Where it holds none for every frame, measured
 joints stand in for them, which is said aloud: a policy then learns where the robot was, not where it was
-sent. Flange poses are always the measured ones, which fit the pictures.
+sent. Flange poses are always the measured ones, which fit the pictures; their grippers are as commanded.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 
 from envs.embodiment import Embodiment
 from envs.episodes.episode import Episode, EpisodeError
-from envs.episodes.formats.gesim import GENIE, VIEWS, flange_poses, readings_of
+from envs.episodes.formats.gesim import GENIE, VIEWS, closed_share, flange_poses
 from envs.episodes.formats.recordings import Cut, Format, assemble
 from envs.episodes.video import read_video
 
-# Grippers are as read, 35 open .. 120 closed.
+# Grippers are commanded as GE-Sim's are, 0 open .. 1 closed, and read as 35 open .. 120 closed.
 AGIBOT: Embodiment = replace(
     GENIE,
     robot="agibot_g1",
     state_names=GENIE.action_names,
-    arms=tuple(replace(arm, gripper_range=(35.0, 120.0)) for arm in GENIE.arms),
+    arms=tuple(replace(arm, gripper_readings=(35.0, 120.0)) for arm in GENIE.arms),
 )
 
 # Of each frame, by arm.
@@ -66,15 +66,16 @@ def _read(place: Path, number: int, cut: Cut) -> Episode:
     videos = [read_video(place / f"videos/{view}_color.mp4") for view in VIEWS]
     length = min(length, *(len(video) for video in videos), cut.frames or length)
     hands = read["effector/position"][:length]
-    joints = _in_order(read["joint/position"][:length], hands)
+    flanges = read["end/position"][:length], read["end/orientation"][:length]
+    joints, closed = sent or (read["joint/position"], closed_share(read["effector/position"]))
     return assemble(
         AGIBOT,
         {row: [video[row] for video in videos] for row in range(length)},
         length,
         place,
-        commands=joints if sent is None else _in_order(sent[0][:length], sent[1][:length]),
-        states=joints,
-        poses=flange_poses(read["end/position"][:length], read["end/orientation"][:length], hands),
+        commands=_in_order(joints[:length], closed[:length]),
+        states=_in_order(read["joint/position"][:length], hands),
+        poses=flange_poses(*flanges, closed[:length]),
         c2w=np.stack([c2w[:length] for _, c2w in cameras], 1),
         intrinsic=np.stack([intrinsic for intrinsic, _ in cameras]),
         instruction=_task(root, task, name),
@@ -84,8 +85,8 @@ def _read(place: Path, number: int, cut: Cut) -> Episode:
 
 
 def _targets(file: Any, length: int) -> Targets | None:
-    """Joint targets [T, 14] and gripper targets [T, 2], as read 35..120; None, with a warning, where they do
-    not cover all frames.
+    """Joint targets [T, 14] and gripper targets [T, 2], 0 open .. 1 closed; None, with a warning, where they
+    do not cover all frames.
     """
     targets = []
     for key, size in (("joint", 14), ("effector", 2)):
@@ -101,7 +102,7 @@ def _targets(file: Any, length: int) -> Targets | None:
     joints, closed = targets
     if not np.isfinite(joints).all() or not ((closed > -0.1) & (closed < 1.1)).all():
         return _warn_measured("action/* holds NaN, or grippers that are no share of 0 open .. 1 closed")
-    return joints, readings_of(closed)
+    return joints, closed
 
 
 def _warn_measured(reason: str) -> Targets | None:

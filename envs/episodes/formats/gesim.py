@@ -59,17 +59,12 @@ def closed_share(readings: NDArray[np.float32]) -> NDArray[np.float32]:
     return (readings - _GRIPPER[0]) / _GRIPPER[1]
 
 
-def readings_of(closed: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Shares closed as AgiBot's gripper readings."""
-    return _GRIPPER[0] + _GRIPPER[1] * closed
-
-
 def flange_poses(
-    position: NDArray[np.float32], xyzw: NDArray[np.float32], gripper: NDArray[np.float32]
+    position: NDArray[np.float32], xyzw: NDArray[np.float32], closed: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Poses [T, 2, 7] of positions [T, 2, 3], quaternions [T, 2, 4] and AgiBot's gripper readings [T, 2]."""
+    """Poses [T, 2, 7] of positions [T, 2, 3], quaternions [T, 2, 4] and shares closed [T, 2]."""
     angles = Rotation.from_quat(xyzw.reshape(-1, 4)).as_euler("xyz").reshape(*xyzw.shape[:-1], 3)
-    return np.concatenate([position, angles, closed_share(gripper)[..., None]], -1).astype(np.float32)
+    return np.concatenate([position, angles, closed[..., None]], -1).astype(np.float32)
 
 
 # -- GE-Sim 2.0
@@ -145,7 +140,8 @@ def _read_sample(place: Path, number: int, cut: Cut) -> Episode:
     names = sorted(int(path.stem) for path in (place / "head_color").glob("*.png") if path.stem.isdigit())
     if not names:
         raise EpisodeError(f"{place / 'head_color'} holds no pictures")
-    commands = flange_poses(arms[..., :3], arms[..., 3:7], arms[..., 7]).reshape(length, 14)
+    closed = closed_share(arms[..., 7])
+    commands = flange_poses(arms[..., :3], arms[..., 3:7], closed).reshape(length, 14)
     pictures = {
         row: [read_picture(place / f"{view}_color/{name}.png") for view in VIEWS]
         for row, name in enumerate(names)

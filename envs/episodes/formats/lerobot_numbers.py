@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from envs.commanded_states import as_commands, same_numbers
 from envs.embodiment import Embodiment
 from envs.episodes.episode import EpisodeError
 from envs.episodes.formats import lerobot_columns as names
@@ -119,8 +120,7 @@ def first_command(robot: Embodiment, action: NDArray[Any], states: NDArray[Any])
         # Nothing has moved yet; a gripper is told where it is, not by how much it changes.
         still[list(robot.grippers)] = action[0, list(robot.grippers)]
         return still
-    same = robot.state_names == robot.action_names
-    return states[0].astype(action.dtype) if same else action[0]
+    return as_commands(robot, states[0]).astype(action.dtype) if same_numbers(robot) else action[0]
 
 
 def seed_of(table: pa.Table, otherwise: int) -> int:

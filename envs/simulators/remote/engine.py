@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
+from envs.commanded_states import as_states, joints_are_states
 from envs.conditioning import CANVAS
-from envs.embodiment import ActionKind
 from envs.ranges import Count
 from envs.simulators.base import Simulator
 from envs.simulators.remote.connection import Connection, ConnectionOptions, RemoteError
@@ -192,7 +192,7 @@ def _close_all(connections: dict[int, Connection]) -> None:
 
 class GivenStates(StateDecoder):
     """Joint states that came with the frames; where a server has none, the command in force stands in, if it
-    is all the joints of the state.
+    is all the joints of the state by their names.
 
     Args:
         simulator: whose features are states.
@@ -202,9 +202,7 @@ class GivenStates(StateDecoder):
 
     def __init__(self, simulator: Simulator):
         super().__init__(1)
-        robot = simulator.spec.embodiment
-        joints = robot.action_kind is ActionKind.JOINTS and not robot.delta
-        self.commands_are_states = joints and robot.action_dim == robot.state_dim
+        self.robot = simulator.spec.embodiment
 
     def decode(
         self, features: Tensor, commands: Tensor, history: TensorDict, seed: Tensor, chunk_index: Tensor
@@ -217,9 +215,9 @@ class GivenStates(StateDecoder):
         known = torch.isfinite(features)
         if known.all():
             return features
-        if not self.commands_are_states:
+        if not joints_are_states(self.robot):
             raise RemoteError(
-                "the server decodes no joint states, and this robot's commands do not say them; serve a world"
-                " with a state decoder"
+                "the server decodes no joint states, and this robot's commands are no joints with the names"
+                f" of its state, {list(self.robot.state_names)}; serve a world with a state decoder"
             )
-        return torch.where(known, features, commands)
+        return torch.where(known, features, as_states(self.robot, commands))

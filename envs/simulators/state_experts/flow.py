@@ -15,9 +15,10 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from envs.commanded_states import joints_are_states
 from envs.conditioning.turns import Turns
 from envs.conditioning.units import LEAST_SPREAD, Units
-from envs.embodiment import ActionKind, Embodiment
+from envs.embodiment import Embodiment
 from envs.ranges import Count
 from envs.rng import Noise, noise_generator
 from envs.simulators.base import Simulator
@@ -35,9 +36,9 @@ _DISTURBANCE = 0.02  # noise on past states in training, in spreads: in rollouts
 class StateTokens(nn.Module):
     """Commands and states as tokens in units of the data.
 
-    Where commands are joint targets of just the numbers that states hold, both stand as they are, and states
-    are predicted as they are (GE-Sim 2.0). Elsewhere commands are moves from the command in force (deltas are
-    moves already), and states are predicted as changes since the last one.
+    Where commands are joint targets of just the numbers that states hold by their names, both stand as they
+    are, and states are predicted as they are (GE-Sim 2.0). Elsewhere commands are moves from the command in
+    force (deltas are moves already), and states are predicted as changes since the last one.
 
     Args:
         embodiment: whose commands and states.
@@ -50,8 +51,7 @@ class StateTokens(nn.Module):
         super().__init__()
         self.action_dim, self.state_dim = embodiment.action_dim, embodiment.state_dim
         self.width = max(self.action_dim, self.state_dim)
-        joints = embodiment.action_kind is ActionKind.JOINTS and not embodiment.delta
-        self.absolute = joints and self.action_dim == self.state_dim
+        self.absolute = joints_are_states(embodiment)
         self.moves = not self.absolute and not embodiment.delta
         self.turns = Turns(self.action_dim, embodiment.action_rotations)
         self.actions = Units(self.action_dim, least=LEAST_SPREAD)

@@ -110,8 +110,8 @@ def _joints(robot: Embodiment, kinematics: Kinematics) -> list[list[int]] | None
     arms = kinematics.robot.joints
     if len(arms) == len(arm_names(robot)) and all(joint in names for arm in arms for joint in arm):
         return [[names.index(joint) for joint in arm] for arm in arms]
-    if robot.action_kind is ActionKind.JOINTS and robot.arms and names == robot.action_names:
-        return [list(arm.numbers) for arm in robot.arms]
+    if robot.action_kind is ActionKind.JOINTS and robot.arms and {*names} == {*robot.action_names}:
+        return [[names.index(robot.action_names[number]) for number in arm.numbers] for arm in robot.arms]
     return None
 
 

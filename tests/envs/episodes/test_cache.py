@@ -14,9 +14,16 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+from envs.conditioning import CANVAS, PoseMapStyle, end_effector_poses, render_pose_map
 from envs.episodes import LeRobotWriter
 from envs.episodes.clips import ClipStore
-from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
+from envs.episodes.formats.recordings import Cut
+from envs.geometry.cameras import follow_wrists
+from envs.geometry.kinematics import Kinematics
+from envs.specs import WorldSpec
+from pipeline.commands.convert import inspect
+from tests.arms import two_arms
+from tests.embodiments import ARM_DELTAS, BIMANUAL_JOINTS, BIMANUAL_POSES, world_spec
 from tests.moving_square import SIZE, moving_square
 
 SPEC = world_spec(BIMANUAL_POSES.at(SIZE), SIZE)
@@ -58,6 +65,29 @@ def test_a_cache_sees_rows_behind_links_and_pictures_beside_them(tmp_path: Path)
     (root / "images/frame-000000.png").write_bytes(b"new")
     ClipStore([root], spec, cache)
     assert made.stat().st_ino != before
+
+
+def test_poses_are_those_of_commands_where_kinematics_say_them_and_else_the_recorded_ones(
+    tmp_path: Path,
+) -> None:
+    robot = replace(BIMANUAL_JOINTS, kinematics=two_arms(tmp_path)).at(SIZE)
+    assert robot.kinematics is not None
+    made = moving_square(robot, 0)
+    commanded = end_effector_poses(robot, torch.from_numpy(made.commands), Kinematics(robot.kinematics))
+    measured = commanded.roll(2, 0) + 0.01  # as of a robot that is late
+    LeRobotWriter(tmp_path / "set", robot).write([replace(made, poses=measured.numpy())])
+    assert made.c2w is not None and made.intrinsic is not None
+    for body, poses in ((robot, commanded), (replace(robot, kinematics=None), measured)):
+        spec = WorldSpec(body, SIZE, 4, pose_map=True, ray_map=True)
+        store = ClipStore([tmp_path / "set"], spec, tmp_path / "cache")
+        c2w = follow_wrists(torch.from_numpy(made.c2w[0]), poses[0], poses, body.wrists)
+        assert torch.allclose(store.arrays["c2w"], c2w, atol=1e-6)
+        maps = render_pose_map(poses, c2w.transpose(0, 1), torch.from_numpy(made.intrinsic), SIZE)
+        drawn = store.pose_maps(torch.arange(len(made)))
+        assert torch.equal(drawn, maps.transpose(0, 1)) and bool((drawn != CANVAS).any())
+    LeRobotWriter(tmp_path / "bare", robot).write([made])
+    (one,), (two,) = (inspect(tmp_path / name, tmp_path, Cut(), PoseMapStyle()) for name in ("set", "bare"))
+    assert one.read_bytes() == two.read_bytes()
 
 
 def test_a_half_made_cache_is_not_used(dataset: Path, tmp_path: Path) -> None:

@@ -66,29 +66,6 @@ def test_clips_line_up(store: ClipStore) -> None:
     assert torch.equal(clip["memory", "frames"][1, 1, 1], store.frames(store.start[3] + 2))
 
 
-def test_stride_skips_frames(store: ClipStore) -> None:
-    clip = store.clips(torch.tensor([3]), torch.tensor([5]), ClipSpec(4, 2, 1, stride=3))
-    ahead = store.start[3] + torch.tensor([8, 11])
-    assert torch.equal(clip["future", "commands"][0], store.arrays["commands"][ahead])
-    assert int(clip["begin"]) == 1  # one stride of past: frames 2 and 5
-
-
-def test_changes_are_summed_over_the_frames_that_a_stride_skips(
-    tiny_store: Callable[[Embodiment], ClipStore],
-) -> None:
-    store = tiny_store(ARM_DELTAS)
-    clip = store.clips(torch.tensor([3]), torch.tensor([2]), ClipSpec(2, 2, 1, stride=3))
-    commands = store.arrays["commands"][store.start[3] :]
-    grippers = list(ARM_DELTAS.grippers)
-    for shown, row in zip(clip["future", "commands"][0], (5, 8), strict=True):
-        summed = commands[row - 2 : row + 1].sum(0)
-        summed[grippers] = commands[row][grippers]
-        assert torch.allclose(shown, summed)
-    now = commands[:3].sum(0)  # nothing was commanded before the first frame
-    now[grippers] = commands[2][grippers]
-    assert torch.allclose(clip["now", "command"][0], now) and clip["stride"].tolist() == [3]
-
-
 def test_frames_past_the_end_are_not_valid(store: ClipStore) -> None:
     end = int(store.length[0]) - 2
     clip = store.clips(torch.tensor([0]), torch.tensor([end]), ClipSpec(4, 4))

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 import torch
 
+from envs.commanded_states import as_states
 from envs.conditioning import PoseMapStyle, end_effector_poses, render_pose_map
 from envs.embodiment import Embodiment
 from envs.episodes import EpisodeError, LeRobotDataset, LeRobotWriter
 from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
+from envs.episodes.formats.agibot import AGIBOT
 from envs.episodes.formats.bridge import BRIDGE
 from envs.episodes.formats.foreign import Cut, read_foreign
 from envs.episodes.formats.gesim import GENIE, GENIE_POSES, write_bundle
@@ -218,7 +220,7 @@ def test_agibot_folders(tmp_path: Path) -> None:
     root = _agibot(tmp_path / "beta")
     with pytest.warns(UserWarning, match="no action/joint/position; measured joints stand in for commands"):
         (episode,) = read_foreign(root)
-    assert np.array_equal(episode.commands, episode.states)
+    assert np.array_equal(as_states(AGIBOT, episode.commands), episode.states)
     assert (episode.instruction, episode.seed) == ("Pickup items", 648642)
     assert episode.frames.shape == (6, 3, 3, 48, 64)
     assert episode.poses is not None and episode.c2w is not None and episode.intrinsic is not None
@@ -245,13 +247,16 @@ def test_agibots_targets_are_commands_where_they_cover_every_frame(
     targets = np.arange(14.0) + 0.1 * np.arange(length)[:, None]
     with h5py.File(path, "a") as file:
         file["action/joint/position"] = targets
-        file["action/effector/position"] = np.tile([[0.0, 1.0]], (length, 1))
+        file["action/effector/position"] = np.tile([[0.25, 0.5]], (length, 1))
         file["action/joint/index"] = np.arange(length)
     assert convert(root, tmp_path / "lerobot", Cut()) == 1
     assert not recwarn.list
     (episode,) = LeRobotDataset(tmp_path / "lerobot")
     assert np.allclose(episode.commands[:, [*range(7), *range(8, 15)]], targets)
-    assert episode.commands[0, [7, 15]].tolist() == [35.0, 120.0]
+    assert episode.commands[0, [7, 15]].tolist() == [0.25, 0.5]  # as GE-Sim and its clients command
+    assert episode.poses is not None and episode.poses[0, :, 6].tolist() == [0.25, 0.5]
+    assert episode.states[0, [7, 15]].tolist() == [35.0, 120.0]
+    assert episode.embodiment.arms == AGIBOT.arms
     assert np.array_equal(episode.states[3, :7], np.arange(7))
     for change, reason in (
         (lambda file: file.create_dataset("action/joint/index", data=[0, 1, 2]), "no target was sent"),
@@ -267,7 +272,7 @@ def test_agibots_targets_are_commands_where_they_cover_every_frame(
                 file[name] = kept[name]
         with pytest.warns(UserWarning, match=reason):
             (episode,) = read_foreign(root)
-        assert np.array_equal(episode.commands, episode.states)
+        assert np.array_equal(as_states(AGIBOT, episode.commands), episode.states)
         with h5py.File(path, "a") as file:
             del file[made]
             file[made] = kept[made]

@@ -16,6 +16,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from envs.conditioning import render_ray_map
+from envs.embodiment import ActionKind, Embodiment
 from envs.geometry.kinematics import Kinematics
 from envs.initial_states import InitialStates
 from envs.judges.learned import LearnedJudge
@@ -218,6 +219,39 @@ def test_what_is_wrong_with_a_checkpoint_is_listed(folder: Path, tmp_path: Path)
     with pytest.raises(CheckpointError, match=r"knows 16 joints.*actions of 14"):
         spec = WorldSpec(BIMANUAL_POSES, (32, 48), 5, pose_map=True, ray_map=True)
         GESimStateExpert(build(folder, spec), str(folder))
+
+
+def test_released_statistics_know_one_order_of_joints(folder: Path) -> None:
+    def refuse(robot: Embodiment, said: str) -> None:
+        with pytest.raises(CheckpointError, match=rf"in one order.*{said}.*state_expert\.checkpoint=null"):
+            GESimStateExpert.check({"checkpoint": str(folder)}, robot)
+        GESimStateExpert.check({"checkpoint": None}, robot)
+
+    names, (left, right) = BIMANUAL_JOINTS.action_names, BIMANUAL_JOINTS.arms
+    last = (*names[:7], *names[8:15], names[7], names[15])
+    GESimStateExpert.check({"checkpoint": str(folder)}, BIMANUAL_JOINTS)
+    refuse(replace(BIMANUAL_JOINTS, state_names=last), "'left_gripper', 'right_gripper'")
+    arms = (replace(left, gripper=14), replace(right, numbers=tuple(range(7, 14))))
+    refuse(replace(BIMANUAL_JOINTS, action_names=last, state_names=last, arms=arms), "'right_gripper'")
+    turned = (replace(left, name="right"), replace(right, name="left"))
+    refuse(replace(BIMANUAL_JOINTS, arms=turned), "right_gripper")
+    refuse(replace(BIMANUAL_JOINTS, action_kind=ActionKind.OTHER), "(other, delta=False)")
+    refuse(replace(BIMANUAL_JOINTS, state_names=tuple(f"torque{k}" for k in range(16))), "torque0")
+
+
+@pytest.mark.parametrize(("opened", "closed"), [(35.0, 120.0), (100.0, 0.0)])
+def test_released_statistics_know_grippers_as_closed_shares(
+    opened: float, closed: float, folder: Path
+) -> None:
+    def told(ends: tuple[float, float], commands: torch.Tensor) -> torch.Tensor:
+        arms = tuple(replace(arm, gripper_range=ends) for arm in BIMANUAL_JOINTS.arms)
+        spec = replace(SPEC, embodiment=replace(SPEC.embodiment, arms=arms))
+        return GESimStateExpert(build(folder, spec), str(folder)).tokens.actions(commands)
+
+    shares = torch.linspace(0, 1, 32).reshape(2, 16)
+    commands = shares.clone()
+    commands[:, [7, 15]] = opened + (closed - opened) * shares[:, [7, 15]]
+    assert torch.allclose(told((opened, closed), commands), told((0.0, 1.0), shares), atol=1e-5)
 
 
 def test_from_nothing_at_any_size_and_chunks_that_fit_the_autoencoder() -> None:

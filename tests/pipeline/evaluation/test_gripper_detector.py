@@ -11,7 +11,9 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from envs.commanded_states import as_states
 from envs.embodiment import Embodiment, EmbodimentError
+from envs.episodes import LeRobotWriter
 from envs.episodes.clips import ClipStore
 from envs.geometry.cameras import project
 from envs.rng import constant_generator
@@ -40,7 +42,7 @@ from pipeline.evaluation.grippers.ruler import GripperRuler
 from pipeline.evaluation.objects.rays import nearest_on_ray, rays, triangulate
 from tests.arms import two_arms
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES, world_spec
-from tests.moving_square import SIZE
+from tests.moving_square import SIZE, moving_square
 from tests.pipeline.evaluation.test_fidelity import Drawing
 
 SECTION = {
@@ -74,6 +76,15 @@ def test_end_effectors_are_known_from_what_the_robot_knows(
     assert found.source == "joints in the state, by kinematics" and found.measured
     assert found.positions.shape == (len(described.arrays["states"]), 2, 3)
     assert float(found.positions[..., 2].max()) == pytest.approx(0.7, abs=1e-4)  # seven links of 10 cm
+    names = BIMANUAL_JOINTS.state_names
+    turned = replace(robot, state_names=(*names[8:], *names[:8]))
+    made = [moving_square(robot, seed) for seed in range(2)]
+    for name, body in (("as", robot), ("turned", turned)):
+        episodes = [replace(one, embodiment=body, states=as_states(body, one.states)) for one in made]
+        LeRobotWriter(tmp_path / name, body).write(episodes)
+    stores = (ClipStore([tmp_path / n], world_spec(b, SIZE)) for n, b in (("as", robot), ("turned", turned)))
+    same = [known_end_effectors(store, 0.0).positions for store in stores]
+    assert torch.equal(*same)
 
 
 def test_a_detector_belongs_to_what_its_data_hold_and_to_the_robot(
