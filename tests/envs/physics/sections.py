@@ -98,6 +98,25 @@ class Scriptless(Counting):
         return super().expert(0.0, rng)
 
 
+# Workers import the modules of such suites: here that takes half a second, beside torch five.
+class OddSeed(Counting):
+    """Counts, and breaks at the first action of one seed."""
+
+    def step(self, action: Array) -> None:
+        super().step(action)
+        if self.count == 9_000_001:
+            raise RuntimeError("the bench is on fire")
+
+
+class Startless(Counting):
+    """Counts, and cannot lay out what every third seed draws."""
+
+    def reset(self, task: str, seed: int) -> None:
+        super().reset(task, seed)
+        if seed % 3 == 0:
+            raise RuntimeError("things lie in each other")
+
+
 class Solved(Tabletop):
     """The table top, whose block is put where it belongs before the first action."""
 

@@ -7,11 +7,9 @@ from pathlib import Path
 import pytest
 
 from envs.episodes.video import read_video
-from envs.physics.suite import Array
 from envs.targets import ConfigError
 from pipeline.benches.experts import ExpertFails, experts
 from pipeline.config import load_config
-from tests.envs.physics.sections import Counting
 
 SMALL = (
     *("task=tabletop", "task.name=[push,pull]", "task.size=[16,16]", "evaluate.episodes=2"),
@@ -39,20 +37,11 @@ def test_an_expert_that_fails_is_shown_with_its_seeds(tmp_path: Path) -> None:
     assert read_video(videos[0]).shape == (5, 3, 192, 192)
 
 
-class OddSeed(Counting):
-    """Counts, and breaks at the first action of one seed."""
-
-    def step(self, action: Array) -> None:
-        super().step(action)
-        if self.count == 9_000_001:
-            raise RuntimeError("the bench is on fire")
-
-
 def test_episodes_that_crash_physics_are_said_to_be_dropped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cfg = load_config([*SMALL, f"runs={tmp_path}"])
-    suite = {"_target_": f"{__name__}.OddSeed", "fault": "", "tasks": ["count", "recount"]}
+    suite = {"_target_": "tests.envs.physics.sections.OddSeed", "fault": "", "tasks": ["count", "recount"]}
     cfg["task"] |= {"suite": suite, "name": ["count", "recount"], "size": [4, 4], "horizon": 4}
     cfg["task"]["variants"], cfg["launch"]["workers"] = {}, 2
     with pytest.raises(

@@ -103,15 +103,6 @@ def test_an_episode_that_crashes_physics_is_left_out_of_its_split(tmp_path: Path
         )
 
 
-class Startless(Counting):
-    """Counts, and cannot lay out what every third seed draws."""
-
-    def reset(self, task: str, seed: int) -> None:
-        super().reset(task, seed)
-        if seed % 3 == 0:
-            raise RuntimeError("things lie in each other")
-
-
 @pytest.mark.parametrize(
     ("stage", "settings", "made"),
     [
@@ -123,7 +114,8 @@ def test_starts_that_crash_physics_are_dropped_and_counted(
     stage: Any, settings: dict[str, Any], made: str, tmp_path: Path
 ) -> None:
     cfg = load_config(["experiment=soak", "launch.workers=2", "extra_starts.episodes=3"])
-    cfg["task"] |= {"suite": {"_target_": f"{__name__}.Startless", "fault": ""}, "variants": {"odd": {}}}
+    suite = {"_target_": "tests.envs.physics.sections.Startless", "fault": ""}
+    cfg["task"] |= {"suite": suite, "variants": {"odd": {}}}
     cfg["task"] |= {"name": "count", "size": [4, 4], "horizon": 4, "mode": "absolute"}
     asked = {"variant": "odd", **settings}
     said = stage.run(stage.view("odd", cfg, asked), tmp_path, Inputs(settings=asked))
