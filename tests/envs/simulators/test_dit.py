@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
 from envs.simulators import memory
@@ -17,6 +16,7 @@ from envs.simulators.dit.shape import DiTShape
 from envs.simulators.inputs import build_inputs
 from envs.simulators.state_experts.flow import StateExpert, StateTokens
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES, EMBODIMENTS, world_spec
+from tests.envs.loss_weights import loss_weights
 from tests.envs.simulators.clips import clip, first_of, future_of
 
 NET = {"layers": 3, "heads": 2, "head_dim": 24, "adaln_rank": 8, "patch": 2, "stem": 8}
@@ -117,18 +117,9 @@ def test_what_is_to_be_said_does_not_decide_what_it_weighs(dit: DiTSimulator) ->
     other = clips.clone()
     other["future", "frames"] = clips["future", "frames"].flip(-1)
 
-    def weights(data: TensorDict) -> tuple[Tensor, Tensor]:
-        """Of a chunk in steps, and of the loss: twice its second derivative by what is said."""
-        said: list[Tensor] = []
-        hook = dit.net.proj_out.register_forward_hook(lambda layer, args, out: said.append(out) or out)
-        loss = dit.loss(data, torch.Generator().manual_seed(0))[0]
-        hook.remove()
-        (first,) = torch.autograd.grad(loss, said[-1:], create_graph=True)
-        (second,) = torch.autograd.grad(first.sum(), said[-1:])
-        return dit.chunk_of(data, torch.Generator().manual_seed(0))[1], second
-
-    for mine, others in zip(weights(clips), weights(other), strict=True):
-        assert torch.equal(mine, others) and len(mine[mine > 0].unique()) > 1
+    mine, others = (loss_weights(dit, dit.net.proj_out, data) for data in (clips, other))
+    for one, same in zip(mine, others, strict=True):
+        assert torch.equal(one, same) and len(one[one > 0].unique()) > 1
     chunk = dit.chunk_of(clips, torch.Generator().manual_seed(0))[1]
     assert (chunk[1, :, :, 3:] == 0).all() and (chunk[1, :, :, :3] >= 1).all()
 

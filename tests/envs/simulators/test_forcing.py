@@ -17,6 +17,7 @@ from envs.simulators.forcing.schedule import DDIM, Sigmoid, unit_parts
 from envs.specs import memory_indices
 from envs.targets import ConfigError
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
+from tests.envs.loss_weights import loss_weights
 from tests.envs.simulators.clips import clip, first_of, future_of
 from tests.envs.simulators.test_engines import build_engine, section_of
 
@@ -214,18 +215,9 @@ def test_what_is_to_be_said_does_not_decide_what_it_weighs() -> None:
     other = clips.clone()
     other["future", "frames"] = clips["future", "frames"].flip(-1)
 
-    def weights(data: TensorDict) -> tuple[Tensor, Tensor]:
-        """Of a chunk in steps, and of the loss: twice its second derivative by what is said."""
-        said: list[Tensor] = []
-        hook = world.net.out.register_forward_hook(lambda layer, args, out: said.append(out) or out)
-        loss = world.loss(data, torch.Generator().manual_seed(0))[0]
-        hook.remove()
-        (first,) = torch.autograd.grad(loss, said[-1:], create_graph=True)
-        (second,) = torch.autograd.grad(first.sum(), said[-1:])
-        return world.chunk_of(data, torch.Generator().manual_seed(0))[1], second
-
-    for mine, others in zip(weights(clips), weights(other), strict=True):
-        assert torch.equal(mine, others) and len(mine[mine > 0].unique()) > 1
+    mine, others = (loss_weights(world, world.net.out, data) for data in (clips, other))
+    for one, same in zip(mine, others, strict=True):
+        assert torch.equal(one, same) and len(one[one > 0].unique()) > 1
 
 
 @pytest.mark.parametrize(("steps", "apart"), [(1, 0.01), (2, 0.5)])
