@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
 from envs.simulators.base import WORLD_OPTIONS, Simulator
-from envs.simulators.samplers import Distilled, Euler, Sampler, shifted_levels
+from envs.simulators.samplers import Euler, Sampler, few_steps
 from envs.simulators.stepwise import Stepwise
 from envs.specs import WorldSpec
 from envs.targets import ConfigError, build
@@ -80,11 +80,6 @@ class Bell(Stepwise):
             return self.sampler(lambda z, s: self.velocity(z, torch.full((len(z),), s), None), noise)
 
 
-def jumps(steps: int) -> Distilled:
-    """The sampler of a student of so many steps."""
-    return Distilled(tuple(shifted_levels(steps, 1.0)[:-1]))
-
-
 def learned(student: Bell, options: FitConfig) -> Tensor:
     """What a student makes at the steps that it learns, each as often as it is drawn."""
     method, nothing = Method(deepcopy(student), student, options), torch.Generator().manual_seed(0)
@@ -101,7 +96,7 @@ def test_a_student_makes_what_the_teacher_makes(
     store = tiny_store(ARM_DELTAS)
     torch.manual_seed(0)
     teacher = Bell(store.spec, Euler(32, 1.0))
-    student = Bell(store.spec, jumps(count))
+    student = Bell(store.spec, few_steps(count, 1.0))
     student.load_state_dict(teacher.state_dict())
     assert float(teacher.sample().std()) == pytest.approx(0.5, abs=0.05)
     assert float(student.sample().std()) < (0.05 if count == 1 else 0.25)
@@ -117,7 +112,7 @@ def test_a_student_makes_what_the_teacher_makes(
 
 def test_each_level_that_a_student_samples_at_is_learned_as_often_and_no_other(tiny_store: Stores) -> None:
     spec, options = tiny_store(ARM_DELTAS).spec, FitConfig(1, 1, 1e-3, bf16=False)
-    student = Bell(spec, jumps(4))
+    student = Bell(spec, few_steps(4, 1.0))
     method, seen, counts = (
         Method(Bell(spec, Euler(32, 1.0)), student, options),
         list[float](),
@@ -132,7 +127,7 @@ def test_each_level_that_a_student_samples_at_is_learned_as_often_and_no_other(t
     for step in range(400):
         seen.clear()
         method.generated(student.chunk_of(TensorDict(), torch.Generator())[0], step)
-        assert seen == list(jumps(4).sigmas[: len(seen)])
+        assert seen == list(few_steps(4, 1.0).sigmas[: len(seen)])
         counts[seen[-1]] += 1
     assert len(counts) == 4 and all(70 < times < 130 for times in counts.values())
 
