@@ -16,8 +16,8 @@ from envs.simulators.dit.shape import DiTShape
 from envs.simulators.inputs import build_inputs
 from envs.simulators.state_experts.flow import StateExpert, StateTokens
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES, EMBODIMENTS, world_spec
-from tests.envs.loss_weights import loss_weights
 from tests.envs.simulators.clips import clip, first_of, future_of
+from tests.envs.simulators.loss_weights import loss_weights
 
 NET = {"layers": 3, "heads": 2, "head_dim": 24, "adaln_rank": 8, "patch": 2, "stem": 8}
 DENOISING: dict[str, Any] = {

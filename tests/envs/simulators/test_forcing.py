@@ -17,8 +17,8 @@ from envs.simulators.forcing.schedule import DDIM, Sigmoid, unit_parts
 from envs.specs import memory_indices
 from envs.targets import ConfigError
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
-from tests.envs.loss_weights import loss_weights
 from tests.envs.simulators.clips import clip, first_of, future_of
+from tests.envs.simulators.loss_weights import loss_weights
 from tests.envs.simulators.test_engines import build_engine, section_of
 
 SIGMOID = Sigmoid(-3.0, 3.0, 1.0)
