@@ -22,7 +22,6 @@ from learners.training.parallel import leads
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import SIMULATOR, Cfg, fit_options, learning_episodes, learns, open_store
 
-_WARM_UP = 2  # steps that fill caches and are not counted
 Train = Callable[[FitConfig, Path], Mapping[str, Any]]
 _FITS = ("tokenizer_fit", "simulator_fit.first", "state_fit.first")
 
@@ -74,6 +73,10 @@ def fits_of(cfg: Cfg) -> dict[str, FitConfig]:
 def pace(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Samples per second in which a world's tokenizer and simulator learn, and what its state expert costs
     (see StatePace), each for a few steps on parts that are thrown away; of those that learn.
+
+    The same steps are taken twice and the second time counts: the first fills caches, and compiles what
+    `launch.compile` asks for. That takes as long as thousands of steps, and clips that unroll, which come
+    last, are compiled anew.
     """
     store, trial = open_store(cfg, inputs), folder / "trial"
     episodes = learning_episodes(store)
@@ -97,15 +100,14 @@ def pace(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     for part, train in trained.items():
         if not present[part]:
             continue
-        fit = fits[part]
-        train(replace(fit, steps=_WARM_UP), trial / f"{part}-warm-up")
-        fit = replace(fit, steps=cfg["equal_time"]["measured"])
+        fit = replace(fits[part], steps=cfg["equal_time"]["measured"])
         if part == "state":
             fit = shortest_kept(fit)
-            cost = StatePace.of(fit, train(fit, trial / part))
-            out |= {f"state_{key}": value for key, value in asdict(cost).items()}
+        train(fit, trial / f"{part}-warm-up")
+        spent = train(fit, trial / part)
+        if part == "state":
+            out |= {f"state_{key}": value for key, value in asdict(StatePace.of(fit, spent)).items()}
         else:
-            spent = train(fit, trial / part)
             out[f"{part}_speed"] = fit.steps * fit.batch / (spent["data_seconds"] + spent["compute_seconds"])
     if leads():
         shutil.rmtree(trial)
