@@ -38,7 +38,7 @@ def clean_ending() -> Iterator[None]:
             signal.signal(number, end)
     try:
         yield
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # Ray makes of the end another one, with status 1
         if received:
             leave(received, error)
         raise
@@ -80,7 +80,7 @@ def deferred_signals() -> Iterator[Callable[[], int]]:
         leave(received)
 
 
-def leave(number: int, cause: Exception | None = None) -> NoReturn:
+def leave(number: int, cause: BaseException | None = None) -> NoReturn:
     """End as the signal asks, with the exit status that shells expect of it."""
     if number == signal.SIGINT:
         raise KeyboardInterrupt from cause

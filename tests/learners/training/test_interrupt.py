@@ -59,6 +59,21 @@ def test_a_signal_that_a_library_turned_into_its_own_error_ends_the_command(
 
 
 @pytest.mark.parametrize(("number", "end"), ENDS)
+def test_a_signal_that_a_library_turned_into_another_end_has_the_status_that_shells_expect(
+    number: signal.Signals, end: type[BaseException]
+) -> None:
+    with pytest.raises(end) as ended, clean_ending():
+        try:
+            os.kill(os.getpid(), number)
+            time.sleep(1)
+        except (KeyboardInterrupt, SystemExit):
+            sys.exit(1)  # as Ray does while a driver waits
+    assert getattr(ended.value, "code", 143) == 143
+    with pytest.raises(SystemExit, match="2"), clean_ending():
+        sys.exit(2)
+
+
+@pytest.mark.parametrize(("number", "end"), ENDS)
 def test_a_signal_after_the_last_question_is_answered_too(
     number: signal.Signals, end: type[BaseException]
 ) -> None:
