@@ -21,6 +21,7 @@ from typing import Any, TypeVar, get_type_hints
 T = TypeVar("T")
 TARGET = "_target_"
 ROOMS = ("envs", "actors", "learners", "pipeline")  # packages of this repository
+_signature = lru_cache(inspect.signature)  # each section of each config asks for its class's
 _PLAIN = (TypeError, ValueError, ImportError, OSError)  # whose texts are sentences; a KeyError's is the key
 
 
@@ -138,7 +139,7 @@ def section_faults(section: Mapping[str, Any], key: str, around: Iterable[str] =
 def unknown_names(kind: Callable[..., Any], given: Iterable[str], name: str, key: str) -> list[str]:
     """A sentence for each option that a class does not take."""
     try:
-        parameters = inspect.signature(kind).parameters
+        parameters = _signature(kind).parameters
     except (TypeError, ValueError):  # built in C
         return []
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
@@ -277,14 +278,13 @@ def _check_names(
 ) -> None:
     """Refuse options that `factory` does not take, and missing ones, by name."""
     try:
-        parameters = inspect.signature(factory).parameters
+        parameters = _signature(factory).parameters
     except (TypeError, ValueError):  # built in C
         return
     kinds = {parameter.kind for parameter in parameters.values()}
     known = [k for k in parameters if k not in context]
     if inspect.Parameter.VAR_KEYWORD not in kinds:
-        alien = sorted(context.keys() - parameters.keys())
-        if alien:
+        if alien := sorted(context.keys() - parameters.keys()):
             raise ConfigError(
                 f"{key}.{TARGET}={name} takes no argument {alien[0]!r}, which every {key} is given;"
                 " wrap it in a class that does"

@@ -68,14 +68,24 @@ def test_a_student_of_few_steps(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "choices", [(), ("policy=chunk_tokens", "algorithm=grpo", "simulator=dit_small", "judge=embedding")]
+    "choices",
+    [
+        (),
+        (
+            "policy=chunk_tokens",
+            "algorithm=grpo",
+            "algorithm.group=2",
+            "simulator=dit_small",
+            "judge=embedding",
+        ),
+    ],
 )
 def test_a_round_of_the_loop(
     choices: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    small = ("task.size=[32,32]", "task.suite.cameras=[head]", "launch.device=cpu", "launch.workers=2")
-    cfg = load_config(["experiment=smoke", f"runs={tmp_path}", *small, *choices])
-    graph = build_loop(cfg, tmp_path / "smoke")
+    small = ("task.suite.cameras=[head]", "launch.device=cpu", "launch.workers=2")
+    cfg = load_config(["experiment=soak", f"runs={tmp_path}", *small, *choices])
+    graph = build_loop(cfg, tmp_path / "soak")
     with second_device(monkeypatch):
         made = graph.run("gap-1") | graph.run("rl-1")
     assert made["rl-1"]["result"]["episodes"] > 0 and made["gap-1"]["result"]["imagined"]["episodes"] > 0

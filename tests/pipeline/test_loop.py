@@ -60,7 +60,7 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_no_learned_weight_knows_privileged_columns(tmp_path: Path) -> None:
     """Collect, deploy, overwrite every privileged column with noise, and learn everything again."""
-    cfg = load_config(["experiment=smoke", "rounds.count=1", "track=disabled"])
+    cfg = load_config(["experiment=soak", "track=disabled"])
     prepare_process(cfg["seed"], cfg["threads"])  # as the command line does, before any thread is started
     true = build_loop(cfg, tmp_path / "true")
     true.run("rl-1")
