@@ -146,6 +146,8 @@ def _of_chosen(
     """
     for group, by_choice in section.items():
         if group not in chosen:
+            if group in groups():  # a section of one's own stands there: ~task +task={...}
+                continue
             raise ConfigError(f"{IF_CHOSEN}.{group} is no group of choices{nearest(group, groups())}")
         for name in by_choice:
             if name != chosen[group] and not offered(group, name, overrides):

@@ -14,15 +14,10 @@ from tests.envs.episodes.lerobot_sets import FakeSet, write_set
 
 POSE = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
 SMALL = (
-    "experiment=smoke",
+    "experiment=soak",
     "track=disabled",
-    "rounds.count=1",
-    "evaluate.episodes=10",
-    "evaluate.envs=10",
-    "measure.starts=8",
     "collect.episodes={train: 16, held_out: 6, calibration: 6}",
     "imitation.demos=2",
-    "rl.envs=8",
 )
 
 
@@ -30,18 +25,19 @@ def loop(command: str, folder: Path, *words: str) -> None:
     """Run a command of the loop in a process of its own: `run`, or `rl` up to the last policy."""
     out = worldloop(folder, command, *SMALL, f"runs={folder}", *words)
     assert out.status == 0, out.output[-4000:]
-    assert list((folder / "smoke/stages").glob("rl-1-*/weights.safetensors"))
+    assert list((folder / "soak/stages").glob("rl-1-*/weights.safetensors"))
 
 
 def robot_of(folder: Path) -> Embodiment:
     """The robot of what was collected."""
-    (info,) = (folder / "smoke/stages").glob("collect-*/dataset/meta/info.json")
+    (info,) = (folder / "soak/stages").glob("collect-*/dataset/meta/info.json")
     return from_info(json.loads(info.read_text()))
 
 
 @pytest.mark.slow
 def test_two_arms_by_poses_with_calibrated_cameras(tmp_path: Path) -> None:
-    loop("rl", tmp_path, "task=push", "task.chunk=4", "task.horizon=12", "task.size=[48,48]")
+    cameras = "task.suite.cameras=[head,hand_left,hand_right]"
+    loop("rl", tmp_path, "task=push", cameras, "task.chunk=4", "task.horizon=12", "task.size=[48,48]")
     robot = robot_of(tmp_path)
     assert robot.action_dim == 14 and robot.calibrated and len(robot.cameras) == 3
 
@@ -88,7 +84,7 @@ def test_one_arm_from_recordings_with_cameras_of_different_sizes(tmp_path: Path)
         "task.size=[32,32]",
     )
     loop("run", tmp_path, *words, "imitation.sources=['*']")
-    result = json.loads((tmp_path / "smoke/result.json").read_text())
+    result = json.loads((tmp_path / "soak/result.json").read_text())
     assert result["physics_after"] is None and result["imagined_after"]["episodes"] > 0
 
 
