@@ -24,6 +24,8 @@ from envs.specs import CHUNK, LOST, STATE, ActionMode, Rewards, WorldSpec
 from envs.targets import ConfigError
 from tests.envs.physics.sections import Counting, task_section
 
+pytestmark = pytest.mark.slow
+
 COUNTING = {"_target_": "tests.envs.physics.sections.Counting", "fault": ""}
 
 

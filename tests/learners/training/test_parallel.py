@@ -32,6 +32,8 @@ from tests.learners.training.workers import gathered, two
 from tests.moving_square import SIZE
 from tests.sections import section
 
+pytestmark = pytest.mark.slow
+
 STEPS = 8
 
 

@@ -28,6 +28,8 @@ from tests.learners.training.workers import gathered, two
 from tests.moving_square import SIZE
 from tests.sections import section
 
+pytestmark = pytest.mark.slow
+
 Figures = dict[str, list[float]]
 STUDENTS = [f"{engine}-{method}" for engine in stepwise_engines() for method in ("dmd2", "trajectory")]
 UNROLLED = (*stepwise_engines(), "tokens_small", "unet_small")

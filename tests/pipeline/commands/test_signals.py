@@ -18,6 +18,8 @@ from pipeline.chaos import life
 from pipeline.chaos.processes import nothing_left
 from pipeline.cli.main import COMMANDS
 
+pytestmark = pytest.mark.slow
+
 SOAK = ["experiment=soak", "track=disabled"]
 
 

@@ -14,6 +14,8 @@ from envs.targets import ConfigError
 from pipeline.study.plan import Study, plan_study
 from pipeline.study.run import run_study
 
+pytestmark = pytest.mark.slow
+
 SOAK = ("experiment=soak", "track=disabled", "launch.workers=1", "cameras=main", "study.seeds=[0]")
 
 
