@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -106,6 +108,28 @@ class OddSeed(Counting):
         super().step(action)
         if self.count == 9_000_001:
             raise RuntimeError("the bench is on fire")
+
+
+class Hanging(Counting):
+    """Counts, and hangs at the first action above 1 of all its processes, which leaves the file `once`."""
+
+    def __init__(self, once: str):
+        super().__init__("")
+        self.once = Path(once)
+
+    def step(self, action: Array) -> None:
+        super().step(action)
+        if action[0] > 1 and not self.once.exists():
+            self.once.touch()
+            time.sleep(600)
+
+
+class Slow(Counting):
+    """Counts, a step in 1.2 s."""
+
+    def step(self, action: Array) -> None:
+        super().step(action)
+        time.sleep(1.2)
 
 
 class Startless(Counting):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from actors.rollouts.evaluate import evaluate
 from envs.physics import process
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import PoolError, TaskPool
-from envs.physics.suite import Array, build_suite
+from envs.physics.suite import build_suite
 from envs.physics.worker import Worker, WorkerSpec
 from envs.specs import CHUNK, LOST, STATE, ActionMode, Rewards, WorldSpec
 from envs.targets import ConfigError
@@ -26,7 +25,8 @@ from tests.envs.physics.sections import Counting, task_section
 
 pytestmark = pytest.mark.slow
 
-COUNTING = {"_target_": "tests.envs.physics.sections.Counting", "fault": ""}
+SUITES = "tests.envs.physics.sections"
+COUNTING = {"_target_": f"{SUITES}.Counting", "fault": ""}
 
 
 def pool_of(slots: int, workers: int, **changes: Any) -> TaskPool:
@@ -167,24 +167,10 @@ def test_an_error_of_the_suite_counts_like_a_crash_and_is_told(
     pool.close()
 
 
-class Hanging(Counting):
-    """Counts, and hangs at the first action above 1 of all its processes, which leaves the file `once`."""
-
-    def __init__(self, once: str):
-        super().__init__("")
-        self.once = Path(once)
-
-    def step(self, action: Array) -> None:
-        super().step(action)
-        if action[0] > 1 and not self.once.exists():
-            self.once.touch()
-            time.sleep(600)
-
-
 def test_a_worker_that_hangs_counts_like_one_that_died(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    suite = {"_target_": f"{__name__}.Hanging", "once": str(tmp_path / "once")}
+    suite = {"_target_": f"{SUITES}.Hanging", "once": str(tmp_path / "once")}
     pool = TaskPool(suite, "count", 2, 8, 2)
     monkeypatch.setattr(process, "PATIENCE", 8.0)
     tracks = pool.script([(seed, float(seed == 2)) for seed in range(4)], 1)
@@ -193,16 +179,10 @@ def test_a_worker_that_hangs_counts_like_one_that_died(
     pool.close()
 
 
-class Slow(Counting):
-    def step(self, action: Array) -> None:
-        super().step(action)
-        time.sleep(1.2)
-
-
 def test_a_worker_that_is_slow_does_not_hang(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    pool = TaskPool({"_target_": f"{__name__}.Slow", "fault": ""}, "count", 2, 8, 2)
+    pool = TaskPool({"_target_": f"{SUITES}.Slow", "fault": ""}, "count", 2, 8, 2)
     monkeypatch.setattr(process, "PATIENCE", 8.0)  # less than an episode takes
     tracks = pool.script([(seed, 0.0) for seed in range(2)], 1)
     assert [len(track) for track in tracks] == [9, 9] and not caplog.text
