@@ -39,6 +39,7 @@ _SECTIONS = {
     "collect": learning.CollectSection,
     "imitation": learning.ImitationSection,
     "explore": learning.ExploreSection,
+    "worth": learning.WorthSection,
     "rounds": learning.RoundsSection,
     "extra_starts": learning.ExtraStartsSection,
     "clone": learning.CloneSection,

@@ -22,6 +22,7 @@ from pipeline.stages import collect, imitation, keep, pace, prove, rl, show, wor
 from pipeline.stages.given import imagined_chunks
 from pipeline.stages.judging import stage as judging
 from pipeline.stages.measured import explore
+from pipeline.stages.measured import worth as measured_worth
 
 Cfg = Mapping[str, Any]
 T = TypeVar("T")
@@ -250,11 +251,16 @@ def _learn(
     starts: list[str],
     known: str,
 ) -> str:
-    """RL in the imagined world; `known` says how good the policy is, "" if it was not deployed."""
+    """RL in the imagined world, of which it is measured first what it is worth where there are episodes of
+    deployed policies; `known` says how good the policy is, "" if it was not deployed.
+    """
+    inputs, worth = {"data": data, **made.roles(), "policy": policy}, ""
+    if known and cfg["worth"]["moments"] and cfg["rl"]["imagined"]:
+        worth = graph.add(f"worth-{number}", measured_worth.worth, inputs, number=number)
     return graph.add(
         f"rl-{number}",
         rl.rl,
-        {"data": data, "starts": starts, **made.roles(), "policy": policy, "known": known},
+        {**inputs, "starts": starts, "known": known, "worth": worth},
         number=number,
         iterations=of_round(cfg["rounds"]["iterations"], number),
     )

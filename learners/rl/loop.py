@@ -31,7 +31,7 @@ from learners.rl.alarms import Alarms
 from learners.rl.algorithm import Algorithm, RLConfig, episode_counts, within
 from learners.rl.feed import AsyncFeed, Feed
 from learners.rl.film import film_rollouts
-from learners.rl.recorded import TrueExperience
+from learners.rl.recorded.decisions import TrueExperience
 from learners.rl.starts import Starts
 from learners.rl.update import update
 from learners.rl.watch import Watch

@@ -127,7 +127,7 @@ class PPO:
         self.gae(batch)
 
     def warm_up(self, rollout: TensorDict, seed: int, minibatch: int = 256) -> tuple[TensorDict, float]:
-        """Let the critic learn from a rollout [N, T] of learners.rl.dataset_rollout.
+        """Let the critic learn from a rollout [N, T] of learners.rl.recorded.rollout.
 
         A critic that begins from nothing spoils the first iterations.
 

@@ -35,3 +35,13 @@ class Starts:
         seeds = batch[EPISODE][:, 0, 0]
         begun = (seeds % self.count if self.count else seeds).unflatten(0, (-1, size))
         assert bool((begun == begun[:, :1]).all()), "a group holds different starts"
+
+
+def weighed(pool: Sequence[int], worth: Sequence[float]) -> list[int]:
+    """Numbers of start frames, each as often as makes its share of them all grow with its worth, in steps of
+    an eighth of the largest; as they are where all are worth the same.
+    """
+    most = max(worth, default=0.0)
+    if most == min(worth, default=0.0):
+        return list(pool)
+    return [start for start, value in zip(pool, worth, strict=True) for _ in range(round(8 * value / most))]

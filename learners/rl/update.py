@@ -14,7 +14,7 @@ from actors.policies.contract import device_of
 from envs.rng import order_generator, step_generator
 from envs.specs import SUCCESS
 from learners.rl.algorithm import Algorithm, RLConfig, finite, first_episode, judged, whole
-from learners.rl.recorded import TrueExperience
+from learners.rl.recorded.decisions import TrueExperience
 from learners.training.fit import TrainingDiverged
 from learners.training.parallel import Trainee, averaged, clip_gradients, my_share
 

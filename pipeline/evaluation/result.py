@@ -27,12 +27,13 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
             physics_after.
 
     Returns:
-        name, seed, simulator, algorithm, verdict; physics_before and physics_after (rate entries) with paired
-        (McNemar), None without physics; imagined_before, imagined_after; judge, rollout, frames_per_second
-        (see the measure stage); tasks (the same rates by task, {} if there is one); scenes (the same rates of
-        each task in each scene that occurs, [] if there is one); exploration (see the explore stage;
-        None without it); rounds (gaps); episodes used and held out; seconds per stage; training (see
-        `_training`); what the judge has cost (stages/judging/cost.py), {} if it is free; alarms.
+        name, seed, simulator, algorithm, verdict; physics_before and physics_after (rate entries) with
+        paired (McNemar), None without physics; imagined_before, imagined_after; judge, rollout,
+        frames_per_second (see the measure stage); tasks (the same rates by task, {} if there is one);
+        scenes (the same rates of each task in each scene that occurs, [] if there is one); exploration (see
+        the explore stage; None without it); rounds (gaps); worth (see its stage), by round; episodes used
+        and held out; seconds per stage; training (see `_training`); what the judge has cost
+        (stages/judging/cost.py), {} if it is free; alarms.
     """
     finished = manifests(inputs)
     imagined, measured = (result_of(inputs.folder(role)) for role in ("imagined", "measured"))
@@ -61,6 +62,7 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         "scenes": _scenes(cfg, inputs, imagined),
         "exploration": finished["explore"]["result"] if "explore" in finished else None,
         "rounds": [entry["result"] for name, entry in finished.items() if name.startswith("gap-")],
+        "worth": [entry["result"] for name, entry in finished.items() if name.startswith("worth-")],
         "episodes_used": sum(entry["episodes"] - entry.get("held_out", 0) for entry in gathered),
         "episodes_held_out": sum(entry.get("held_out", 0) for entry in gathered),
         "imagined_episodes_used": [entry["result"]["episodes"] for entry in learned],

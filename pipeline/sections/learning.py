@@ -85,6 +85,13 @@ class ExploreSection:
 
 
 @dataclass(frozen=True)
+class WorthSection:
+    """Section worth."""
+
+    moments: Natural
+
+
+@dataclass(frozen=True)
 class RoundsSection:
     """Section rounds."""
 

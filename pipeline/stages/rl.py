@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,7 @@ from torch import Tensor
 
 from actors.factory import (
     build_algorithm,
-    build_judge,
     build_policy,
-    build_simulator,
-    build_state_decoder,
     open_clips,
 )
 from actors.fleets.fleet import Fleet, FleetError
@@ -26,18 +24,18 @@ from actors.world_config import rewards_of
 from envs.episodes.clips import ClipStore
 from envs.episodes.key_frames import key_points
 from envs.initial_states import decision_points, shared_out
-from envs.judges.base import Judge
+from envs.manifest import read_manifest
 from envs.rng import Purpose, episode_seeds
-from envs.simulators.features import features_of_chunks, features_of_episodes
 from envs.specs import CHUNK
 from envs.targets import target
 from learners.rl.algorithm import Algorithm, RLConfig
-from learners.rl.dataset_rollout import dataset_rollout
 from learners.rl.loop import train_rl
-from learners.rl.recorded import RecordedDecisions, TrueExperience
-from learners.rl.starts import Starts
+from learners.rl.recorded.decisions import RecordedDecisions, TrueExperience
+from learners.rl.recorded.rollout import dataset_rollout
+from learners.rl.starts import Starts, weighed
 from learners.stages.imitation import Cloning
 from learners.training.parallel import leads
+from pipeline.evaluation.by_task import tasks_of_episodes
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.graph.view import ConfigView
@@ -56,6 +54,7 @@ from pipeline.stages.given import (
     successful_episodes,
 )
 from pipeline.stages.judging.cost import priced
+from pipeline.stages.judging.recordings import judge_of_recordings
 from pipeline.stages.trials import true_success
 
 LEARNING = ("policy", "algorithm", "rl", "imitation", "microbatches")
@@ -90,7 +89,8 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     algorithm = build_algorithm(cfg, policy)
     inside = None if settings.starts == "first" else newest_episodes(store, inputs, learning_episodes(store))
     data, more = (datasets(inputs.folders(role)) for role in ("data", "starts"))
-    extra = range(len(store), len(store) + (len(open_clips(cfg, more)) if more else 0))
+    beyond = open_clips(cfg, more) if more else None
+    extra = range(len(store), len(store) + (0 if beyond is None else len(beyond)))
     knew, decisions = _warm_up(cfg, inputs, policy, algorithm, store, settings.seed)
     recipe = Recipe(
         config=cfg.plain(),
@@ -110,6 +110,11 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     fleet = build_fleet(recipe) if leads() else None
     try:
         starts = starts_of(cfg, *_begun(store, inside, settings.starts == "key"), len(extra))
+        if worth := worth_in(inputs):
+            starts, mean = by_worth(starts, _tasks_of_starts(cfg, store, inside, beyond), worth)
+            if decisions is not None and settings.recorded:
+                settings = replace(settings, imagined=settings.imagined * mean)
+            knew["imagined_weight"] = settings.imagined
         true = TrueExperience(anchor, decisions)
         watch = true_success(cfg, settings, inputs.weights("policy"))
         stats = train_rl(fleet, policy, algorithm, settings, folder, starts, true=true, watch=watch)
@@ -140,6 +145,39 @@ def starts_of(cfg: Cfg, begun: int, chosen: Sequence[int], extra: int) -> Starts
     share, shared = cfg["extra_starts"]["share"], cfg["simulator"]["shared_noise"]
     pool = shared_out(chosen, range(begun, begun + extra), share) if extra else chosen
     return Starts(pool, 0 if shared else begun + extra)
+
+
+def worth_in(inputs: Inputs) -> dict[str, float]:
+    """What imagined returns are worth by task, as the role `worth` has measured it; {} if nobody plays it."""
+    if "worth" not in inputs.found:
+        return {}
+    manifest = read_manifest(inputs.folder("worth"))
+    assert manifest is not None, "a role is played by finished stages"
+    return {task: float(one["value"]) for task, one in manifest["result"]["worth"].items()}
+
+
+def by_worth(starts: Starts, tasks: Sequence[str], worth: Mapping[str, float]) -> tuple[Starts, float]:
+    """Starts of which each task has a share as its imagined decisions are worth, and their mean worth, which
+    weighs them all beside recorded ones: together each task's decisions weigh what they are worth.
+
+    Args:
+        tasks: of all start numbers.
+        worth: by task; one that was not measured is worth the mean of the others.
+    """
+    mean = sum(worth.values()) / len(worth)
+    each = [worth.get(tasks[start], mean) for start in starts.pool]
+    return replace(starts, pool=weighed(starts.pool, each)), sum(each) / len(each)
+
+
+def _tasks_of_starts(
+    cfg: Cfg, store: ClipStore, inside: Tensor | None, beyond: ClipStore | None
+) -> list[str]:
+    """The task of each start number: of moments or episodes, then of the first frames beyond."""
+    every = torch.arange(len(store)) if inside is None else inside
+    tasks = dict(zip(every.tolist(), tasks_of_episodes(cfg, store, every), strict=True))
+    begun = every if inside is None else decision_points(store, inside)[0]
+    more = [] if beyond is None else tasks_of_episodes(cfg, beyond, torch.arange(len(beyond)))
+    return [*(tasks[number] for number in begun.tolist()), *more]
 
 
 def what_the_judge_needs(cfg: Cfg, fleet: Fleet | None) -> str:
@@ -173,7 +211,7 @@ def _warm_up(
         return {}, None
     rewards, judge, features = rewards_of(cfg), None, None
     if rewards.progress:  # to some judges every question costs
-        judge, features = _judge_of_recordings(cfg, inputs, store, past)
+        judge, features = judge_of_recordings(cfg, inputs, store, past)
     rollout = dataset_rollout(policy, store, past, rewards, judge, features)
     rollout, knew = algorithm.warm_up(rollout, seed)
     if action_key(policy) != CHUNK:
@@ -181,22 +219,6 @@ def _warm_up(
     decisions = RecordedDecisions(policy, store, rollout, mode_of(cfg))
     figures = {"critic_knew": knew, "recorded_decisions": float(len(decisions))}
     return figures, decisions if len(decisions) else None
-
-
-def _judge_of_recordings(
-    cfg: Cfg, inputs: Inputs, store: ClipStore, episodes: Tensor
-) -> tuple[Judge, Tensor | None]:
-    """The judge that rewards imagined episodes, and the features that it reads of recorded ones, if any; see
-    dataset_rollout.
-    """
-    judge = build_judge(cfg, inputs.weights("judge")).eval()
-    if not judge.reads_features:
-        return judge, None
-    simulator, bf16 = build_simulator(cfg, inputs.weights("simulator")), cfg["simulator"]["bf16"]
-    build_state_decoder(cfg, simulator, inputs.weights("state"))  # it may mix the simulator's features
-    begin = torch.zeros_like(episodes)
-    still = features_of_chunks(simulator, store, episodes, begin, bf16, still=True)
-    return judge, torch.cat((still[:, None], features_of_episodes(simulator, store, episodes, bf16)), 1)
 
 
 @stage(reads=(*PHYSICS, *LEARNING))

@@ -40,7 +40,7 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     table = worldloop(tmp_path, "compare", str(run), str(run)).output
     assert "| algorithm; seed | PPO; 0 | PPO; 0 |" in table
     again = worldloop(tmp_path, "run", *words)
-    assert again.output.count("is finished, reused") == 25
+    assert again.output.count("is finished, reused") == 27
     one = worldloop(tmp_path, "controls", *words, "controls.only=[filtered_bc]")
     assert one.status == 0, one.output[-3000:]
     assert set(json.loads((run / "controls.json").read_text())) == {"before", "loop", "filtered BC"}

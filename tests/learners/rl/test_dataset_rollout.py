@@ -13,7 +13,7 @@ from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge, Judgement
 from envs.specs import IMAGE, Rewards, Status
 from envs.targets import build
-from learners.rl.dataset_rollout import dataset_rollout
+from learners.rl.recorded.rollout import dataset_rollout
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS
 from tests.sections import section
 

@@ -22,8 +22,8 @@ from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
 from envs.specs import C2W, CHUNK, COMMAND, IMAGE, INTRINSIC, LOG_PROB, STATE, ActionMode, Rewards
 from learners.rl.algorithm import Algorithm
-from learners.rl.dataset_rollout import dataset_rollout
-from learners.rl.recorded import RecordedDecisions, TrueExperience
+from learners.rl.recorded.decisions import RecordedDecisions, TrueExperience
+from learners.rl.recorded.rollout import dataset_rollout
 from learners.rl.update import update
 from learners.stages.imitation import chunks_ahead
 from learners.stages.observed import observe

@@ -49,13 +49,36 @@ def dataset_rollout(
     Raises:
         ValueError: if nobody said whether an episode succeeded.
     """
+    paid = paid_decisions(store, episodes, rewards, judge, features)
+    seen = _observed(policy, store, paid["row"])
+    out = seen[:, :-1].copy()
+    out["row"], out["valid"], out["whole"] = paid["row"][:, :-1], paid["valid"], paid["whole"]
+    out["next"] = seen[:, 1:].copy()
+    for key in ("reward", "done", "terminated"):
+        out["next", key] = paid[key][..., None]
+    return out
+
+
+def paid_decisions(
+    store: ClipStore,
+    episodes: torch.Tensor,
+    rewards: Rewards,
+    judge: Judge | None = None,
+    features: torch.Tensor | None = None,
+) -> dict[str, torch.Tensor]:
+    """What was paid for the decisions of recorded episodes; arguments and errors are dataset_rollout's.
+
+    Returns:
+        By name: row int64 [N, T + 1], of each decision's frame and of the last one's outcome; progress
+        float32 [N, T], that the judge sees there; reward float32 [N, T]; done, terminated, valid and
+        whole bool [N, T].
+    """
     if not bool(store.arrays["labelled"][episodes].all()):
         raise ValueError("a critic learns from episodes that were labelled with success; choose those")
     chunk, last = store.spec.chunk, store.length[episodes] - 1
     steps = int((last.max() + chunk - 1) // chunk)
     at = torch.minimum(torch.arange(steps + 1) * chunk, last[:, None])  # past the end the last frame stays
     rows = store.start[episodes][:, None] + at
-    seen = _observed(policy, store, rows)
     over = at[:, 1:] == last[:, None]
     won = (store.arrays["success"][rows[:, 1:]] > 0.5) & over
     progress = torch.zeros(at.shape)
@@ -63,13 +86,15 @@ def dataset_rollout(
     if judge is not None and rewards.progress:
         progress = _seen_progress(judge, store, episodes, at, features)
         after = torch.where(won, 1.0, progress[:, 1:])
-    out = seen[:, :-1].copy()
-    out["row"], out["valid"] = rows[:, :-1], at[:, :-1] < last[:, None]
-    out["whole"] = at[:, :-1] + chunk <= last[:, None]
-    out["next"] = seen[:, 1:].copy()
-    out["next", "reward"] = rewards(progress[:, :-1, None], after[..., None], won[..., None])
-    out["next", "done"], out["next", "terminated"] = over[..., None], won[..., None]
-    return out
+    return {
+        "row": rows,
+        "progress": progress[:, :-1],
+        "reward": rewards(progress[:, :-1, None], after[..., None], won[..., None]).squeeze(-1),
+        "done": over,
+        "terminated": won,
+        "valid": at[:, :-1] < last[:, None],
+        "whole": at[:, :-1] + chunk <= last[:, None],
+    }
 
 
 def _seen_progress(

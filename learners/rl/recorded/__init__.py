@@ -1,0 +1,1 @@
+"""What recordings of physics say, where reinforcement learning learns in imagination."""
