@@ -8,6 +8,7 @@ from __future__ import annotations
 import atexit
 import os
 import re
+import select
 import signal
 import sys
 import textwrap
@@ -38,6 +39,7 @@ COMMANDS: dict[str, Callable[[Words], None]] = {
 }
 # commands whose words are their own, none of configs/
 _NO_KEYS = ("compare", "convert", "inspect", "verify", "tasks", "doctor", "completion")
+_STDOUT = 1  # its file descriptor
 
 
 def _help() -> str:
@@ -89,9 +91,32 @@ def _find_modules_here() -> None:
 
 
 def main() -> None:
-    """Entry point of `worldloop` and `python -m pipeline`."""
+    """Entry point of `worldloop` and `python -m pipeline`. Where nobody reads its output any more, as of
+    `worldloop --help | head -1`, it ends as SIGPIPE would end it, with 141 and without a word.
+    """
     _find_modules_here()
-    words = sys.argv[1:]
+    try:
+        _command(sys.argv[1:])
+        print(end="", flush=True)  # here, where it can be caught, and not as Python ends
+    except BaseException as error:
+        if not _unread():
+            raise
+        # Python flushes once more as it ends: what is left goes nowhere, without an error.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), _STDOUT)
+        if not isinstance(error, BrokenPipeError):
+            raise
+        sys.exit(128 + signal.SIGPIPE)
+
+
+def _unread() -> bool:
+    """Whether stdout is a pipe, or a socket, whose other end was closed."""
+    poll = select.poll()
+    poll.register(_STDOUT, 0)  # errors are always told
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
+
+
+def _command(words: Words) -> None:
+    """Answer, or run the command that words begin with."""
     if words[:1] == ["help"] and words[1:] and words[1] in COMMANDS:
         words = [words[1], "--help"]
     if not words or words[0] in ("-h", "--help", "help"):
@@ -117,7 +142,7 @@ def main() -> None:
         print("\ninterrupted; the same command goes on from the last checkpoint", file=sys.stderr)
         sys.exit(130)
     except Exception as error:
-        if not _explained(error):
+        if not _explained(error) or (isinstance(error, BrokenPipeError) and _unread()):
             raise
         print(f"worldloop {words[0]}: {error}", file=sys.stderr)
         sys.exit(1)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
+import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -38,9 +41,47 @@ def worldloop(*words: str) -> Answer:
     return subprocess.CompletedProcess(list(words), status, out.getvalue(), err.getvalue())
 
 
+def unread(*words: str) -> tuple[int, str]:
+    """Exit status and stderr of `python -m pipeline <words>` whose stdout nobody reads."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as nobody:
+        out = subprocess.run(
+            [sys.executable, "-m", "pipeline", *words],
+            cwd=ROOT,
+            stdout=nobody,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    return out.returncode, out.stderr
+
+
 def test_help_lists_the_commands() -> None:
     out = process("--help")
     assert out.returncode == 0 and "doctor" in out.stdout and "controls" in out.stdout
+
+
+@pytest.mark.parametrize("words", [[], ["--help"], ["doctor", "--help"], ["stages", "experiment=smoke"]])
+def test_a_reader_that_goes_ends_a_command_without_a_word(words: list[str]) -> None:
+    assert unread(*words) == (128 + signal.SIGPIPE, "")
+
+
+def test_of_an_end_with_nobody_to_read_output_the_mistake_is_told() -> None:
+    status, said = unread("nonsense")
+    assert status == 2 and said.startswith("no command 'nonsense'") and said.count("\n") == 1
+
+
+def test_a_broken_pipe_that_is_not_stdout_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def ask(words: list[str]) -> None:
+        one, other = socket.socketpair()
+        with one, other:
+            other.close()
+            one.send(b"to nobody")
+
+    monkeypatch.setitem(COMMANDS, "doctor", ask)
+    out = worldloop("doctor")
+    assert out.returncode == 1 and out.stderr == "worldloop doctor: [Errno 32] Broken pipe\n"
 
 
 def test_what_needs_no_learning_is_answered_without_loading_torch() -> None:
