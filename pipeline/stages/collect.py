@@ -22,7 +22,6 @@ from envs.episodes.clips import ClipStore
 from envs.episodes.episode import Episode
 from envs.episodes.filming import side_by_side, write_film
 from envs.episodes.formats.lerobot import LeRobotDataset
-from envs.episodes.formats.lerobot_columns import SEED
 from envs.episodes.formats.lerobot_writer import LeRobotWriter
 from envs.episodes.splits import write_splits
 from envs.episodes.write_behind import WriteBehind
@@ -87,9 +86,7 @@ def collect(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 def _recorded_seeds(writer: LeRobotWriter) -> list[int]:
     """Seeds of the episodes that are written, in their order."""
-    if not writer.shards:
-        return []
-    return list(dict.fromkeys(LeRobotDataset(writer.root).column(SEED).flatten().tolist()))
+    return LeRobotDataset(writer.root).seeds() if writer.shards else []
 
 
 def _next_job(writer: LeRobotWriter, jobs: list[tuple[int, float, str]]) -> int:

@@ -200,6 +200,14 @@ class LeRobotDataset:
             parts.append(column_array(table, name).reshape(len(table), *shape_of(name, self.features)))
         return np.concatenate(parts)
 
+    def seeds(self) -> list[int]:
+        """Seeds of the episodes, in their order.
+
+        Raises:
+            EpisodeError: if nobody recorded them.
+        """
+        return list(dict.fromkeys(self.column(names.SEED).flatten().tolist()))
+
     # -- numbers
     def _table(self, row: dict[str, Any]) -> tuple[pa.Table, Path]:
         """The rows of an episode, without pictures, and the file they are from."""

@@ -6,6 +6,7 @@ longest recordings there are.
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -19,7 +20,9 @@ from actors.factory import build_pool, open_clips
 from actors.world_config import world_spec
 from envs.episodes.clips import ClipStore
 from envs.episodes.episode import Episode
+from envs.episodes.formats.lerobot import LeRobotDataset
 from envs.episodes.formats.lerobot_writer import LeRobotWriter
+from envs.files import write_json
 from envs.judges.perceptual import PerceptualDistance
 from envs.manifest import read_manifest, write_manifest
 from envs.rng import Purpose, episode_seeds
@@ -29,6 +32,7 @@ from pipeline.evaluation.fidelity.frames import by_frame, frame_errors, psnr
 from pipeline.graph.kept import Tensors
 
 Keep = Callable[[list[int], Callable[[], Tensors]], Tensors]
+_DATA, _PLAN = "dataset", "plan.json"
 _TRIES = 4  # scripted episodes for each that is wanted; physics gives some up
 _END = 0.1  # share of an episode's frames that are its end
 _OFFSET = 500_000  # of their seeds among those of evaluation
@@ -43,33 +47,43 @@ def long_episodes(cfg: Mapping[str, Any], folder: Path) -> ClipStore:
 
     Args:
         cfg: the resolved config, with physics.
-        folder: where they are kept.
+        folder: where they are kept, each as soon as it is recorded.
 
     Raises:
         PoolError: if physics gives up too many.
     """
     section, chunk = cfg["fidelity"]["long"], cfg["task"]["chunk"]
     horizon = -(-section["frames"] // chunk) * chunk
-    mine = {"task": dict(cfg["task"]), "long": dict(section)}
+    plan = {"task": dict(cfg["task"]), "long": dict(section)}
     longer = {**cfg, "task": {**cfg["task"], "horizon": horizon}}
     manifest = read_manifest(folder)
-    if manifest is None or manifest["result"] != mine:
+    if manifest is None or manifest["result"] != plan:
+        _record(longer, folder, plan)
+        write_manifest(folder, {"stage": "fidelity-long", "result": plan})
+    return open_clips(longer, [folder / _DATA])
+
+
+def _record(cfg: Mapping[str, Any], folder: Path, plan: Mapping[str, Any]) -> None:
+    """The episodes that are not recorded yet; those of another plan are removed."""
+    planned = folder / _PLAN
+    if not planned.exists() or json.loads(planned.read_text()) != plan:
         shutil.rmtree(folder, ignore_errors=True)
-        robot, wanted = world_spec(longer).embodiment, section["episodes"]
-        seeds = episode_seeds(cfg["seed"], Purpose.EVALUATE, _TRIES * wanted, _OFFSET)
-        pool, kept = build_pool(longer), []
-        try:
-            for begin in range(0, len(seeds), wanted):
-                jobs = [(seed, section["noise_level"]) for seed in seeds[begin : begin + wanted]]
-                kept += pool.script(jobs, None)
-                if len(kept) >= wanted:
-                    break
-        finally:
-            pool.close()
-        episodes = [Episode.from_track(track, "long", robot) for track in kept[:wanted]]
-        LeRobotWriter(folder / "dataset", robot).write(episodes)
-        write_manifest(folder, {"stage": "fidelity-long", "result": mine})
-    return open_clips(longer, [folder / "dataset"])
+        write_json(planned, plan)
+    section, robot = cfg["fidelity"]["long"], world_spec(cfg).embodiment
+    seeds = episode_seeds(cfg["seed"], Purpose.EVALUATE, _TRIES * section["episodes"], _OFFSET)
+    writer = LeRobotWriter(folder / _DATA, robot)
+    if writer.episodes:
+        seeds = seeds[1 + seeds.index(LeRobotDataset(writer.root).seeds()[-1]) :]
+    pool = build_pool(cfg)
+    try:
+        while seeds and (missing := section["episodes"] - writer.episodes):
+            count = min(pool.slots, missing)
+            for track in pool.script([(seed, section["noise_level"]) for seed in seeds[:count]], None):
+                # a shard each, so that videos are the same however many were recorded side by side
+                writer.write([Episode.from_track(track, "long", robot)])
+            seeds = seeds[count:]
+    finally:
+        pool.close()
 
 
 def longest(store: ClipStore, episodes: Tensor, count: int) -> Tensor:

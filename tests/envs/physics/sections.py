@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from envs.embodiment import ActionKind, Camera, Embodiment
 from envs.physics.suite import Array, Expert, Observation, TaskSuite, task_names
 from envs.physics.tabletop.suite import Tabletop
+from envs.targets import ConfigError
 from tests.sections import CONFIGS, offered
 
 
@@ -153,6 +154,23 @@ class Solved(Tabletop):
         if not self.put:
             data.qpos[goal.joint : goal.joint + 2], self.put = goal.target, True
         super().step(action)
+
+
+class Stopped(Solved):
+    """The same, with the seeds that it lays out in a file, a line each; it refuses another while there is a
+    file `stop` beside that, which holds their number.
+    """
+
+    def __init__(self, laid_out: str, **options: Any):
+        super().__init__(**options)
+        self.laid_out = Path(laid_out)
+
+    def reset(self, task: str, seed: int) -> None:
+        super().reset(task, seed)
+        stop, lines = self.laid_out.with_name("stop"), self.laid_out.read_text().split()
+        if stop.exists() and len(lines) == int(stop.read_text()):
+            raise ConfigError("stopped, as asked")
+        self.laid_out.write_text("\n".join([*lines, str(seed)]))
 
 
 def _misbehave(how: str) -> None:

@@ -62,3 +62,22 @@ def test_long_rollouts_go_on_after_success(tmp_path: Path) -> None:
     assert store.length.tolist() == [25, 25]  # whole chunks
     rows = store.start + 5
     assert store.arrays["success"][rows].all()
+
+
+def test_long_rollouts_that_are_recorded_stay_when_recording_is_interrupted(tmp_path: Path) -> None:
+    laid_out, stop = tmp_path / "laid_out", tmp_path / "stop"
+    laid_out.touch()
+    stop.write_text("2")
+    suite = "tests.envs.physics.sections.Stopped"
+    words = [*SMOKE, f"task.suite._target_={suite}", f"+task.suite.laid_out={laid_out}", "cameras=main"]
+    cfg = load_config([*words, "fidelity.long={frames: 5, episodes: 3, noise_level: 1.0}"])
+    with pytest.raises(ConfigError, match="as asked"):
+        long_episodes(cfg, tmp_path / "long")
+    stop.unlink()
+    store = long_episodes(cfg, tmp_path / "long")
+    seeds = [row["seed"] for row in store.episodes]
+    assert [int(seed) for seed in laid_out.read_text().split()] == seeds and len(set(seeds)) == 3
+    begun = long_episodes(cfg, tmp_path / "at once")
+    assert torch.equal(begun.frames(begun.start), store.frames(store.start))
+    other = load_config([*words, "fidelity.long={frames: 5, episodes: 1, noise_level: 0.5}"])
+    assert len(long_episodes(other, tmp_path / "long")) == 1
