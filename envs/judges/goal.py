@@ -64,6 +64,16 @@ class GoalJudge(Judge):
         """
         return frames
 
+    def away(self, frames: Tensor, goals: Tensor) -> Tensor:
+        """Distances float32 [B, T] of frames uint8 [B, T, V, 3, H, W], as goals show them, from goals uint8
+        [B, V, 3, H, W], by the metric, mean over the cameras that are compared.
+        """
+        seen = self.as_goals(frames[:, :, self.chosen])
+        wanted = goals[:, None, self.chosen].expand_as(seen)
+        lead = seen.shape[:3]
+        pairs = zip(seen.flatten(0, 2).split(_AT_ONCE), wanted.flatten(0, 2).split(_AT_ONCE), strict=True)
+        return torch.cat([self.metric(one, other) for one, other in pairs]).unflatten(0, lead).mean(-1)
+
     def done(
         self, frames: Tensor, instruction: list[str], progress: Tensor, features: Tensor | None = None
     ) -> Tensor:
@@ -88,19 +98,9 @@ class GoalJudge(Judge):
         device = self.threshold.device
         frames_here, first_here = frames.to(device), first.to(device)
         goals = self.goals(first_here, instruction)
-        begin = self._away(first_here[:, None], goals.frames).clamp(min=_NEAREST)
-        progress = (1 - self._away(frames_here, goals.frames) / begin).clamp(0, 1)
+        begin = self.away(first_here[:, None], goals.frames).clamp(min=_NEAREST)
+        progress = (1 - self.away(frames_here, goals.frames) / begin).clamp(0, 1)
         success = self.done(frames_here, instruction, progress, features)
         status = judgement_status(success + progress)
         success, status = self.unknown(success, status, goals.known)
         return Judgement(*(part.to(frames.device) for part in (success, progress, status)))
-
-    def _away(self, frames: Tensor, goals: Tensor) -> Tensor:
-        """Distance [B, T] of frames [B, T, V, 3, H, W], as goals show them, from goals [B, V, 3, H, W], mean
-        over the cameras.
-        """
-        seen = self.as_goals(frames[:, :, self.chosen])
-        wanted = goals[:, None, self.chosen].expand_as(seen)
-        lead = seen.shape[:3]
-        pairs = zip(seen.flatten(0, 2).split(_AT_ONCE), wanted.flatten(0, 2).split(_AT_ONCE), strict=True)
-        return torch.cat([self.metric(one, other) for one, other in pairs]).unflatten(0, lead).mean(-1)

@@ -25,5 +25,5 @@ def nearing(judge: GoldenGoalJudge, first: Tensor, instruction: list[str]) -> Te
         noise = torch.randint(0, 256, (batch, _TRIED, *first.shape[1:]), dtype=torch.uint8, generator=g)
         mask = grid.repeat_interleave(_PATCH, -1).repeat_interleave(_PATCH, -2)
         tried = torch.where(mask, noise, best[:, None])
-        best = tried[torch.arange(batch), judge._away(tried, goals).argmin(1)]
+        best = tried[torch.arange(batch), judge.away(tried, goals).argmin(1)]
     return best

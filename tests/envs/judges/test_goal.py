@@ -127,6 +127,16 @@ def test_frames_are_compared_with_a_given_picture_as_they_are(tmp_path: Path) ->
     assert judge.as_goals(frames) is frames
 
 
+def test_away_is_the_mean_distance_of_the_cameras_that_are_compared() -> None:
+    judge, (frames, _) = golden(), episodes()
+    seen = judge.as_goals(frames)
+    goals = seen[:, 0]
+    each = torch.stack([judge.metric(seen[:, 1, view], goals[:, view]) for view in judge.chosen], 1)
+    found = judge.away(frames[:, :2], goals)
+    assert torch.allclose(found, torch.stack((torch.zeros(2), each.mean(1)), 1), atol=1e-6)
+    assert (found[:, 1] > 0).all()
+
+
 def test_other_weights_imagine_other_goals() -> None:
     judge, (_, first) = golden(), episodes()
     before = judge.goals(first, TEXTS).frames
