@@ -26,14 +26,21 @@ class Kept:
     """
 
     def __init__(self, folder: Path):
-        self.folder, self.reused = folder, 0
+        self.folder = folder
+        self._left: dict[Path, bool] = {}  # of each file that was asked for, whether it was there by then
+
+    @property
+    def reused(self) -> int:
+        """How many files were asked for that had been there before, each counted once."""
+        return sum(self._left.values())
 
     def get(self, name: str, identity: Mapping[str, Any], make: Callable[[], Tensors]) -> Tensors:
         """What `make` gave for this identity, now or at some earlier time."""
         key = digest(json.dumps(identity, sort_keys=True, default=str))
         path = self.folder / f"{re.sub(_ODD, '_', name)}-{key}.safetensors"
-        if path.exists():
-            self.reused += 1
+        there = path.exists()
+        self._left.setdefault(path, there)
+        if there:
             return load_file(path)
         made = make()
         with atomic(path) as part:

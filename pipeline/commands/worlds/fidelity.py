@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from pipeline.evaluation.fidelity.end_effector import end_effector_ruler
 from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.fidelity.grid import Settings, combinations, run_grid, with_settings
 from pipeline.evaluation.fidelity.long import drift, long_episodes, longest
-from pipeline.evaluation.fidelity.masks import part_labels
+from pipeline.evaluation.fidelity.masks import part_labels, read_labels
 from pipeline.evaluation.fidelity.open_loop import OpenLoop
 from pipeline.evaluation.fidelity.page import build_page, summary_text
 from pipeline.evaluation.fidelity.strides import by_stride, common_stride
@@ -59,12 +60,17 @@ def fidelity(cfg: Cfg, root: Path) -> str:
     strides = _checked_strides(section["strides"], store, episodes)
     simulator = subject.simulator()
     kept = Kept(root / "fidelity")
-    labels = _labels(cfg, subject, store, episodes, kept)
-    hands = end_effector_ruler(cfg, store, subject.data, root)
     loop = OpenLoop(
-        *(store, episodes, cfg["simulator"]["bf16"], labels, extractors, section["clip"], hands),
+        *(store, episodes, cfg["simulator"]["bf16"], _labels(cfg, subject, store, kept), extractors),
+        clip=section["clip"],
         kept=kept,
         identity={**subject.generated(_MODULE), "by": code_of(_MODULE, _extractor_sections(section))},
+    )
+    masked = _masked(loop)
+    loop = replace(
+        loop,
+        labels=loop.labels if masked else None,
+        hands=end_effector_ruler(cfg, store, subject.data, root),
     )
     place = {int(number): n for n, number in enumerate(episodes)}
     mine = {
@@ -80,7 +86,7 @@ def fidelity(cfg: Cfg, root: Path) -> str:
         "fps": store.fps,
         "perceptual": loop.distance.name,
         **measured,
-        "masks": _masks(section, labels),
+        "masks": {"source": (section["masks"] or "physics") if masked else None, "episodes": masked},
         "still": still.by_frame,
         "still_coded": None if coded is None else coded.by_frame,
         "held": {
@@ -103,20 +109,33 @@ def fidelity(cfg: Cfg, root: Path) -> str:
     return f"{summary_text(result)}\n{page}, {page.with_suffix('.json')}\n{kept.reused} parts were reused"
 
 
-def _labels(cfg: Cfg, subject: Subject, store: ClipStore, episodes: Tensor, kept: Kept) -> Tensor | None:
-    """See masks.part_labels; what physics said is kept, for it says the same of every simulator."""
+def _labels(cfg: Cfg, subject: Subject, store: ClipStore, kept: Kept) -> Callable[[Tensor], Tensor] | None:
+    """See OpenLoop; what physics says is kept, for it says the same of every simulator."""
     masks = cfg["fidelity"]["masks"]
-    if masks is not None or not has_physics(cfg):
-        return part_labels(cfg, store, episodes, masks)
-
-    def asked() -> Tensors:
-        found = part_labels(cfg, store, episodes, None)
-        return {} if found is None else {"labels": found}
-
+    if masks is not None:
+        return partial(read_labels, Path(masks), store)
+    if not has_physics(cfg):
+        return None
     suite = {"suite": cfg["task"]["suite"]}
     code = code_of(part_labels.__module__, suite)
-    about = {"data": subject.data_mark(), "size": list(store.spec.size), "episodes": episodes.tolist()}
-    return kept.get("labels", {**about, **suite, "code": code}, asked).get("labels")
+    about = {"data": subject.data_mark(), "size": list(store.spec.size), **suite, "code": code}
+
+    def told(episodes: Tensor) -> Tensor:
+        def asked() -> Tensors:
+            return {"labels": part_labels(cfg, store, episodes)}
+
+        identity = {**about, "episodes": episodes.tolist()}
+        return kept.get(f"labels-{int(episodes[0])}", identity, asked)["labels"]
+
+    return told
+
+
+def _masked(loop: OpenLoop) -> int:
+    """Of how many episodes there are masks; what is wrong with a file of them is told here."""
+    if loop.labels is None:
+        return 0
+    parts = (loop.labels(loop.episodes[some]) for some in loop.batches())
+    return sum(int((labels != 255).flatten(1).any(1).sum()) for labels in parts)
 
 
 def build_extractors(section: Mapping[str, Any]) -> list[Extractor]:
@@ -145,14 +164,6 @@ def build_extractors(section: Mapping[str, Any]) -> list[Extractor]:
 
 def _extractor_sections(section: Mapping[str, Any]) -> dict[str, Any]:
     return {key: section[key] for key in ("frames_extractor", "clips_extractor")}
-
-
-def _masks(section: Mapping[str, Any], labels: Tensor | None) -> dict[str, Any]:
-    """Where masks came from, and of how many episodes there are any."""
-    if labels is None:
-        return {"source": None, "episodes": 0}
-    known = int((labels != 255).flatten(1).any(1).sum())
-    return {"source": section["masks"] or "physics", "episodes": known}
 
 
 def _checked_strides(strides: Sequence[int], store: ClipStore, episodes: Tensor) -> list[int]:

@@ -30,31 +30,52 @@ _CLEARLY = 40  # grey levels; encoding changes hardly a pixel by so much
 _START, _END = 0.002, 0.02
 
 
-def part_labels(
-    cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor, path: str | None
-) -> Tensor | None:
-    """Labels uint8 [N, T, V, H, W] (envs.physics.render.PARTS) of all frames but the first of some episodes,
-    as ClipStore.whole counts them; 255 where nothing is known.
+def part_labels(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor) -> Tensor:
+    """Labels uint8 [N, T, V, H, W] (envs.physics.render.PARTS) of all frames but the first of N episodes
+    int64, as ClipStore.whole counts them; 255 where nothing is known.
 
-    With physics, episodes are repeated from their recorded seeds by their recorded commands. One that begins
-    with things elsewhere (or, where nobody recorded where they were, looks otherwise) or looks otherwise in
-    the end is not measured.
+    Physics repeats episodes from their recorded seeds by their recorded commands. One that begins with things
+    elsewhere (or, where nobody recorded where they were, looks otherwise) or looks otherwise in the end is
+    not measured.
 
-    Args:
-        path: an .npz file, see `read_labels`; None asks physics.
-
-    Returns:
-        None if nobody knows.
+    Raises:
+        ConfigError: if pictures are of another size than physics renders.
     """
-    if path is not None:
-        return read_labels(Path(path), store, episodes)
-    if not cfg["task"].get("suite"):
-        return None
-    return _repeated(cfg, store, episodes)
+    size = tuple(world_spec(cfg).embodiment.cameras[0].size)
+    if size != tuple(store.spec.size):
+        raise ConfigError(
+            f"task.size={store.spec.size} must be task.suite.size={size} for masks from physics"
+        )
+    out = _unknown(store, episodes)
+    places = store.seeded(episodes).nonzero().flatten().tolist()
+    if not places:
+        return out
+    jobs = []
+    for number in episodes[places].tolist():
+        rows = store.rows(torch.tensor([number]))
+        commands = store.arrays["commands"][rows].double().numpy()
+        jobs.append((int(store.episodes[number]["seed"]), commands))
+    pool = build_pool(cfg)
+    try:
+        made = pool.segment(jobs)
+    finally:
+        pool.close()
+    poses = read_privileged(store, POSES)
+    for n, (labels, pictures, start) in zip(places, made, strict=True):
+        first = store.start[episodes[n]]
+        ends = torch.stack((first, first + store.length[episodes[n]] - 1))
+        begun, ended = _changed(store.frames(ends), torch.from_numpy(pictures)).tolist()
+        if poses is None or POSES not in start:
+            same = begun <= _START
+        else:
+            same = _alike(poses[first].numpy(), start[POSES])
+        if labels is not None and same and ended <= _END:
+            out[n, : len(labels) - 1] = torch.from_numpy(labels[1:])
+    return out
 
 
 def read_labels(path: Path, store: ClipStore, episodes: Tensor) -> Tensor:
-    """Labels from a file for recordings of a real robot.
+    """The same from a file, for recordings of a real robot.
 
     Args:
         path: an .npz file with an array for each episode, named by its number in the data sets: uint8
@@ -66,8 +87,7 @@ def read_labels(path: Path, store: ClipStore, episodes: Tensor) -> Tensor:
     with _reading(path):
         held = np.load(path, allow_pickle=False)
         names = set(held.files)
-    rows, _ = store.whole(episodes)
-    out = torch.full((*rows.shape, store.spec.views, *store.spec.size), 255, dtype=torch.uint8)
+    out = _unknown(store, episodes)
     for n, number in enumerate(episodes.tolist()):
         if str(number) not in names:
             raise ConfigError(f"fidelity.masks={path} holds no array '{number}', of episode {number}")
@@ -97,41 +117,10 @@ def _reading(path: Path) -> Iterator[None]:
         raise ConfigError(f"fidelity.masks={path} is no .npz file, or damaged: {error}") from error
 
 
-def _repeated(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor) -> Tensor | None:
-    size = tuple(world_spec(cfg).embodiment.cameras[0].size)
-    if size != tuple(store.spec.size):
-        raise ConfigError(
-            f"task.size={store.spec.size} must be task.suite.size={size} for masks from physics"
-        )
-    places = store.seeded(episodes).nonzero().flatten().tolist()
-    if not places:
-        return None
-    jobs = []
-    for number in episodes[places].tolist():
-        rows = store.rows(torch.tensor([number]))
-        commands = store.arrays["commands"][rows].double().numpy()
-        jobs.append((int(store.episodes[number]["seed"]), commands))
-    pool = build_pool(cfg)
-    try:
-        made = pool.segment(jobs)
-    finally:
-        pool.close()
-    if any(labels is None for labels, *_ in made):
-        return None
+def _unknown(store: ClipStore, episodes: Tensor) -> Tensor:
+    """Labels of episodes of which nothing is known."""
     rows, _ = store.whole(episodes)
-    out = torch.full((*rows.shape, store.spec.views, *store.spec.size), 255, dtype=torch.uint8)
-    poses = read_privileged(store, POSES)
-    for n, (labels, pictures, start) in zip(places, made, strict=True):
-        first = store.start[episodes[n]]
-        ends = torch.stack((first, first + store.length[episodes[n]] - 1))
-        begun, ended = _changed(store.frames(ends), torch.from_numpy(pictures)).tolist()
-        if poses is None or POSES not in start:
-            same = begun <= _START
-        else:
-            same = _alike(poses[first].numpy(), start[POSES])
-        if labels is not None and same and ended <= _END:
-            out[n, : len(labels) - 1] = torch.from_numpy(labels[1:])
-    return out
+    return torch.full((*rows.shape, store.spec.views, *store.spec.size), 255, dtype=torch.uint8)
 
 
 def _changed(recorded: Tensor, again: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 from tqdm import tqdm
 
 from envs.episodes.clips import ClipStore
@@ -39,7 +40,8 @@ class OpenLoop:
         store: of the episodes.
         episodes: int64 [N].
         bf16: generate in bfloat16 where the device computes in it.
-        labels: uint8 [N, T, V, H, W], see masks.part_labels; None if nobody knows.
+        labels: uint8 [n, T, V, H, W] of n of the episodes, see masks.part_labels, asked for as these are
+            measured, for those of all would fill the memory; None if nobody knows any.
         extractors: of Frechet distances.
         clip: frames of a clip.
         hands: measures end effectors, or why nothing can.
@@ -52,7 +54,7 @@ class OpenLoop:
     store: ClipStore
     episodes: Tensor
     bf16: bool
-    labels: Tensor | None = None
+    labels: Callable[[Tensor], Tensor] | None = None
     extractors: Sequence[Extractor] = ()
     clip: int = 8
     hands: EndEffectorRuler | str = "nobody asked"
@@ -70,7 +72,7 @@ class OpenLoop:
         """
         out = Measured()
         sides = [(Moments(e), Moments(e)) for e in self.extractors]
-        for some in tqdm(self._batches(), desc="rolled out", unit="batch", dynamic_ncols=True, leave=False):
+        for some in tqdm(self.batches(), desc="rolled out", unit="batch", dynamic_ncols=True, leave=False):
             part = self._part(simulator, some, about or {})
             out.add(_named(part, "error"), part["valid"])
             out.seconds += float(part["seconds"])
@@ -120,16 +122,16 @@ class OpenLoop:
     def _held(self, shown: Callable[[Tensor], Tensor]) -> Measured:
         """Errors of what is shown for ever of first frames uint8 [N, 1, V, 3, H, W]."""
         out = Measured()
-        for some in self._batches():
+        for some in self.batches():
             rows, valid = self.store.whole(self.episodes[some])
             first = shown(self.store.first(self.episodes[some])["frames"][:, None])
             frames = first.expand(-1, rows.shape[1], -1, -1, -1, -1)
-            marks = None if self.labels is None else _fitted(self.labels[some], rows.shape[1])
+            marks = _fitted(self._labels(some), rows.shape[1], 1)
             errors = frame_errors(frames, self.store.frames(rows), self.distance, marks)
             out.add(_known(errors, self.store.arrays["present"][rows]), valid)
         return out
 
-    def _batches(self) -> list[slice]:
+    def batches(self) -> list[slice]:
         """Which episodes are measured together; the same whatever measures them."""
         longest = int(self.store.length[self.episodes].max())
         size = side_by_side(self.store, longest, _SIDE_BY_SIDE)
@@ -137,32 +139,35 @@ class OpenLoop:
 
     def _part(self, simulator: Simulator, some: slice, about: Mapping[str, Any]) -> Tensors:
         """What is measured of some episodes, now or at some earlier time."""
+        labels = self._labels(some)
         if self.kept is None:
-            return self._rolled_out(simulator, some)
-        shown = b"" if self.labels is None else self.labels[some].numpy().tobytes()
+            return self._rolled_out(simulator, some, labels)
         identity = {
             **self.identity,
             **about,
             "episodes": self.episodes[some].tolist(),
-            "labels": hashlib.sha256(shown).hexdigest(),
+            "labels": hashlib.sha256(b"" if labels is None else labels.numpy().tobytes()).hexdigest(),
             "extractors": [extractor.name for extractor in self.extractors],
             "clip": self.clip,
             "stride": self.stride,
             "hands": self.hands if isinstance(self.hands, str) else self.hands.ruler.identity,
             "distance": self.distance.name,
         }
-        return self.kept.get(f"rolled-out-{some.start}", identity, lambda: self._rolled_out(simulator, some))
+        name = f"rolled-out-{some.start}"
+        return self.kept.get(name, identity, lambda: self._rolled_out(simulator, some, labels))
 
-    def _rolled_out(self, simulator: Simulator, some: slice) -> Tensors:
+    def _labels(self, some: slice) -> Tensor | None:
+        return None if self.labels is None else self.labels(self.episodes[some])
+
+    def _rolled_out(self, simulator: Simulator, some: slice, labels: Tensor | None) -> Tensors:
         """Errors and valid, see Measured.add; seconds that generating took; features of generated and true
         samples by the extractor's number; offsets of objects and hands; scores of the judge.
         """
         episodes, began = self.episodes[some], time.perf_counter()
         made = replay(simulator, self.store, episodes, bf16=self.bf16, stride=self.stride)
         out = {"valid": made.valid, "seconds": torch.tensor(time.perf_counter() - began)}
-        shown, true, marks = made.pictured(self.store), self.store.frames(made.rows), None
-        if self.labels is not None:
-            marks = _fitted(self.labels[some, self.stride - 1 :: self.stride], made.rows.shape[1])
+        shown, true = made.pictured(self.store), self.store.frames(made.rows)
+        marks = _fitted(labels, made.rows.shape[1], self.stride)
         errors = _known(frame_errors(made.frames, true, self.distance, marks), shown.valid)
         out |= {f"error/{name}": values for name, values in errors.items()}
         for number, extractor in enumerate(self.extractors):
@@ -276,11 +281,12 @@ def _named(part: Tensors, kind: str) -> Tensors:
     return {name.partition("/")[2]: value for name, value in part.items() if name.startswith(f"{kind}/")}
 
 
-def _fitted(labels: Tensor, frames: int) -> Tensor:
-    """Labels of as many frames as were generated; unknown (255) beyond those that there are."""
-    missing = max(0, frames - labels.shape[1])
-    more = labels.new_full((len(labels), missing, *labels.shape[2:]), 255)
-    return torch.cat((labels[:, :frames], more), 1)
+def _fitted(labels: Tensor | None, frames: int, stride: int) -> Tensor | None:
+    """Labels, if any, of generated frames, one in `stride`; unknown (255) beyond those that there are."""
+    if labels is None:
+        return None
+    some = labels[:, stride - 1 :: stride][:, :frames]
+    return pad(some, (0, 0, 0, 0, 0, 0, 0, frames - some.shape[1]), value=255)
 
 
 def _longer(values: Tensor, frames: int) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -225,7 +226,8 @@ def test_clips_that_are_too_short_are_told_before_anything_is_measured(tmp_path:
 
 def test_a_right_world_is_measured_as_right(store: ClipStore) -> None:
     labels = torch.ones(20, store.whole(torch.arange(20))[0].shape[1], 3, 32, 32, dtype=torch.uint8)
-    loop = OpenLoop(store, torch.arange(8), False, labels[:8], (PyramidFrames(), PyramidClips()), clip=4)
+    extractors = PyramidFrames(), PyramidClips()
+    loop = OpenLoop(store, torch.arange(8), False, labels.__getitem__, extractors, clip=4)
     right = loop.measure(Drawing(store.spec, "right")).result(store.spec.embodiment.views, {})
     wrong = loop.measure(Drawing(store.spec, "grey")).result(store.spec.embodiment.views, {})
     assert right["episodes"] == 8 and len(right["by_frame"]["mse"]) == 12 and len(right["views"]) == 3
@@ -240,10 +242,28 @@ def test_a_right_world_is_measured_as_right(store: ClipStore) -> None:
     assert loop.held_coded(Drawing(store.spec, "right")) is None
 
 
+def test_labels_are_held_of_no_more_episodes_than_are_measured_at_once(store: ClipStore) -> None:
+    held: list[weakref.ref[Tensor]] = []
+
+    def told(episodes: Tensor) -> Tensor:
+        assert all(one() is None for one in held)  # those of earlier batches
+        rows, _ = store.whole(episodes)
+        labels = torch.ones(*rows.shape, 3, 32, 32, dtype=torch.uint8)
+        held.append(weakref.ref(labels))
+        asked.append(len(episodes))
+        return labels
+
+    asked: list[int] = []
+    loop = OpenLoop(store, torch.arange(20), False, told)
+    found = loop.measure(Drawing(store.spec, "right"))
+    assert asked == [16, 4] and found.overall["arm_mse"] == pytest.approx(found.overall["mse"])
+    assert loop.held_still().overall["arm_mse"] is not None and asked == [16, 4] * 2
+
+
 def test_strides_are_compared_at_the_frames_that_all_of_them_show(store: ClipStore) -> None:
     labels = torch.zeros(8, 12, 3, 32, 32, dtype=torch.uint8)
     labels[:, 3::4] = 1  # the arm is seen in every fourth frame alone
-    loop = OpenLoop(store, torch.arange(8), False, labels)
+    loop = OpenLoop(store, torch.arange(8), False, labels.__getitem__)
     rows = by_stride(loop, Drawing(store.spec, "right"), [1, 2, 4])
     assert [row["frames"] for row in rows] == [12, 12, 12]  # the square's places are what is commanded
     assert len({row["psnr"] for row in rows}) == 1 and rows[0]["psnr"] > 25

@@ -91,8 +91,8 @@ def test_fidelity_with_masks_from_physics(tmp_path: Path) -> None:
     store = open_clips(cfg, [data])
     for row in store.episodes[1:]:
         row["seed"] += 1000
-    labels = part_labels(cfg, store, torch.arange(3), None)
-    assert labels is not None and (labels[0] != 255).any() and (labels[1:] == 255).all()
+    labels = part_labels(cfg, store, torch.arange(3))
+    assert (labels[0] != 255).any() and (labels[1:] == 255).all()
 
 
 def test_of_episodes_of_one_frame_nothing_can_be_measured(tmp_path: Path) -> None:
