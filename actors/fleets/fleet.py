@@ -33,6 +33,7 @@ class Result:
         forward_seconds: of these, inside the networks.
         bytes: that travelled.
         footage: of the episodes that the job asked to be shown.
+        counted: see Host.counted.
     """
 
     job: Job
@@ -44,6 +45,7 @@ class Result:
     bytes: int = 0
     failure: str = ""
     footage: tuple[Footage, ...] = ()
+    counted: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass
@@ -52,6 +54,9 @@ class EpisodeLedger:
 
     Episodes of a job that is run again after its host died count in `rerun`: they were begun, nobody learned
     from them, and the same episodes came later.
+
+    What the hosts' judges counted (Host.counted) stands in `judged`; a goal that several hosts imagine counts
+    for each.
     """
 
     requested: int = 0
@@ -59,11 +64,17 @@ class EpisodeLedger:
     dropped: dict[str, int] = field(default_factory=dict)
     rerun: int = 0
     deaths: int = 0
+    judged: dict[str, int] = field(default_factory=dict)
 
     def drop(self, reason: str, episodes: int) -> None:
         """Episodes that nobody will learn from."""
         if episodes:
             self.dropped[reason] = self.dropped.get(reason, 0) + episodes
+
+    def count(self, judged: Mapping[str, int]) -> None:
+        """What a judge counted in a job that has come back."""
+        for name, number in judged.items():
+            self.judged[name] = self.judged.get(name, 0) + number
 
     def settle(self, episodes: int, spoiled: Mapping[str, int]) -> None:
         """A rollout of so many episodes was learned from, but for those that something spoiled."""
@@ -165,7 +176,10 @@ class LocalFleet:
         loaded, forward = watch.read(), self.host.meter.seconds
         batch = self.host.run(job)
         seconds, forward = loaded + watch.read(), self.host.meter.seconds - forward
-        return Result(job, version, batch, seconds, loaded, forward, footage=self.host.footage)
+        host = self.host
+        return Result(
+            job, version, batch, seconds, loaded, forward, footage=host.footage, counted=host.counted
+        )
 
     def close(self) -> None:
         """See Fleet.close."""

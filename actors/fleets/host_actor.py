@@ -37,6 +37,7 @@ class HostActor:
             "load_seconds": loaded,
             "forward_seconds": self.host.meter.seconds - forward,
             "footage": self.host.footage,
+            "counted": self.host.counted,
         }
 
 

@@ -36,6 +36,7 @@ from actors.policies.contract import (
 from actors.policies.safe import SafePolicyWrapper
 from actors.rollouts.footage import Footage, footage
 from actors.rollouts.meter import Meter
+from envs.judges.base import counted
 from envs.rng import seed_process
 from envs.specs import (
     CHUNK,
@@ -97,6 +98,8 @@ class Host:
 
     Attributes:
         footage: of the last job, as many episodes as it asked to be shown; none in physics.
+        counted: what the judge counted in the last job, such as goals; nothing in physics, and nothing of a
+            judge in a service, which hosts share.
     """
 
     def __init__(
@@ -107,6 +110,7 @@ class Host:
         self.steps = self.base.horizon // self.base.chunk
         self.version = -1
         self.footage: tuple[Footage, ...] = ()
+        self.counted: dict[str, int] = {}
         self.actor = SafePolicyWrapper(policy, self.base.spec, self.base.mode)
         self._features = feature_part(policy) if bootstrap and writes_features(policy) else None
         transforms = list(getattr(env, "transform", None) or ())
@@ -165,6 +169,7 @@ class Host:
             visual features. Pictures are among it only if the policy's encoder is trained, or writes no
             features; the video itself stays here.
         """
+        before = self._counts()
         devices = [torch.cuda.current_device()] if device_of(self.policy).type == "cuda" else []
         # In one process with the learner, its random numbers are its own.
         with torch.random.fork_rng(devices=devices), torch.no_grad(), computing_threads(self.threads):
@@ -179,8 +184,12 @@ class Host:
             if self._judging is not None and self._judging.later:
                 self._judging.settle(batch)
             self.footage = footage(self.base, batch, job.shown) if job.shown and self._judging else ()
+        self.counted = {name: count - before[name] for name, count in self._counts().items()}
         batch[VERSION] = torch.full((*batch.shape, 1), self.version)
         return batch.cpu()
+
+    def _counts(self) -> dict[str, int]:
+        return {} if self._judging is None else counted(self._judging.judge)
 
     def _collect(self) -> tuple[TensorDict, TensorDict | None]:
         """Rollout [B, T] from fresh episodes, and the observations [N] after which another episode begins, in

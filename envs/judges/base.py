@@ -228,6 +228,11 @@ def _texts(options: Any) -> Iterator[str]:
             yield from _texts(value)
 
 
+def counted(judge: Judge) -> dict[str, int]:
+    """What a judge has counted so far, such as goals, of its facts."""
+    return {name: value for name, value in judge.facts().items() if type(value) is int}
+
+
 def judgement_status(success: Tensor) -> Tensor:
     """Status int64 [B] of probabilities [B, T]: ERROR where one is not finite, OK elsewhere."""
     bad = ~torch.isfinite(success).all(1)

@@ -94,6 +94,7 @@ class Feed:
         watch = Stopwatch()
         result = self.fleet.take()
         self.idle += watch.read()
+        self.fleet.ledger.count(result.counted)
         return result
 
     def _given_up(self, result: Result) -> None:

@@ -17,7 +17,7 @@ from torchrl.envs import TransformedEnv
 from actors.factory import at_once, build_physics, build_pool
 from actors.policies.recorded import Commands, RecordedActions
 from actors.rollouts.evaluate import Outcome, evaluate
-from envs.judges.base import Judge
+from envs.judges.base import counted
 from envs.physics.env import PhysicsEnv
 from envs.physics.pool import PoolError, TaskPool
 from envs.physics.worker import Track
@@ -189,8 +189,3 @@ class Imagination:
         )
         told = {COUNT + name: torch.tensor(value - before[name]) for name, value in counted(judge).items()}
         return {"success": outcome.success, "judged": outcome.counted, **told}
-
-
-def counted(judge: Judge) -> dict[str, int]:
-    """What a judge has counted so far, such as goals, of its facts."""
-    return {name: value for name, value in judge.facts().items() if type(value) is int}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,10 +17,11 @@ from pipeline.config import load_config
 from pipeline.graph.stage import Inputs
 from pipeline.loop import build_loop, deployed_episodes
 from pipeline.stages import rl as stages
-from pipeline.stages.given import rl_options
+from pipeline.stages.given import DATASETS, rl_options
 from pipeline.study.methods import add_rl_in_physics
 from pipeline.track import read_metrics
 from tests.embodiments import ARM_DELTAS
+from tests.worlds import untrained_world
 
 SETTINGS = {"imagined": 0.0, "iterations": 1, "seed": 0, "lr": 1e-4}
 SQUARE = ("task=lerobot", "task.size=[32,32]", "task.chunk=4", "task.horizon=12", "task.mode=absolute")
@@ -53,6 +56,25 @@ def test_true_decisions_are_learned_from_whatever_measures_progress(
     )
     assert "nothing but the anchor" in alarm and stages.nothing_left(learning, None) == [alarm]
     assert not stages.nothing_left(rl_options(cfg, **{**SETTINGS, "imagined": 1.0}), None)
+
+
+def test_goals_that_hosts_imagine_are_counted(
+    tiny_data: Callable[[Embodiment], Path], tmp_path: Path
+) -> None:
+    data = tiny_data(ARM_DELTAS)
+    words = ("experiment=smoke", "judge=golden_goal", *SQUARE, f"task.data=[{data}]", "launch.device=cpu")
+    cfg = load_config([*words, "judge.fallback=last_frame", "judge.text_world.ending.threshold=1.0"])
+    untrained_world(cfg, tmp_path)
+    (tmp_path / "recordings").mkdir()
+    (tmp_path / "recordings" / DATASETS).write_text(json.dumps([str(data)]))
+    roles: dict[str, Any] = {name: tmp_path / name for name in ("policy", "simulator", "state", "judge")}
+    settings = {"number": 1, "iterations": 2}
+    view = stages.rl.view("rl-1", cfg, settings)
+    made = stages.rl.run(
+        view, tmp_path / "rl", Inputs({**roles, "data": (tmp_path / "recordings",)}, settings)
+    )
+    judged = made["ledger"]["judged"]  # nothing is more certain than that, so that no goal ends
+    assert judged["goals_unfinished"] == judged["goals"] > 0
 
 
 def test_in_physics_it_plays_as_many_episodes_as_are_deployed_and_not_whole_iterations(
