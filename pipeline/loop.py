@@ -256,7 +256,10 @@ def _learn(
     """
     inputs, worth = {"data": data, **made.roles(), "policy": policy}, ""
     if known and cfg["worth"]["moments"] and cfg["rl"]["imagined"]:
-        worth = graph.add(f"worth-{number}", measured_worth.worth, inputs, number=number)
+        before = f"worth-{number - 1}" if number > 1 else ""
+        worth = graph.add(
+            f"worth-{number}", measured_worth.worth, {**inputs, "before": before}, number=number
+        )
     return graph.add(
         f"rl-{number}",
         rl.rl,

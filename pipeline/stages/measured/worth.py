@@ -18,10 +18,11 @@ from actors.process import prepare_process
 from actors.world_config import rewards_of
 from envs.episodes.clips import ClipStore
 from envs.initial_states import DecisionPoints
+from envs.manifest import read_manifest
 from envs.rng import order_generator, seed_process
 from envs.specs import CHUNK, JUDGE_STATUS, ActionMode, Status
 from learners.rl.recorded.rollout import paid_decisions
-from learners.rl.recorded.worth import Returns, Worth, worth_by_task
+from learners.rl.recorded.worth import Estimate, Returns, Worth, worth_by_task
 from learners.stages.imitation import chunks_ahead
 from pipeline.evaluation.by_task import tasks_of_episodes
 from pipeline.graph.stage import Inputs, Place, stage
@@ -40,19 +41,25 @@ def worth(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     held-out episodes of all deployed policies, in the simulator, state expert and judge of these roles,
     against other actions of the role `policy`.
 
+    The role `before`, if somebody plays it, has measured it of the world before.
+
+    Settings: number of the round.
+
     Returns:
         worth, of each task its value in [0, 1], by which RL weighs its imagined decisions, with what was
-        measured; {} where there is nothing to measure it on, or nobody said whether episodes succeeded.
+        measured and is known; {} where there is nothing to measure it on, or nobody said whether episodes
+        succeeded.
     """
     prepare_process(cfg["seed"], cfg["threads"])
     store, number = open_store(cfg, inputs), inputs.settings["number"]
+    seed = cfg["seed"] * 100 + number  # each round asks other moments
     held = store.select(["policy-*"])
     held = held[torch.isin(held, store.split("held_out")) & store.arrays["labelled"][held]]
     if not len(held):
         return {"round": number, "worth": {}, "alarms": []}
     points = DecisionPoints(store, held)
     tasks = dict(zip(held.tolist(), tasks_of_episodes(cfg, store, held), strict=True))
-    which = _shared_out([tasks[n] for n in points.episode.tolist()], cfg["worth"]["moments"], cfg["seed"])
+    which = _shared_out([tasks[n] for n in points.episode.tolist()], cfg["worth"]["moments"], seed)
     chunks = imagined_chunks(cfg)
     true, begun = _true_returns(cfg, inputs, store, held, points, which, chunks)
     simulator = build_simulator(cfg, inputs.weights("simulator"))
@@ -62,13 +69,13 @@ def worth(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         horizon=chunks * int(cfg["task"]["chunk"]),
     )
     policy = SafePolicyWrapper(build_policy(cfg, inputs.weights("policy")), world.base_env.spec, mode_of(cfg))
-    seed_process(cfg["seed"])
+    seed_process(seed)
     imagined = _imagined_returns(world, policy, points, which, mode_of(cfg), recorded=True)
     others = _imagined_returns(world, policy, points, which, mode_of(cfg), recorded=False)
     known = imagined.isfinite() & others.isfinite()
     returns = Returns(true, imagined, others, begun, points.episode[which])
     mine = [tasks[n] for n in points.episode[which][known].tolist()]
-    found = worth_by_task(returns[known], mine)
+    found = worth_by_task(returns[known], mine, _known_before(inputs))
     said = ", ".join(f"{task} {one.value:.2f}" for task, one in found.items())
     tqdm.write(f"worth-{number}: of imagined returns {said}")
     return {
@@ -76,6 +83,16 @@ def worth(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         "worth": {task: asdict(one) for task, one in found.items()},
         "alarms": worth_little(found),
     }
+
+
+def _known_before(inputs: Inputs) -> dict[str, Estimate]:
+    """What was known of each task in the round before."""
+    if "before" not in inputs.found:
+        return {}
+    manifest = read_manifest(inputs.folder("before"))
+    assert manifest is not None, "a role is played by finished stages"
+    told = ((task, one["known"]) for task, one in manifest["result"]["worth"].items())
+    return {task: (known[0], known[1]) for task, known in told if known is not None}
 
 
 def worth_little(found: dict[str, Worth]) -> list[str]:

@@ -68,6 +68,26 @@ def test_where_nothing_is_told_imagination_is_taken_at_its_word() -> None:
     assert worth_by_task(alike, ["a"] * 200)["a"].value == 1.0
 
 
+def test_what_was_known_of_earlier_worlds_counts_half() -> None:
+    now = returns(0.3, 1.0, 0)
+    alone = worth_by_task(now, ["a"] * 200)["a"]
+    assert alone.measured is not None and alone.known == alone.measured
+    value, error = alone.measured
+    told = worth_by_task(now, ["a"] * 200, {"a": (0.9, error / 2**0.5), "b": (0.1, 0.1)})["a"]
+    assert told.measured == alone.measured and told.known is not None
+    assert told.known == pytest.approx(((value + 0.9) / 2, error / 2**0.5))
+    silent = worth_by_task(now[torch.arange(4)], ["a"] * 4, {"a": (0.9, 0.1)})["a"]
+    assert silent.measured is None and silent.known == pytest.approx((0.9, 0.1 * 2**0.5))
+
+
+def test_two_lucky_episodes_do_not_decide() -> None:
+    lucky = returns(0.0, 1.0, 3)
+    for values in (lucky.true, lucky.imagined):
+        values[[0, 100]] += 100.0
+    found = correlation(lucky)
+    assert found is not None and abs(found[0]) < 2 * found[1] < 0.5
+
+
 def test_each_task_weighs_what_it_is_worth() -> None:
     tasks = ["a", "a", "a", "b", "c", "c"]
     starts, mean = by_worth(Starts(list(range(6)), 6), tasks, {"a": 0.4, "b": 0.1, "c": 0.0})

@@ -43,7 +43,7 @@ def result(**changes: Any) -> dict[str, Any]:
             "state": {"median": 0.1, "p90": 0.2},
         },
     }
-    told = {"value": 0.31, "measured": (0.42, 0.1), "moments": 96}
+    told = {"value": 0.31, "measured": (0.42, 0.1), "known": (0.37, 0.08), "moments": 96}
     base = {
         "name": "tiny <run>",
         "seed": 0,
@@ -72,7 +72,12 @@ def result(**changes: Any) -> dict[str, Any]:
                 "replayed": table,
             }
         ],
-        "worth": [{"round": 1, "worth": {"push": told, "grasp": {**told, "value": 1.0, "measured": None}}}],
+        "worth": [
+            {
+                "round": 1,
+                "worth": {"push": told, "grasp": {**told, "value": 1.0, "measured": None, "known": None}},
+            }
+        ],
         "episodes_used": 60,
         "episodes_held_out": 10,
         "imagined_episodes_used": [256],
@@ -191,7 +196,11 @@ def test_the_page_is_one_file_with_everything(inputs: Inputs) -> None:
     assert "http" not in page.split("<h2 id=config>")[0]
     assert "2 judge" in page and "25.0%" in page and "3.1%" in page and "812" in page
     assert "held-out starts" in page and "<td>80</td>" in page
-    assert "<td>round 1, push</td><td>0.31</td>" in page and "0.42 &plusmn; 0.10" in page
+    assert (
+        "<td>round 1, push</td><td>0.31</td>" in page
+        and "0.42 &plusmn; 0.10" in page
+        and "0.37 &plusmn; 0.08" in page
+    )
     assert "<td>round 1, grasp</td><td>1.00</td>" in page and "nothing told" in page
 
 

@@ -12,7 +12,7 @@ from actors.world_config import world_spec
 from envs.episodes import Episode, LeRobotWriter
 from envs.episodes.splits import write_splits
 from envs.initial_states import DecisionPoints
-from learners.rl.recorded.worth import Returns, Worth
+from learners.rl.recorded.worth import Estimate, Returns, Worth
 from pipeline.config import load_config
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs
@@ -54,9 +54,9 @@ def test_it_is_measured_on_held_out_moments_of_each_task(
     seen: list[Returns] = []
     told = worth.worth_by_task
 
-    def noting(returns: Returns, tasks: list[str]) -> dict[str, Worth]:
+    def noting(returns: Returns, tasks: list[str], earlier: dict[str, Estimate]) -> dict[str, Worth]:
         seen.append(returns)
-        return told(returns, tasks)
+        return told(returns, tasks, earlier)
 
     monkeypatch.setattr(worth, "worth_by_task", noting)
     view = worth.worth.view("worth-1", cfg, {"number": 1})
@@ -95,6 +95,9 @@ def test_moments_are_shared_out_over_tasks() -> None:
 
 
 def test_a_task_in_which_imagination_is_worth_nothing_is_told() -> None:
-    found = {"push": Worth(0.3, (0.3, 0.1), 90), "grasp": Worth(0.0, (-0.1, 0.1), 90)}
+    found = {
+        "push": Worth(0.3, (0.3, 0.1), (0.3, 0.1), 90),
+        "grasp": Worth(0.0, (-0.1, 0.1), (-0.1, 0.1), 90),
+    }
     (alarm,) = worth.worth_little(found)
     assert "in grasp," in alarm and "simulator_fit" in alarm and not worth.worth_little({"a": found["push"]})
