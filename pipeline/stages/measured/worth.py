@@ -101,8 +101,8 @@ def worth_little(found: dict[str, Worth]) -> list[str]:
     if not lost:
         return []
     return [
-        f"imagined returns say nothing of true ones in {', '.join(lost)}, so RL learns there from recorded"
-        " decisions; train the simulator for longer (simulator_fit), show it the task from nearer, or deploy"
+        f"imagined returns say nothing of true ones in {', '.join(lost)}, so RL hardly learns there in"
+        " imagination; train the simulator for longer (simulator_fit), show it the task from nearer, or deploy"
         " more episodes (rounds.deploy)"
     ]
 
