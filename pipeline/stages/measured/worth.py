@@ -102,8 +102,8 @@ def worth_little(found: dict[str, Worth]) -> list[str]:
         return []
     return [
         f"imagined returns say nothing of true ones in {', '.join(lost)}, so RL hardly learns there in"
-        " imagination; train the simulator for longer (simulator_fit), show it the task from nearer, or deploy"
-        " more episodes (rounds.deploy)"
+        " imagination; train the simulator for longer (simulator_fit), show it the task from nearer, or"
+        " deploy more episodes (rounds.deploy)"
     ]
 
 

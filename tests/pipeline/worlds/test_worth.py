@@ -16,6 +16,7 @@ from learners.rl.recorded.worth import Estimate, Returns, Worth
 from pipeline.config import load_config
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs
+from pipeline.loop import build_loop
 from pipeline.stages.measured import worth
 from tests.worlds import untrained_world
 
@@ -84,6 +85,18 @@ def test_recorded_returns_are_those_of_the_chunks_that_follow(cfg: dict[str, obj
             paid = rewards["progress"] * (1 - begun[first]) + rewards["success"]
             assert float(whole[first]) == pytest.approx(float(paid), abs=1e-4)
         assert int(mine.sum()) == (int(store.length[episode]) - 2) // chunk + 1
+
+
+def test_it_is_asked_of_each_world_that_rl_imagines(tmp_path: Path) -> None:
+    nodes = build_loop(load_config(["experiment=smoke"]), tmp_path).nodes
+    for number in (1, 2):
+        asked = nodes[f"worth-{number}"].parents
+        assert {f"simulator-{number}", f"state-{number}", f"judge-{number}"} < set(asked)
+        assert f"worth-{number}" in nodes[f"rl-{number}"].parents
+    assert "worth-1" in nodes["worth-2"].parents
+    for word in ("rl.imagined=0", "worth.moments=0"):
+        without = build_loop(load_config(["experiment=smoke", word]), tmp_path).nodes
+        assert not [name for name in without if name.startswith("worth")]
 
 
 def test_moments_are_shared_out_over_tasks() -> None:
