@@ -10,11 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from actors.factory import (
-    build_algorithm,
-    build_policy,
-    open_clips,
-)
+from actors.factory import build_algorithm, build_policy, open_clips
 from actors.fleets.fleet import Fleet, FleetError
 from actors.fleets.launch import build_fleet
 from actors.policies.contract import action_key, freeze_perception, rl_rate
@@ -24,7 +20,6 @@ from actors.world_config import rewards_of
 from envs.episodes.clips import ClipStore
 from envs.episodes.key_frames import key_points
 from envs.initial_states import decision_points, shared_out
-from envs.manifest import read_manifest
 from envs.rng import Purpose, episode_seeds
 from envs.specs import CHUNK
 from envs.targets import target
@@ -36,6 +31,7 @@ from learners.rl.starts import Starts, weighed
 from learners.stages.imitation import Cloning
 from learners.training.parallel import leads
 from pipeline.evaluation.by_task import tasks_of_episodes
+from pipeline.evaluation.result import result_of
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.graph.view import ConfigView
@@ -151,9 +147,7 @@ def worth_in(inputs: Inputs) -> dict[str, float]:
     """What imagined returns are worth by task, as the role `worth` has measured it; {} if nobody plays it."""
     if "worth" not in inputs.found:
         return {}
-    manifest = read_manifest(inputs.folder("worth"))
-    assert manifest is not None, "a role is played by finished stages"
-    return {task: float(one["value"]) for task, one in manifest["result"]["worth"].items()}
+    return {task: float(one["value"]) for task, one in result_of(inputs.folder("worth"))["worth"].items()}
 
 
 def by_worth(starts: Starts, tasks: Sequence[str], worth: Mapping[str, float]) -> tuple[Starts, float]:

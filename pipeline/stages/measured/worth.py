@@ -18,13 +18,13 @@ from actors.process import prepare_process
 from actors.world_config import rewards_of
 from envs.episodes.clips import ClipStore
 from envs.initial_states import DecisionPoints
-from envs.manifest import read_manifest
 from envs.rng import order_generator, seed_process
 from envs.specs import CHUNK, JUDGE_STATUS, ActionMode, Status
 from learners.rl.recorded.rollout import paid_decisions
 from learners.rl.recorded.worth import Estimate, Returns, Worth, worth_by_task
 from learners.stages.imitation import chunks_ahead
 from pipeline.evaluation.by_task import tasks_of_episodes
+from pipeline.evaluation.result import result_of
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import WORLD, Cfg, imagined_chunks, mode_of, open_store
 from pipeline.stages.judging.cost import priced
@@ -89,9 +89,7 @@ def _known_before(inputs: Inputs) -> dict[str, Estimate]:
     """What was known of each task in the round before."""
     if "before" not in inputs.found:
         return {}
-    manifest = read_manifest(inputs.folder("before"))
-    assert manifest is not None, "a role is played by finished stages"
-    told = ((task, one["known"]) for task, one in manifest["result"]["worth"].items())
+    told = ((task, one["known"]) for task, one in result_of(inputs.folder("before"))["worth"].items())
     return {task: (known[0], known[1]) for task, known in told if known is not None}
 
 
