@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
+from scipy.stats import rankdata
 from torch import Tensor
 
 Estimate = tuple[float, float]  # and its standard error
@@ -137,9 +138,8 @@ def _correlation(returns: Returns) -> float | None:
 
 def _scores(values: Tensor) -> Tensor:
     """Normal quantiles float64 [N] of the ranks of values [N]; those that are alike share theirs."""
-    values = values.double()
-    below = (values[:, None] > values).sum(1) + (values[:, None] == values).sum(1) / 2
-    return torch.special.ndtri(below / len(values))
+    ranks = torch.from_numpy(rankdata(values.numpy()))
+    return torch.special.ndtri((ranks - 0.5) / len(values))
 
 
 def _rest(value: Tensor, *known: Tensor) -> Tensor:
