@@ -111,14 +111,17 @@ def kept(rates: Rates, mode: Rates) -> float:
 
     It is the mean over tasks of min(1, its rate over the mode's), so that what a hard task loses is not made
     up for by an easy one, over the mean of min(1, the mode's rate over its), for chance takes as much from
-    either. Tasks in which neither succeeds say nothing; half a success and half a failure more on both sides
-    let single episodes decide little.
+    either. Tasks in which neither succeeds say nothing, nor do those all of whose episodes were dropped on
+    either side; half a success and half a failure more on both sides let single episodes decide little. 0 if
+    no task says anything.
     """
     ratios = [
         _shrunk(rates[task]) / _shrunk(mode[task])
         for task in mode
-        if rates[task]["successes"] or mode[task]["successes"]
+        if task in rates and (rates[task]["successes"] or mode[task]["successes"])
     ]
+    if not ratios:
+        return 0.0
     return min(1.0, sum(min(1.0, one) for one in ratios) / sum(min(1.0, 1 / one) for one in ratios))
 
 

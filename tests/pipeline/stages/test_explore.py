@@ -62,6 +62,13 @@ def test_easy_tasks_do_not_make_up_for_hard_ones() -> None:
     assert kept(lucky, even) < 0.6  # with 126 of 150 successes
 
 
+def test_a_task_all_of_whose_episodes_were_dropped_says_nothing() -> None:
+    won, lost = rate_entry(torch.ones(2) > 0), rate_entry(torch.zeros(2) > 0)
+    assert kept({"push": won}, {"push": won, "grasp": won}) == 1.0
+    assert kept({"push": won, "grasp": lost}, {"push": won}) == 1.0
+    assert kept({"push": lost}, {"push": lost, "grasp": won}) == 0.0  # what it keeps is not known
+
+
 @pytest.mark.parametrize(
     ("rate", "share", "least", "most"),
     [
