@@ -33,7 +33,7 @@ def variant_of(cfg: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     if name and not known:
         raise ConfigError(
             f"variant={name}: this task has no variants; leave it out (a study's column by"
-            " if_chosen.study.<study>.columns=[success]), or add task.variants"
+            " study.columns=[success]), or add task.variants"
         )
     if name and name not in known:
         raise ConfigError(f"variant={name} is not one of task.variants{nearest(name, known)}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +17,7 @@ from envs.physics.suite import build_suite
 from envs.targets import ConfigError
 from learners.training.fit import FitConfig
 from pipeline.config import load_config
+from pipeline.evaluation.by_task import variant_of
 from pipeline.graph.stage import Inputs
 from pipeline.stages import pace
 from pipeline.study.columns import Measured, Success
@@ -218,6 +220,15 @@ def test_a_task_without_episodes_is_not_called_not_run() -> None:
     )
     assert mine.count("no episode") == 1 and "not run" not in mine
     assert other.count("not run") == 3 and "no episode" not in other
+
+
+def test_what_leaves_out_a_variant_that_a_task_has_not_is_an_option_of_any_study(
+    cfg: dict[str, Any],
+) -> None:
+    with pytest.raises(ConfigError, match="has no variants") as refused:
+        variant_of(cfg, "out_of_domain")
+    told = re.findall(r"column by ([^ ]+)\)", str(refused.value))
+    assert load_config(["experiment=soak", *told])["study"]["columns"] == ["success"]
 
 
 def test_success_is_drawn_by_task_and_scene_of_a_variant(tmp_path: Path, cfg: dict[str, Any]) -> None:
