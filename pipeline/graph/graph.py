@@ -88,7 +88,7 @@ class Graph:
             raise ValueError(f"stage {name} comes before its inputs {unknown}")
         read = sections(self.cfg, stage.reads_of(settings))
         config = {
-            path: digest(json.dumps(_decisive(path, value), sort_keys=True)) for path, value in read.items()
+            path: digest(json.dumps(decisive(path, value), sort_keys=True)) for path, value in read.items()
         }
         for path, value in read.items():
             if files := option_files(path, value):
@@ -228,8 +228,8 @@ def _names(names: str | Sequence[str]) -> tuple[str, ...]:
     return (names,) if isinstance(names, str) else tuple(names)
 
 
-def _decisive(path: str, section: Any) -> Any:
-    """The part of a section that decides what comes out of a stage that reads it."""
+def decisive(path: str, section: Any) -> Any:
+    """The part of a section that decides what comes out of whoever reads it."""
     if path != "judge" or not isinstance(section, Mapping) or "_target_" not in section:
         return section
     kind: Any = target(section, "judge")

@@ -19,7 +19,7 @@ from envs.simulators.state_experts.base import StateDecoder
 from envs.targets import ConfigError
 from pipeline.evaluation.measurement import followed
 from pipeline.graph.code_version import code_of
-from pipeline.graph.graph import Graph
+from pipeline.graph.graph import Graph, decisive
 from pipeline.loop import build_loop, has_physics
 from pipeline.outside import KINEMATICS, files_at, fingerprint, judge_files
 from pipeline.stages.given import datasets, learns
@@ -158,12 +158,13 @@ class Subject:
         }
 
     def identity(self, *roles: str) -> dict[str, Any]:
-        """What tells this world from others, as far as some of its parts go: sections, weights, and the files
-        that decide what a judge says.
+        """What tells this world from others, as far as some of its parts go: what decides of their sections,
+        weights, and the files that decide what a judge says.
         """
         sections = {"simulator": "simulator", "state": "simulator", "judge": "judge"}
+        read = sorted({sections[role] for role in roles})
         return {
-            "sections": {name: self.cfg[name] for name in sorted({sections[role] for role in roles})},
+            "sections": {name: decisive(name, self.cfg[name]) for name in read},
             "weights": {role: mark_of(self.weights[role]) for role in roles},
             **(judge_files(self.cfg) if "judge" in roles else {}),
         }

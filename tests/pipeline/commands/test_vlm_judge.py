@@ -19,6 +19,7 @@ from envs.judges.vlm.ledger import _ledger
 from envs.targets import ConfigError
 from pipeline.cli.words import prepared
 from pipeline.commands.worlds.judge import Selection, judge_study
+from pipeline.commands.worlds.policy_value import policy_value
 from pipeline.config import load_config
 from pipeline.graph.stage import Inputs
 from pipeline.loop import build_loop
@@ -26,6 +27,7 @@ from pipeline.stages.given import DATASETS
 from pipeline.stages.judging import stage as judging
 from tests.embodiments import ARM_DELTAS
 from tests.envs.judges.chat_server import MODEL, ChatServer, seeing, serving
+from tests.worlds import untrained_world
 
 
 @pytest.fixture
@@ -134,6 +136,25 @@ def test_the_study_says_what_is_missing(words: list[str], tmp_path: Path) -> Non
         judge_study(load_config(learned), tmp_path / "run", Selection.of({"split": "all"}))
     with pytest.raises(ConfigError, match="has recorded nothing yet: first `worldloop stage collect`"):
         judge_study(load_config([f"runs={tmp_path}"]), tmp_path / "run", Selection.of({}))
+
+
+def test_values_that_were_judged_stay_when_the_budget_or_patience_changes(
+    words: list[str], server: ChatServer, tmp_path: Path
+) -> None:
+    words = ["experiment=smoke", "track=disabled", *words, "task.chunk=4", "task.horizon=4"]
+    words += ["policy_value={repeats: 1, starts: 2, noise: [0.5]}"]
+    words += untrained_world(load_config(words), tmp_path)
+    words += [f"policy_value.policies=[{tmp_path / 'policy'}]"]
+    _ledger.cache_clear()
+    with pytest.raises(JudgeError, match=r"judge\.budget\.calls=8 is spent"):
+        policy_value(load_config([*words, "judge.budget.calls=8"]), tmp_path / "run")
+    _ledger.cache_clear()
+    assert policy_value(load_config(words), tmp_path / "run").endswith("\n1 parts were reused")
+    asked, patient = len(server.seen), ["judge.asking.retries=9", f"judge.asking.cache={tmp_path}/other"]
+    assert policy_value(load_config([*words, *patient]), tmp_path / "run").endswith("\n2 parts were reused")
+    assert len(server.seen) == asked
+    changed = policy_value(load_config([*words, "judge.pictures.side=48"]), tmp_path / "run")
+    assert changed.endswith("\n0 parts were reused") and len(server.seen) > asked
 
 
 def test_a_changed_prompt_makes_judgements_out_of_date(words: list[str], tmp_path: Path) -> None:
