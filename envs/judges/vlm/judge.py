@@ -145,7 +145,7 @@ class VLMJudge(Judge):
     ) -> Ticket:
         """See Judge.submit; the first questions are under way when it returns."""
         clips = zip(frames.cpu().numpy(), first.cpu().numpy(), list(instruction), strict=True)
-        work = _all([self._clip(*clip) for clip in clips])
+        work = self._clips([self._clip(*clip) for clip in clips])
         return Ticket(asyncio.run_coroutine_threadsafe(work, background_loop()), frames.device)
 
     def fetch(self, ticket: Ticket) -> Judgement:
@@ -155,6 +155,13 @@ class VLMJudge(Judge):
         status = torch.tensor([answer.status.value for answer in answers], dtype=torch.int64)
         success = shares.to(ticket.device)
         return Judgement(success, success.clone(), status.to(ticket.device))
+
+    async def _clips(self, work: list[Coroutine[Any, Any, Answer]]) -> list[Answer]:
+        """What comes of clips; what it cost is written down even where it broke off."""
+        try:
+            return await _all(work)
+        finally:
+            self.asker.ledger.write()
 
     async def _clip(self, frames: NDArray[np.uint8], first: NDArray[np.uint8], instruction: str) -> Answer:
         """Judge a clip uint8 [T, V, 3, H, W] of the episode that began with `first` [V, 3, H, W]."""

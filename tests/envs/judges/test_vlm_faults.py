@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from envs.judges import JudgeError
+from envs.judges.vlm import VLMJudge
 from envs.specs import Status
 from envs.targets import ConfigError
 from tests.envs.judges.chat_server import (
@@ -158,6 +159,18 @@ def test_a_model_that_never_says_what_it_is_asked_for_stops_the_run(make: Make, 
     with pytest.raises(JudgeError, match="nothing usable"):  # what was remembered says no more
         score(make(votes={"count": 1}, asking={"stop_after": 3}), *(clip(k / 20) for k in range(3, 6)))
     assert len(server.seen) == asked
+
+
+def test_useless_and_remembered_answers_are_told_beside_the_cost(
+    make: Make, options: dict[str, Any], server: ChatServer
+) -> None:
+    new_command()
+    server.answer = lambda asked: "I cannot say."
+    for remembered in (0, 3):
+        assert score(make(), clip(FAR)).status.tolist() == [Status.ABSTAIN.value]
+        spent = VLMJudge.spent(options)
+        assert spent["calls"] == 3 and spent["remembered"] == remembered
+        assert spent["unusable"] == 3 + remembered
 
 
 def test_a_dead_server_stops_the_run(make: Make, server: ChatServer) -> None:
