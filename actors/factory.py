@@ -181,22 +181,25 @@ def build_world(
     cfg: Mapping[str, Any],
     simulator: Simulator,
     decoder: StateDecoder,
-    judge: Judge,
+    judge: Judge | None,
     starts: InitialStates,
     batch: int,
     later: bool = False,
     horizon: int | None = None,
 ) -> TransformedEnv:
-    """The imagined world with its three transforms.
+    """The imagined world with its transforms.
 
     Args:
+        judge: see world_transforms.
         starts: where episodes begin.
         batch: of them side by side.
         later: see JudgeReward.
         horizon: control steps of an episode, the task's by default.
     """
     task, section = cfg["task"], cfg["simulator"]
-    simulator.eval(), decoder.eval(), judge.eval()
+    simulator.eval(), decoder.eval()
+    if judge is not None:
+        judge.eval()
     base = WorldEnv(
         simulator,
         starts,

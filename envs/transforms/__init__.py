@@ -17,23 +17,20 @@ __all__ = ["ActionDecoding", "JudgeReward", "StateExpertTransform", "world_trans
 def world_transforms(
     spec: WorldSpec,
     decoder: StateDecoder,
-    judge: Judge,
+    judge: Judge | None,
     rewards: Rewards,
     *,
     later: bool = False,
     style: PoseMapStyle | None = None,
     kinematics: Kinematics | None = None,
 ) -> Compose:
-    """The three transforms in their order: chunks to conditioned commands going in, states and rewards coming
-    out.
+    """The transforms in their order: chunks to conditioned commands going in, states and rewards coming out.
 
     Args:
+        judge: decides rewards; None for video that nobody judges, which has none.
         later: rewards arrive after the episode, see JudgeReward.
         style: how pose maps are drawn; must be that of training.
         kinematics: of the robot, for pose maps of joint commands.
     """
-    return Compose(
-        ActionDecoding(spec, style, kinematics),
-        StateExpertTransform(decoder),
-        JudgeReward(judge, rewards, later),
-    )
+    reward = [] if judge is None else [JudgeReward(judge, rewards, later)]
+    return Compose(ActionDecoding(spec, style, kinematics), StateExpertTransform(decoder), *reward)

@@ -48,7 +48,7 @@ def sweep(cfg: Mapping[str, Any], root: Path) -> list[Path]:
     spread = usual_travel(store, cfg)
     names = store.spec.embodiment.action_names
     simulator = subject.simulator()
-    parts = (simulator, subject.decoder(simulator), subject.judge())
+    parts = (simulator, subject.decoder(simulator), None)  # nobody is rewarded
     levels = [0.0, *section["levels"]]
     starts = InitialStates.of(store, torch.tensor([section["episode"]]))
     horizon = section["chunks"] * store.spec.chunk

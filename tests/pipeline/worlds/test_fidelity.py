@@ -201,6 +201,15 @@ def test_a_contact_sheet_for_each_number_of_any_robot(
         sweep(load_config([*words, "sweep.episode=99"]), tmp_path / "run")
 
 
+def test_contact_sheets_ask_no_judge(tmp_path: Path, tiny_data: Callable[[Embodiment], Path]) -> None:
+    words = ["experiment=smoke", "track=disabled", "task=lerobot", f"task.data=[{tiny_data(ARM_DELTAS)}]"]
+    words += ["task.size=[32,32]", "task.chunk=4", "task.horizon=8", "sweep.chunks=1", "sweep.levels=[1.0]"]
+    words += untrained_world(load_config(words), tmp_path)[:2]  # not its judge
+    nobody_there = ["judge=vlm", "judge.chat.url=http://127.0.0.1:9/v1", "judge.chat.model=any"]
+    for judge in ([], nobody_there):  # one that has not learned yet, and one that cannot be reached
+        assert len(sweep(load_config([*words, *judge]), tmp_path / "run")) == ARM_DELTAS.action_dim
+
+
 def test_deltas_are_repeated_and_absolute_numbers_go_there() -> None:
     start, travel = torch.ones(1, 4), torch.tensor([[0.0, 0.4, 0.0, 0.0]])
     assert commanded(world_spec(ARM_DELTAS), start, travel, 4)[0, :, 1].tolist() == pytest.approx([0.4] * 4)
