@@ -22,7 +22,7 @@ from pipeline.evaluation.value.agreement import ALL, Cell, agreement, overall
 from pipeline.evaluation.value.candidates import Candidate, action_spread, candidates
 from pipeline.evaluation.value.estimate import Comparison, starts_of, task_of
 from pipeline.evaluation.value.page import build_page, table_text
-from pipeline.graph.code_version import code_of
+from pipeline.graph.code_version import code_of, digest
 from pipeline.graph.kept import Kept
 from pipeline.loop import has_physics
 from pipeline.stages import imitation, rl
@@ -62,7 +62,9 @@ def policy_value(cfg: Mapping[str, Any], root: Path) -> str:
     judge = subject.judge()
     parts = (simulator, subject.decoder(simulator), judge)
     world = {**subject.identity("simulator", "state", "judge"), **physics}
-    with Spending(cfg["judge"], root / "policy-value" / COST) as spending:
+    # by world and judge: others have paid their own
+    mark = digest(json.dumps(world, sort_keys=True, default=str))
+    with Spending(cfg["judge"], root / "policy-value" / f"{mark}-{COST}") as spending:
         cells = comparison.imagined(parts, world, kept, true)
         cost = spending.total
     result = {

@@ -27,7 +27,7 @@ from pipeline.stages.given import DATASETS
 from pipeline.stages.judging import stage as judging
 from tests.embodiments import ARM_DELTAS
 from tests.envs.judges.chat_server import MODEL, ChatServer, seeing, serving
-from tests.worlds import untrained_world
+from tests.worlds import untrained_world, written
 
 
 @pytest.fixture
@@ -153,8 +153,11 @@ def test_values_that_were_judged_stay_when_the_budget_or_patience_changes(
     asked, patient = len(server.seen), ["judge.asking.retries=9", f"judge.asking.cache={tmp_path}/other"]
     assert policy_value(load_config([*words, *patient]), tmp_path / "run").endswith("\n2 parts were reused")
     assert len(server.seen) == asked
+    page = written(tmp_path / "run", "policy-value.json")
+    assert json.loads(page.read_text())["judge_cost"]["calls"] == asked
     changed = policy_value(load_config([*words, "judge.pictures.side=48"]), tmp_path / "run")
     assert changed.endswith("\n0 parts were reused") and len(server.seen) > asked
+    assert json.loads(page.read_text())["judge_cost"]["calls"] == len(server.seen) - asked
 
 
 def test_a_changed_prompt_makes_judgements_out_of_date(words: list[str], tmp_path: Path) -> None:
