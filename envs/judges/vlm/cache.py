@@ -6,7 +6,7 @@ import hashlib
 import json
 from pathlib import Path
 
-from envs.files import write_json
+from envs.files import new_neighbour, remove, write_json
 from envs.judges.vlm.chat import Question, Reply
 
 
@@ -41,8 +41,14 @@ class AnswerCache:
             return None
 
     def put(self, key: str, reply: Reply) -> None:
-        """Keep an answer."""
-        write_json(self._path(key), vars(reply))
+        """Keep an answer, also where other processes put the same one meanwhile."""
+        path = self._path(key)
+        own = new_neighbour(path)
+        try:
+            write_json(own / path.name, vars(reply))
+            (own / path.name).replace(path)
+        finally:
+            remove(own)
 
     def _path(self, key: str) -> Path:
         return self.folder / key[:2] / f"{key}.json"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 import traceback
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ import torch
 from envs.judges import JudgeError
 from envs.judges.vlm import VLMJudge
 from envs.judges.vlm.answers import parse
+from envs.judges.vlm.cache import AnswerCache
+from envs.judges.vlm.chat import Reply
 from envs.specs import Status
 from envs.targets import ConfigError
 from tests.envs.judges.chat_server import (
@@ -175,6 +178,13 @@ def test_a_damaged_answer_is_asked_for_again(make: Make, server: ChatServer, tmp
     for path in (tmp_path / "cache" / "answers").rglob("*.json"):
         path.write_text('{"text": "Answer')
     assert score(make(), clip(DONE)).status.tolist() == [0] and len(server.seen) == 6
+
+
+def test_many_may_keep_the_same_answer_at_once(tmp_path: Path) -> None:
+    cache, reply = AnswerCache(tmp_path), Reply("Answer: Yes", 1, 1)
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda _: cache.put("ab12", reply), range(400)))
+    assert cache.get("ab12") == reply and len(list(tmp_path.rglob("*"))) == 3  # nothing is left beside it
 
 
 @pytest.mark.parametrize("limit", [{"calls": 7}, {"tokens": 700}])
