@@ -18,6 +18,7 @@ from envs.simulators.base import Simulator
 from envs.simulators.state_experts.base import StateDecoder
 from envs.targets import ConfigError
 from pipeline.evaluation.measurement import followed
+from pipeline.evaluation.result import result_of
 from pipeline.graph.code_version import code_of
 from pipeline.graph.graph import Graph, decisive
 from pipeline.loop import build_loop, has_physics
@@ -66,10 +67,12 @@ class Subject:
         named = section["simulator"]
         made_as = stage_of(weights["simulator"]) if named else ""
         student = 0 if made_as == "simulator" else cfg["distill"]["steps"]
-        if made_as == "student" and not student:
+        learned = result_of(weights["simulator"].parent)["evaluations"] if made_as == "student" else student
+        if student != learned:
             raise ConfigError(
-                f"imagined.simulator={named} is a few-step student, which distill.steps=0 would sample as its"
-                " teacher; say distill.steps=<as it was distilled>"
+                f"imagined.simulator={named} is a student of {learned} evaluations, and"
+                f" distill.steps={student} would sample it in a way that it has not learned; say"
+                f" distill.steps={learned}"
             )
         cfg = graph.cfg if student else cfg  # a teacher is sampled as one, whatever the run acts in
         if section["data"]:

@@ -83,7 +83,7 @@ def test_a_teacher_and_its_student_are_each_sampled_as_they_were_made(tmp_path: 
         folder = graph.folder(name)
         folder.mkdir(parents=True)
         save_file(made, folder / "weights.safetensors")
-        write_manifest(folder, {"stage": name, "key": graph.key(name), "result": {}})
+        write_manifest(folder, {"stage": name, "key": graph.key(name), "result": {"evaluations": 2}})
     samplers, pages = {}, {}
     for name in ("simulator-1", "student-1"):
         subject = Subject.of(load_config([*words, f"imagined.simulator={name}"]), root)
@@ -98,8 +98,12 @@ def test_a_teacher_and_its_student_are_each_sampled_as_they_were_made(tmp_path: 
     assert samplers["student-1"].jumps and samplers["student-1"].evaluations == 2
     assert pages == {name: root / "simulators" / name for name in pages}
     alone = [word for word in words if not word.startswith("distill")]
-    with pytest.raises(ConfigError, match=r"imagined\.simulator=.*few-step student, .* say distill\.steps="):
-        Subject.of(load_config([*alone, f"imagined.simulator={graph.folder('student-1')}"]), root)
+    for steps in (0, 1):  # at levels that it has not learned it is not that student
+        other = [*alone, f"distill.steps={steps}", f"imagined.simulator={graph.folder('student-1')}"]
+        with pytest.raises(
+            ConfigError, match=rf"student of 2 .*distill\.steps={steps} .*say distill\.steps=2"
+        ):
+            Subject.of(load_config(other), root)
 
 
 def test_a_simulator_is_evaluated_by_one_command(
