@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ from envs.simulators.state_experts.base import StateDecoder
 from envs.targets import ConfigError
 from pipeline.evaluation.measurement import followed
 from pipeline.evaluation.result import result_of
-from pipeline.graph.code_version import code_of
+from pipeline.graph.code_version import code_of, digest
 from pipeline.graph.graph import Graph, decisive
 from pipeline.loop import build_loop, has_physics
 from pipeline.outside import KINEMATICS, files_at, fingerprint, judge_files
@@ -148,8 +149,8 @@ class Subject:
         return self.weights["judge"].is_file() or not learns(build_judge(self.cfg))
 
     def about(self) -> dict[str, Any]:
-        """What is looked at, for people: name, classes of simulator and judge, the weights' files, and their
-        marks, by which a file that was written anew is another.
+        """What is looked at, for people: name, classes of simulator and judge, the weights' files, their
+        marks, by which a file that was written anew is another, and options, that of the section simulator.
         """
         engine = str(self.cfg["simulator"]["_target_"]).rpartition(".")[2]
         return {
@@ -158,6 +159,7 @@ class Subject:
             "judge": str(self.cfg["judge"]["_target_"]).rpartition(".")[2],
             "weights": {role: str(path) for role, path in self.weights.items()},
             "marks": {role: mark_of(path) for role, path in self.weights.items()},
+            "options": digest(json.dumps(self.cfg["simulator"], sort_keys=True, default=str)),
         }
 
     def identity(self, *roles: str) -> dict[str, Any]:

@@ -18,7 +18,8 @@ RESULTS = ("fidelity", "ewmbench", "policy-value")  # commands, and the names of
 
 def summary(cfg: Mapping[str, Any], root: Path) -> str:
     """Write summary.html into the simulator's folder (see pages_of), from what is there. What was measured of
-    other weights than the newest result, such as before they were trained anew, is left out.
+    other weights than the newest result, such as before they were trained anew, or with other options of the
+    simulator, such as more steps, is left out.
 
     Returns:
         The table, as Markdown, and where the page lies.
@@ -35,15 +36,20 @@ def summary(cfg: Mapping[str, Any], root: Path) -> str:
             " ewmbench` or `worldloop policy-value` with the same options"
         )
     newest = there[max(there, key=lambda name: files[name].stat().st_mtime)]
-    left_out = {
-        name: f"What {files[name].name} says is of other weights: {', '.join(_weights(result))}."
-        for name, result in there.items()
-        if _weights(result) != _weights(newest)
-    }
+    odd = {name: _odd(result, newest) for name, result in there.items()}
+    left_out = {name: f"What {files[name].name} says is of {why}." for name, why in odd.items() if why}
     parts = parts_of({name: result for name, result in there.items() if name not in left_out}, left_out)
     page = build_page(newest["name"], newest["simulator"], newest["weights"]["simulator"], parts)
     write_text(folder / "summary.html", page)
     return f"{summary_text(newest['simulator'], parts)}\n{folder / 'summary.html'}"
+
+
+def _odd(result: Mapping[str, Any], newest: Mapping[str, Any]) -> str:
+    """What a result is of that the newest is not; "" if both are of one simulator."""
+    if _weights(result) != _weights(newest):
+        return f"other weights: {', '.join(_weights(result))}"
+    same = result.get("options") == newest.get("options")  # results of former versions hold none
+    return "" if same else "the same weights with other options of the section simulator"
 
 
 def _weights(result: Mapping[str, Any]) -> tuple[str, str]:

@@ -56,6 +56,14 @@ def test_what_was_measured_stands_on_one_page(
     page = written(root, "summary.html").read_text()
     assert "1 held-out episodes, one sample of each; features by" in page
     assert page.count("<table>") == 3 and not re.findall(r'(?:src|href)=(?!"#)', page)
+    bf16 = load_config(words)["simulator"]["bf16"]
+    fidelity(load_config([*words, f"simulator.bf16={not bf16}"]), root)
+    other = summary(load_config(words), root)
+    assert (
+        "| PSNR dB" in other and "| scene ↑" not in other and other.count("the same weights with other") == 2
+    )
+    fidelity(load_config(words), root)
+    assert "with other options" not in summary(load_config(words), root)
     first = json.loads(written(root, "fidelity.json").read_text())
     weights = Path(first["weights"]["simulator"])
     save_file({name: value * 2 for name, value in load_file(weights).items()}, weights)  # trained anew
