@@ -18,8 +18,9 @@ _CHUNKS = 16  # of a video at most, for recordings may be long
 
 @dataclass(frozen=True)
 class Film:
-    """Replays the first held-out episode, or the first one if none is held out, and leaves a video of it:
-    media/held-out-step000400.mp4 or media/learned-from-step000400.mp4, imagined above, recorded below.
+    """Replays the first held-out episode that begins with a picture, or the first such of all if none is held
+    out, and leaves a video of it: media/held-out-step000400.mp4 or media/learned-from-step000400.mp4,
+    imagined above, recorded below.
 
     Args:
         simulator: which learns.
@@ -36,9 +37,11 @@ class Film:
     def __call__(self, step: int) -> None:
         """Film what it draws after so many steps; every worker calls."""
         held = self.store.split("held_out")
-        label, episode = ("held-out", held[:1]) if len(held) else ("learned-from", torch.tensor([0]))
-        if int(self.store.length[episode]) < 2:
-            return  # nothing follows its first picture
+        label, some = ("held-out", held) if len(held) else ("learned-from", torch.arange(len(self.store)))
+        begun = self.store.arrays["present"][self.store.start[some]]
+        episode = some[begun & (self.store.length[some] > 1)][:1]
+        if not len(episode):
+            return  # of none there is a first picture that something follows
         made = replay(self.simulator, self.store, episode, bf16=self.bf16, most=_CHUNKS)
         valid = made.valid[0]
         videos = (made.frames[0][valid], self.store.frames(made.rows[0][valid]))

@@ -88,12 +88,15 @@ def rollout_error(store: ClipStore, episodes: Tensor, made: Replay) -> dict[str,
 
 def speed(simulator: Simulator, store: ClipStore, batch: int, chunks: int, bf16: bool) -> float:
     """Generated frames per second (all views together count as one) at a batch size, SIDE_BY_SIDE at most:
-    over the first chunks of the longest episodes, and fewer of them where so many do not fit side by side.
+    over the first chunks of the longest episodes that begin with a picture, and fewer of them where so many
+    do not fit side by side.
 
     Args:
         chunks: to generate, about, in passes of ten at most.
     """
-    episodes = store.length.argsort(descending=True)[torch.arange(batch) % len(store)]
+    begun = store.arrays["present"][store.start]
+    longest = (store.length * begun).argsort(descending=True)
+    episodes = longest[torch.arange(batch) % max(1, int(begun.sum()))]
     together, most = min(batch, SIDE_BY_SIDE), _CHUNKS
     while most > 1 and side_by_side(store, 1 + most * store.spec.chunk) < together:
         most -= 1

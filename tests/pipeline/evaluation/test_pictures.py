@@ -17,6 +17,7 @@ from envs.initial_states import InitialStates
 from envs.judges.perceptual import PerceptualDistance
 from envs.simulators import replay as replaying
 from envs.simulators.replay import replay, side_by_side
+from learners.stages.film import Film
 from pipeline.evaluation.ewmbench.choose import in_pictures
 from pipeline.evaluation.ewmbench.features import PyramidPatches
 from pipeline.evaluation.ewmbench.measure import Instruments
@@ -120,6 +121,20 @@ def test_video_is_not_generated_from_a_frame_without_a_picture(tmp_path: Path, d
             ask()
     assert begun.pictures(SOME).tolist() == [11] * 8 and dark.pictures(SOME).tolist() == [10] * 8
     assert without_picture(store_of(tmp_path / "whole", ()), SOME) == []
+
+
+def test_films_and_speed_are_of_episodes_that_begin_with_a_picture(tmp_path: Path) -> None:
+    begun = store_of(tmp_path / "set", (0,))
+    present, first = begun.arrays["present"], begun.start
+    film = Film(Drawing(SPEC, "right"), begun, tmp_path, False)
+    film(1)  # nothing can be drawn, and training goes on
+    assert not (tmp_path / "media").exists()
+    with pytest.raises(EpisodeError, match="have no picture at their first"):
+        speed(Drawing(SPEC, "right"), begun, 4, 1, False)
+    present[first[begun.split("held_out")[1]]] = True
+    film(2)
+    assert (tmp_path / "media/held-out-step000002.mp4").is_file()
+    assert speed(Drawing(SPEC, "right"), begun, 4, 1, False) > 0
 
 
 class Counting(Drawing):
