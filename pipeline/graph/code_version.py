@@ -12,6 +12,7 @@ import ast
 import hashlib
 import importlib.metadata
 import importlib.util
+import json
 import sys
 from collections.abc import Iterable, Mapping
 from functools import cache
@@ -42,6 +43,11 @@ def code_of(module: str, config: Mapping[str, Any]) -> dict[str, str]:
 def digest(value: Any) -> str:
     """A short hash of a text."""
     return hashlib.sha256(str(value).encode()).hexdigest()[:12]
+
+
+def json_digest(value: Any) -> str:
+    """A short hash of what JSON can hold, in whatever order its keys are; of other things, as text."""
+    return digest(json.dumps(value, sort_keys=True, default=str))
 
 
 def targets(section: Any) -> Iterable[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from envs.files import atomic
-from pipeline.graph.code_version import digest
+from pipeline.graph.code_version import json_digest
 
 Tensors = dict[str, Tensor]
 _ODD = r"[^\w.+-]+"  # in names of files
@@ -36,7 +35,7 @@ class Kept:
 
     def get(self, name: str, identity: Mapping[str, Any], make: Callable[[], Tensors]) -> Tensors:
         """What `make` gave for this identity, now or at some earlier time."""
-        key = digest(json.dumps(identity, sort_keys=True, default=str))
+        key = json_digest(identity)
         path = self.folder / f"{re.sub(_ODD, '_', name)}-{key}.safetensors"
         there = path.exists()
         self._left.setdefault(path, there)

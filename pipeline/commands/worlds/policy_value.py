@@ -22,7 +22,7 @@ from pipeline.evaluation.value.agreement import ALL, Cell, agreement, overall
 from pipeline.evaluation.value.candidates import Candidate, action_spread, candidates
 from pipeline.evaluation.value.estimate import Comparison, starts_of, task_of
 from pipeline.evaluation.value.page import build_page, table_text
-from pipeline.graph.code_version import code_of, digest
+from pipeline.graph.code_version import code_of, json_digest
 from pipeline.graph.kept import Kept
 from pipeline.loop import has_physics
 from pipeline.stages import imitation, rl
@@ -63,8 +63,8 @@ def policy_value(cfg: Mapping[str, Any], root: Path) -> str:
     parts = (simulator, subject.decoder(simulator), judge)
     world = {**subject.identity("simulator", "state", "judge"), **physics}
     # by world and judge: others have paid their own
-    mark = digest(json.dumps(world, sort_keys=True, default=str))
-    with Spending(cfg["judge"], root / "policy-value" / f"{mark}-{COST}") as spending:
+    paid = root / "policy-value" / f"{json_digest(world)}-{COST}"
+    with Spending(cfg["judge"], paid) as spending:
         cells = comparison.imagined(parts, world, kept, true)
         cost = spending.total
     result = {

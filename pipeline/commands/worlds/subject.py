@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from envs.simulators.state_experts.base import StateDecoder
 from envs.targets import ConfigError
 from pipeline.evaluation.measurement import followed
 from pipeline.evaluation.result import result_of
-from pipeline.graph.code_version import code_of, digest
+from pipeline.graph.code_version import code_of, json_digest
 from pipeline.graph.graph import Graph, decisive
 from pipeline.loop import build_loop, has_physics
 from pipeline.outside import KINEMATICS, files_at, fingerprint, judge_files
@@ -159,7 +158,7 @@ class Subject:
             "judge": str(self.cfg["judge"]["_target_"]).rpartition(".")[2],
             "weights": {role: str(path) for role, path in self.weights.items()},
             "marks": {role: mark_of(path) for role, path in self.weights.items()},
-            "options": digest(json.dumps(self.cfg["simulator"], sort_keys=True, default=str)),
+            "options": json_digest(self.cfg["simulator"]),
         }
 
     def identity(self, *roles: str) -> dict[str, Any]:

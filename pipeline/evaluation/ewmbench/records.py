@@ -16,7 +16,7 @@ from torch import Tensor
 from envs.files import write_json
 from pipeline.evaluation.ewmbench.scene import Scene
 from pipeline.evaluation.ewmbench.semantics import VideoReport
-from pipeline.graph.code_version import digest
+from pipeline.graph.code_version import json_digest
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Records:
 
     def path(self, name: str, about: Mapping[str, Any]) -> Path:
         """The file of a video."""
-        key = digest(json.dumps([self.identity, about], sort_keys=True, default=str))
+        key = json_digest([self.identity, about])
         return self.folder / f"{re.sub(r'[^A-Za-z0-9_.+-]+', '_', name)}-{key}.json"
 
     def get(self, name: str, about: Mapping[str, Any]) -> Record | None:

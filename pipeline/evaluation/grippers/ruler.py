@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +27,7 @@ from pipeline.evaluation.grippers.detecting import (
 )
 from pipeline.evaluation.grippers.detector import GripperDetector
 from pipeline.evaluation.grippers.end_effectors import EndEffectors, arm_names, known_end_effectors
-from pipeline.graph.code_version import code_of, digest
+from pipeline.graph.code_version import code_of, json_digest
 from pipeline.outside import KINEMATICS, files_at, fingerprint
 
 _MODULE = "pipeline.evaluation.grippers.detecting"
@@ -130,7 +129,7 @@ def gripper_ruler(cfg: Mapping[str, Any], store: ClipStore, data: Sequence[Path]
         "section": section,
         "code": code_of(_MODULE, {}),
     }
-    key = digest(json.dumps(about, sort_keys=True, default=str))
+    key = json_digest(about)
     folder = root / "ewmbench" / f"detector-{key}"
     detector = train_detector(sights, section, folder, device_of(cfg))
     return GripperRuler(detector, sights.views, sights, folder / WEIGHTS)
