@@ -130,7 +130,18 @@ def _source(module: str) -> Path | None:
 
 @cache
 def _tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(), filename=str(path))
+    """A file's syntax tree without docstrings."""
+    tree = ast.parse(path.read_text(), filename=str(path))
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
+            first = node.body[0] if node.body else None
+            if (
+                isinstance(first, ast.Expr)
+                and isinstance(first.value, ast.Constant)
+                and isinstance(first.value.value, str)
+            ):
+                node.body = node.body[1:]
+    return tree
 
 
 @cache
@@ -153,18 +164,8 @@ def _imports(module: str, path: Path) -> tuple[str, ...]:
 
 @cache
 def _file_hash(path: Path) -> str:
-    """Hash of a file's syntax tree without docstrings and positions."""
-    tree = ast.parse(path.read_text())
-    for node in ast.walk(tree):
-        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
-            first = node.body[0] if node.body else None
-            if (
-                isinstance(first, ast.Expr)
-                and isinstance(first.value, ast.Constant)
-                and isinstance(first.value.value, str)
-            ):
-                node.body = node.body[1:]
-    return digest(ast.dump(tree))
+    """Hash of a file's syntax tree; positions are not part of it."""
+    return digest(ast.dump(_tree(path)))
 
 
 @cache
@@ -185,6 +186,7 @@ def _name(path: Path) -> str:
     return str(path.relative_to(ROOT)) if path.is_relative_to(ROOT) else str(path)
 
 
+@cache
 def _version(module: str) -> dict[str, str]:
     """{path: hash} of a module that has sources here, {distribution: version} of an installed one."""
     path = _source(module)

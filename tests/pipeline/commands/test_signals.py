@@ -114,7 +114,7 @@ AT_ONCE = {"convert", "stages", "summary", "compare", "submit", "tasks", "config
 
 # The same code answers both, so one command is asked one way and the next the other; those whose processes
 # live longest are asked both ways.
-BOTH = ("run", "serve", "chaos", "chaos soak")
+BOTH = ("run", "serve", "chaos")
 CASES = [
     (name, number)
     for place, name in enumerate(LASTS)
