@@ -17,7 +17,10 @@ from tensordict import TensorDict
 from actors.fleets.fleet import Fleet, FleetError, Result
 from actors.rollouts.footage import Footage
 from actors.rollouts.host import Job, Stopwatch, Weights
+from envs.rng import iteration_generator, sampling_seed
 from envs.targets import ConfigError
+from learners.rl.algorithm import Algorithm, RLConfig
+from learners.rl.starts import Starts
 
 SHOWN = 6  # episodes
 
@@ -202,3 +205,19 @@ class AsyncFeed(Feed):
                 self._next, self._wave = self.jobs(self._wave), self._wave + 1
             self._submit(self._next.pop(0))
             self._waiting += 1
+
+
+def build_feed(fleet: Fleet, algorithm: Algorithm, config: RLConfig, starts: Starts, first: int = 0) -> Feed:
+    """The feed of `config.schedule`, whose jobs draw their starts and exploration from (seed, iteration)."""
+
+    def seeds(iteration: int) -> list[int]:
+        generator = iteration_generator(config.seed, iteration)
+        return starts.seeds(algorithm.seeds(len(starts.pool), config.envs, generator), iteration)
+
+    def sampling(iteration: int, shard: int) -> int:
+        return sampling_seed(config.seed, iteration, shard)
+
+    common = (fleet, config.shards, seeds, sampling, config.max_dropped, first, config.checkpoint_every)
+    if config.schedule == "sync":
+        return Feed(*common)
+    return AsyncFeed(*common, config.max_policy_lag, config.queue)

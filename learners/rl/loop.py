@@ -25,11 +25,11 @@ from tqdm import tqdm
 
 from actors.fleets.fleet import EpisodeLedger, Fleet
 from actors.rollouts.host import Weights, trained_weights
-from envs.rng import iteration_generator, sampling_seed, update_seed
+from envs.rng import update_seed
 from envs.targets import ConfigError
 from learners.rl.alarms import Alarms
 from learners.rl.algorithm import Algorithm, RLConfig, episode_counts, within
-from learners.rl.feed import AsyncFeed, Feed
+from learners.rl.feed import Feed, build_feed
 from learners.rl.film import film_rollouts
 from learners.rl.recorded.decisions import TrueExperience
 from learners.rl.starts import Starts
@@ -109,25 +109,13 @@ def train_rl(
         truncate_log(log, first)
         truncate_log(learned, first)
 
-    def seeds(iteration: int) -> list[int]:
-        generator = iteration_generator(config.seed, iteration)
-        return starts.seeds(algorithm.seeds(len(starts.pool), config.envs, generator), iteration)
-
     def share_over(iteration: int) -> float:
         return iteration / config.iterations if config.episodes is None else episodes / config.episodes
-
-    def sampling(iteration: int, shard: int) -> int:
-        return sampling_seed(config.seed, iteration, shard)
 
     feed: Feed | None = None
     if fleet is not None:
         fleet.ledger = ledger
-        common = (fleet, config.shards, seeds, sampling, config.max_dropped, wave, config.checkpoint_every)
-        feed = (
-            Feed(*common)
-            if config.schedule == "sync"
-            else AsyncFeed(*common, config.max_policy_lag, config.queue)
-        )
+        feed = build_feed(fleet, algorithm, config, starts, wave)
 
     def gather(iteration: int, weights: Weights) -> tuple[TensorDict, dict[str, float]]:
         assert feed is not None, "only the leading worker is asked"

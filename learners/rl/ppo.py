@@ -73,7 +73,7 @@ class PPO:
         self.config = config = options(PPOConfig, settings, "algorithm")
         self.policy = trained_part(policy)
         self.critic = build_critic(policy, spec, config.critic_width).to(device_of(policy))
-        self.gae = GAE(gamma=config.gamma, lmbda=config.lam, value_network=None, average_gae=False)
+        self.credit(config.lam)
         self.objective = ClipPPOLoss(
             self.policy,
             self.critic,
@@ -87,6 +87,10 @@ class PPO:
         self.objective.set_keys(action=action_key(self.policy), sample_log_prob=LOG_PROB)
         # The loss registers both as functional parameters; optimising the originals needs them in one place.
         self._all = nn.ModuleList([self.policy, self.critic])
+
+    def credit(self, lam: float) -> None:
+        """Share out returns among decisions by this lambda of GAE from now on."""
+        self.gae = GAE(gamma=self.config.gamma, lmbda=lam, value_network=None, average_gae=False)
 
     def modules(self) -> nn.Module:
         """Policy and critic."""
@@ -108,7 +112,7 @@ class PPO:
         """Advantages of all steps of the rollout, unfinished last episodes included: the critic stands in for
         their rest.
         """
-        self._advantages(batch)
+        self.value(batch)
         value, target = batch["state_value"], batch["value_target"]
         extra = {"advantage": batch["advantage"], "value_target": target, "state_value": value}
         keys = dict.fromkeys([*input_keys(self.policy), *self.critic.in_keys, action_key(self.policy)])
@@ -119,7 +123,7 @@ class PPO:
         }
 
     @torch.no_grad()
-    def _advantages(self, batch: TensorDict) -> None:
+    def value(self, batch: TensorDict) -> None:
         """Write values, advantages and value targets [B, T, 1] into a rollout [B, T]."""
         self.critic.module.take_units(batch[STATE])
         for part in (batch, batch["next"]):
@@ -140,7 +144,7 @@ class PPO:
         shuffle = order_generator(seed)
         valid, explained = rollout["valid"].flatten(), 0.0
         for _ in range(self.config.warmup_passes):
-            self._advantages(rollout)
+            self.value(rollout)
             data = rollout.flatten(0, 1)[valid]
             explained = _explained(data["state_value"], data["value_target"])
             targets = data["value_target"].clone()
@@ -149,7 +153,7 @@ class PPO:
                 value = self.critic(data[pick].select(*self.critic.in_keys))["state_value"]
                 F.smooth_l1_loss(value, targets[pick]).backward()
                 optimiser.step()
-        self._advantages(rollout)
+        self.value(rollout)
         return rollout, explained
 
     def loss(self, minibatch: TensorDict) -> tuple[Tensor, dict[str, float]]:

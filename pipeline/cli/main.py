@@ -22,7 +22,8 @@ from pipeline.cli.words import Words
 COMMANDS: dict[str, Callable[[Words], None]] = {
     command.__name__.replace("_", "-"): command
     for command in (
-        *(runs.run, runs.rl, runs.stage, runs.stages, runs.evaluate, runs.trust, runs.controls, runs.study),
+        *(runs.run, runs.rl, runs.stage, runs.stages, runs.evaluate),
+        *(runs.trust, runs.gradients, runs.controls, runs.study),
         *(
             worlds.policy_value,
             worlds.fidelity,

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from envs.targets import ConfigError, nearest, target
-from pipeline.cli.words import Words, prepared, root_of
+from pipeline.cli.words import Words, counts_of, prepared, root_of
 
 
 def run(words: Words) -> None:
@@ -132,18 +132,21 @@ def trust(words: Words) -> None:
     """
     from pipeline.commands.worlds.trust import trust as table
 
-    own, rest = {"round": 1, "moments": 160, "futures": 8, "depth": 3}, []
-    for word in words:
-        key, _, value = word.partition("=")
-        if key not in own:
-            rest.append(word)
-        elif not value.isdigit() or not int(value):
-            raise ConfigError(f"{word}: say a whole number above 0")
-        else:
-            own[key] = int(value)
+    own, rest = counts_of(words, {"round": 1, "moments": 160, "futures": 8, "depth": 3})
     cfg, root = prepared(rest)
     number = own.pop("round")
     print(table(cfg, root, number, **own))
+
+
+def gradients(words: Words) -> None:
+    """how much RL can learn from a round's imagined decisions, beside recorded ones, and with which lambda:
+    worldloop gradients round=1 [batches=16] experiment=...
+    """
+    from pipeline.commands.worlds.gradients import gradients as table
+
+    own, rest = counts_of(words, {"round": 1, "batches": 16})
+    cfg, root = prepared(rest)
+    print(table(cfg, root, own["round"], own["batches"]))
 
 
 def controls(words: Words) -> None:

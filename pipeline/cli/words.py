@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from envs.targets import ConfigError
+
 Words = list[str]
 
 
@@ -18,6 +20,24 @@ def without_given(base: Sequence[str], words: Sequence[str]) -> list[str]:
 def listed(value: str) -> list[str]:
     """The names in a word's value, such as [a,b] or a."""
     return [name.strip() for name in value.strip("[]").split(",") if name.strip()]
+
+
+def counts_of(words: Words, own: Mapping[str, int]) -> tuple[dict[str, int], Words]:
+    """A command's own numbers, as said or as in `own`, and the other words.
+
+    Raises:
+        ConfigError: at one that is no whole number above 0.
+    """
+    found, rest = dict(own), []
+    for word in words:
+        key, _, value = word.partition("=")
+        if key not in own:
+            rest.append(word)
+        elif not value.isdigit() or not int(value):
+            raise ConfigError(f"{word}: say a whole number above 0")
+        else:
+            found[key] = int(value)
+    return found, rest
 
 
 def root_of(cfg: Mapping[str, Any]) -> Path:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from actors.factory import build_algorithm, build_policy, open_clips
@@ -70,6 +71,47 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     Raises:
         FleetError: if too many episodes are lost; also what to change, where the judge lost most of them.
     """
+    ready = begin(cfg, inputs)
+    fleet = build_fleet(ready.recipe) if leads() else None
+    try:
+        watch = true_success(cfg, ready.settings, inputs.weights("policy"))
+        learning = (fleet, ready.policy, ready.algorithm, ready.settings, folder, ready.starts)
+        stats = train_rl(*learning, true=ready.true, watch=watch)
+        stats["alarms"] = [*stats["alarms"], *nothing_left(ready.settings, ready.true.decisions)]
+    except FleetError as error:
+        raise FleetError(f"{error}{what_the_judge_needs(cfg, fleet)}") from error
+    finally:
+        if fleet is not None:
+            fleet.close()
+    save_weights(ready.policy, folder)
+    last = {f"last_{key}": value for key, value in stats.pop("last").items()}
+    return {"lr": ready.settings.lr, **ready.known, **stats, **last}
+
+
+@dataclass(frozen=True)
+class Imagination:
+    """What learns in a simulator, and what from, before the first iteration.
+
+    Args:
+        recipe: of the hosts that imagine.
+        starts: of imagined episodes.
+        true: what physics has told.
+        rollout: those true episodes [N, T] as the critic values them, if there are any.
+        known: figures of all this.
+    """
+
+    policy: Any
+    algorithm: Algorithm
+    settings: RLConfig
+    recipe: Recipe
+    starts: Starts
+    true: TrueExperience
+    rollout: TensorDict | None
+    known: dict[str, float]
+
+
+def begin(cfg: ConfigView, inputs: Inputs) -> Imagination:
+    """All that the stage `rl` begins with; see there."""
     number, deployed = inputs.settings["number"], deployed_in(inputs, "known")
     prepare_process(cfg["seed"], cfg["threads"])
     store = open_store(cfg, inputs)
@@ -87,7 +129,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
     data, more = (datasets(inputs.folders(role)) for role in ("data", "starts"))
     beyond = open_clips(cfg, more) if more else None
     extra = range(len(store), len(store) + (0 if beyond is None else len(beyond)))
-    knew, decisions = _warm_up(cfg, inputs, policy, algorithm, store, settings.seed)
+    known, rollout, decisions = _warm_up(cfg, inputs, policy, algorithm, store, settings.seed)
     recipe = Recipe(
         config=cfg.plain(),
         episodes=settings.envs // settings.shards,
@@ -103,26 +145,14 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         bootstrap=algorithm.bootstraps,
         later=settings.rewards_later,
     )
-    fleet = build_fleet(recipe) if leads() else None
-    try:
-        starts = starts_of(cfg, *_begun(store, inside, settings.starts == "key"), len(extra))
-        if worth := worth_in(inputs):
-            starts, mean = by_worth(starts, _tasks_of_starts(cfg, store, inside, beyond), worth)
-            if decisions is not None and settings.recorded:
-                settings = replace(settings, imagined=settings.imagined * mean)
-            knew["imagined_weight"] = settings.imagined
-        true = TrueExperience(anchor, decisions)
-        watch = true_success(cfg, settings, inputs.weights("policy"))
-        stats = train_rl(fleet, policy, algorithm, settings, folder, starts, true=true, watch=watch)
-        stats["alarms"] = [*stats["alarms"], *nothing_left(settings, decisions)]
-    except FleetError as error:
-        raise FleetError(f"{error}{what_the_judge_needs(cfg, fleet)}") from error
-    finally:
-        if fleet is not None:
-            fleet.close()
-    save_weights(policy, folder)
-    last = {f"last_{key}": value for key, value in stats.pop("last").items()}
-    return {"lr": lr, **knew, **stats, **last}
+    starts = starts_of(cfg, *_begun(store, inside, settings.starts == "key"), len(extra))
+    if worth := worth_in(inputs):
+        starts, mean = by_worth(starts, _tasks_of_starts(cfg, store, inside, beyond), worth)
+        if decisions is not None and settings.recorded:
+            settings = replace(settings, imagined=settings.imagined * mean)
+        known["imagined_weight"] = settings.imagined
+    true = TrueExperience(anchor, decisions)
+    return Imagination(policy, algorithm, settings, recipe, starts, true, rollout, known)
 
 
 def _begun(store: ClipStore, inside: Tensor | None, key: bool) -> tuple[int, Sequence[int]]:
@@ -195,24 +225,24 @@ def nothing_left(settings: RLConfig, decisions: RecordedDecisions | None) -> lis
 
 def _warm_up(
     cfg: Cfg, inputs: Inputs, policy: Any, algorithm: Algorithm, store: ClipStore, seed: int
-) -> tuple[dict[str, float], RecordedDecisions | None]:
+) -> tuple[dict[str, float], TensorDict | None, RecordedDecisions | None]:
     """Let a critic, if the algorithm has one, learn from the deployed policy's true episodes first; one that
     begins from nothing spoils the first iterations. What it says of their decisions RL learns from, too.
     """
     past = store.select([f"policy-{deployed_in(inputs, 'known')}"])
     past = past[torch.isin(past, learning_episodes(store)) & store.arrays["labelled"][past]]
     if not hasattr(algorithm, "warm_up") or not len(past):
-        return {}, None
+        return {}, None, None
     rewards, judge, features = rewards_of(cfg), None, None
     if rewards.progress:  # to some judges every question costs
         judge, features = judge_of_recordings(cfg, inputs, store, past)
     rollout = dataset_rollout(policy, store, past, rewards, judge, features)
     rollout, knew = algorithm.warm_up(rollout, seed)
     if action_key(policy) != CHUNK:
-        return {"critic_knew": knew}, None
+        return {"critic_knew": knew}, rollout, None
     decisions = RecordedDecisions(policy, store, rollout, mode_of(cfg))
     figures = {"critic_knew": knew, "recorded_decisions": float(len(decisions))}
-    return figures, decisions if len(decisions) else None
+    return figures, rollout, decisions if len(decisions) else None
 
 
 @stage(reads=(*PHYSICS, *LEARNING))

@@ -49,14 +49,14 @@ class RecordedDecisions:
         if action_key(policy) != CHUNK:
             raise ConfigError(f"{type(policy).__name__} is scored on action tokens, and recordings hold none")
         self.policy, self.store = trained_part(policy), store
-        pick = (rollout["valid"] & rollout["whole"]).flatten()
-        self.known = rollout.exclude("next", "valid", "whole").flatten(0, 1)[pick].cpu()
+        self.at = (rollout["valid"] & rollout["whole"]).flatten().nonzero().squeeze(-1)
+        self.known = rollout.exclude("next", "valid", "whole").flatten(0, 1)[self.at].cpu()
         self.known[CHUNK] = chunks_ahead(store, self.known["row"], mode)
         if not len(self.known):
             return
         likely, sayable = zip(*(self._likely(some) for some in self.known.split(_AT_ONCE)), strict=True)
         self.known[LOG_PROB] = torch.cat(likely)
-        self.known = self.known[torch.cat(sayable)]
+        self.known, self.at = self.known[torch.cat(sayable)], self.at[torch.cat(sayable)]
 
     def __len__(self) -> int:
         return len(self.known)
@@ -79,6 +79,11 @@ class RecordedDecisions:
         """Decisions [N] with what the policy reads: no pictures if it was left its features alone."""
         seen = observe(self.store, some["row"], pictures=IMAGE in self.policy.in_keys)
         return seen.update(some)
+
+    def revalue(self, rollout: TensorDict) -> None:
+        """Take advantages and values anew from the rollout that they were made of."""
+        for key in ("advantage", "value_target", "state_value"):
+            self.known[key] = rollout[key].flatten(0, 1)[self.at].cpu()
 
     def sample(self, count: int, like: TensorDict, generator: torch.Generator) -> TensorDict:
         """Random ones, `count` at most, with the keys and on the device of the transitions `like`."""

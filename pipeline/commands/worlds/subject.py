@@ -21,6 +21,7 @@ from pipeline.evaluation.measurement import followed
 from pipeline.evaluation.result import result_of
 from pipeline.graph.code_version import code_of, json_digest
 from pipeline.graph.graph import Graph, decisive
+from pipeline.graph.stage import Inputs
 from pipeline.loop import build_loop, has_physics
 from pipeline.outside import KINEMATICS, files_at, fingerprint, judge_files
 from pipeline.stages.given import datasets, learns
@@ -172,6 +173,23 @@ class Subject:
             "weights": {role: mark_of(self.weights[role]) for role in roles},
             **(judge_files(self.cfg) if "judge" in roles else {}),
         }
+
+
+def round_inputs(graph: Graph, root: Path, number: int, stage: str) -> Inputs:
+    """What the stage `stage`-`number` of a run begins with.
+
+    Raises:
+        ConfigError: if there is no such round, or the run has not come so far.
+    """
+    if f"{stage}-{number}" not in graph.nodes:
+        raise ConfigError(f"round={number}: the rounds of this run are 1 to {graph.cfg['rounds']['count']}")
+    missing = [name for name in graph.nodes[f"{stage}-{number}"].parents if not graph.finished(name)]
+    if missing:
+        raise ConfigError(
+            f"{root} has not come to round {number} with this config: {', '.join(missing)} are not finished"
+            " (`worldloop stages` says what differs); first `worldloop run` with the same options"
+        )
+    return graph.inputs(f"{stage}-{number}")
 
 
 def pages_of(root: Path, graph: Graph, section: Mapping[str, Any]) -> Path:

@@ -23,7 +23,8 @@ from envs.files import write_text
 from envs.initial_states import DecisionPoints
 from envs.rng import order_generator, seed_process
 from envs.targets import ConfigError
-from pipeline.evaluation.branches import agreement, branch
+from pipeline.commands.worlds.subject import round_inputs
+from pipeline.evaluation.trust.branches import agreement, branch
 from pipeline.loop import build_loop, has_physics
 from pipeline.stages.given import open_store
 
@@ -49,15 +50,7 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
         )
     graph = build_loop(cfg, root)
     cfg = graph.cfg  # of the world that is acted in
-    if f"gap-{number}" not in graph.nodes:
-        raise ConfigError(f"round={number}: the rounds of this run are 1 to {cfg['rounds']['count']}")
-    missing = [name for name in graph.nodes[f"gap-{number}"].parents if not graph.finished(name)]
-    if missing:
-        raise ConfigError(
-            f"{root} has not come to round {number} with this config: {', '.join(missing)} are not finished"
-            " (`worldloop stages` says what differs); first `worldloop run` with the same options"
-        )
-    inputs = graph.inputs(f"gap-{number}")
+    inputs = round_inputs(graph, root, number, "gap")
     store = open_store(cfg, inputs)
     held = store.split("held_out")
     held = held[torch.isin(held, store.select([f"policy-{number}"]))]

@@ -58,6 +58,7 @@ LASTS = {
         r"physics: +\d",
     ),
     "trust": (["trust", *SOAK, "name=known", "depth=1", "futures=300"], r"carried out: +\d"),
+    "gradients": (["gradients", *SOAK, "name=known", "batches=9000"], r"imagined batches: +\d"),
     "controls": (["controls", *SOAK, "name=known"], r"deploy: +\d"),
     "study": (
         [

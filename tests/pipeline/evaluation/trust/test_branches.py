@@ -29,7 +29,7 @@ from envs.judges.base import Judge, Judgement, ask
 from envs.specs import PROGRESS, SUCCESS, Rewards, Status, to_chunk
 from envs.transforms.judge_reward import JudgeReward
 from pipeline.config import load_config
-from pipeline.evaluation.branches import Branches, agreement, branch, carry_out, watched
+from pipeline.evaluation.trust.branches import Branches, agreement, branch, carry_out, watched
 from tests.worlds import scripted_set
 
 

@@ -1,0 +1,1 @@
+"""How much of what reinforcement learning learns from is true: futures compared, and gradients."""
