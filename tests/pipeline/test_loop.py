@@ -18,17 +18,22 @@ from pipeline.config import load_config
 from pipeline.loop import build_loop
 from tests.commands import worldloop
 
+FEWER = (
+    *("collect.episodes={train: 16, held_out: 8, calibration: 6}", "imitation.demos=4"),
+    *("explore.episodes=4", "rounds.deploy=[8,8]"),
+    *("evaluate.episodes=10", "evaluate.envs=10", "evaluate.imagined=8", "measure.starts=8"),
+)
 LEARNED = ("imitation", "simulator-1", "state-1", "judge-1", "clone-1", "rl-1")
 
 
 @pytest.mark.slow
 def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
-    words = ("experiment=smoke", f"runs={tmp_path}", "track=offline")
+    words = ("experiment=smoke", f"runs={tmp_path}", "track=offline", *FEWER)
     out = worldloop(tmp_path, "run", *words)
     assert out.status == 0, out.output[-3000:]
     run = tmp_path / "smoke"
     result = json.loads((run / "result.json").read_text())
-    assert result["physics_before"]["episodes"] == 20 and len(result["rounds"]) == 2
+    assert result["physics_before"]["episodes"] == 10 and len(result["rounds"]) == 2
     assert "on-policy" in result["rollout"]
     tracked = json.loads((run / "wandb.json").read_text())
     assert {*LEARNED, "imitation-perception", "clone-1-perception"} <= tracked["rows"].keys()
