@@ -60,12 +60,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write what JSON can hold, whole or not at all; see `atomic`.
+    """Write what JSON can hold, and numbers of NumPy and torch, whole or not at all; see `atomic`.
 
     Raises:
-        ValueError: for NaN and infinite numbers, which JSON does not know.
+        ValueError: for NaN and infinite numbers, which JSON does not know: what is not there is None.
     """
-    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+    write_text(path, json.dumps(value, indent=2, allow_nan=False, default=float) + "\n")
 
 
 def new_neighbour(path: Path) -> Path:

@@ -7,9 +7,9 @@ is `worldloop study study=students`.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
 import torch
@@ -18,7 +18,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure as
 from actors.factory import build_judge, build_simulator, build_state_decoder
 from actors.process import prepare_process
 from envs.episodes.clips import ClipStore
-from envs.files import write_text
+from envs.files import write_json
 from envs.simulators.base import Simulator
 from envs.simulators.replay import Replay, replay
 from envs.targets import ConfigError, target
@@ -67,13 +67,19 @@ def distil(cfg: dict[str, Any]) -> dict[str, dict[str, Any]]:
     graph, rows, left = build_table(cfg, root / "distil")
     graph.run(list(rows.values()))
     found = {title: graph.result(name) for title, name in rows.items()}
-    write_text(root / "distil.json", json.dumps(found, indent=1))
+    write_json(root / "distil.json", found)
     frames = next(iter(found.values()))["frames"]
     print(f"| | {' | '.join(_FIGURES).format(frames=frames)} |\n|{' --- |' * (1 + len(_FIGURES))}")
     for title, figures in found.items():
-        print(f"| {title} | {' | '.join(form.format(**figures) for form in _FIGURES.values())} |")
+        print(f"| {title} | {' | '.join(_cell(form, figures) for form in _FIGURES.values())} |")
     print("\n".join([*(f"{title}: left out, {why}" for title, why in left.items()), *reached(found)]))
     return found
+
+
+def _cell(form: str, figures: Mapping[str, Any]) -> str:
+    """Figures in the form of a column; "-" where nobody knows one of them."""
+    names = [name for _, name, _, _ in Formatter().parse(form) if name]
+    return "-" if any(figures[name] is None for name in names) else form.format(**figures)
 
 
 def reached(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -88,19 +94,21 @@ def reached(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
         faster = [row[f"speed_{n}"] / teacher[f"speed_{n}"] for n in (1, 32)]
         lost = teacher["rollout_psnr"] - row["rollout_psnr"]
         kept = row["rollout_detail"] / teacher["rollout_detail"]
+        gaps = (row["judge_gap"], teacher["judge_gap"])
         met = {
             f"{row['evaluations']} evaluations": row["evaluations"] <= _EVALUATIONS,
             "frames/s": min(faster) >= _FASTER,
             "PSNR": lost <= _LOST_DB,
             "detail": kept >= _DETAIL,
-            "gap to truth": abs(row["judge_gap"]) <= abs(teacher["judge_gap"]),
+            "gap to truth": None not in gaps and abs(gaps[0]) <= abs(gaps[1]),
         }
-        missed = [name for name, there in met.items() if not there]  # what is NaN is not met
+        missed = [name for name, there in met.items() if not there]
+        told = " and ".join("unknown" if gap is None else f"{gap:+.1f}" for gap in gaps)
         lines.append(
             f"{title}: {'missed by ' + ', '.join(missed) if missed else 'met'} ({faster[0]:.1f} and"
             f" {faster[1]:.1f} times the frames/s of {first} at 1 and 32, {lost:.2f} dB lost over a rollout,"
             f" {100 * kept:.0f}% of its detail,"
-            f" imagined less true success {row['judge_gap']:+.1f} and {teacher['judge_gap']:+.1f} points)"
+            f" imagined less true success {told} points)"
         )
     return lines
 
@@ -198,6 +206,7 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
             " collect.episodes.held_out, or lower the horizon"
         )
     chunks, whole = (replay(simulator, store, held, decoder, bf16=bf16, alone=n) for n in (1, None))
+    state = rollout_error(store, held, whole)["state"]
     return {
         "evaluations": inputs.settings["evaluations"],
         **_verdicts(cfg, inputs, simulator, store),
@@ -205,14 +214,14 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         **{f"chunk_{name}": value for name, value in _pictures(store, chunks).items()},
         **{f"rollout_{name}": value for name, value in _pictures(store, whole).items()},
         "rollout_detail": _detail(store, whole),
-        "state": rollout_error(store, held, whole)["state"]["median"],
+        "state": None if state is None else state["median"],
         **{f"speed_{n}": speed(simulator, store, n, cfg["measure"]["speed_chunks"], bf16) for n in (1, 32)},
     }
 
 
-def _verdicts(cfg: Cfg, inputs: Inputs, simulator: Simulator, store: ClipStore) -> dict[str, float]:
+def _verdicts(cfg: Cfg, inputs: Inputs, simulator: Simulator, store: ClipStore) -> dict[str, float | None]:
     """Confusion of the judge's verdicts on generated video with recorded success, and imagined less true
-    success in points, of the episodes that it could judge; NaN if there are none.
+    success in points, of the episodes that it could judge; None if there are none.
     """
     held, bf16 = labelled(store, store.split("held_out"))[:_JUDGED], cfg["simulator"]["bf16"]
     made, judge = replay(simulator, store, held, bf16=bf16), build_judge(cfg, inputs.weights("judge"))
@@ -220,7 +229,7 @@ def _verdicts(cfg: Cfg, inputs: Inputs, simulator: Simulator, store: ClipStore) 
     found = judge_table(judge, scores, made.valid, store, held)
     count = {name: float(found.get(name, 0)) for name in ("tp", "fp", "fn", "tn")}
     judged = sum(count.values())
-    gap = 100 * (count["fp"] - count["fn"]) / judged if judged else float("nan")
+    gap = 100 * (count["fp"] - count["fn"]) / judged if judged else None
     return {**{f"judge_{name}": value for name, value in count.items()}, "judge_gap": gap}
 
 

@@ -8,7 +8,6 @@ was stopped.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,12 +17,13 @@ import torch
 
 from actors.factory import build_judge, build_simulator
 from actors.process import prepare_process
-from envs.files import write_text
+from envs.files import write_json
 from envs.simulators.replay import replay
 from pipeline.cli.words import root_of
 from pipeline.evaluation.fidelity.strides import VERDICTS, common_stride
 from pipeline.evaluation.fidelity.verdicts import judged, verdict_tables, verdict_text
 from pipeline.evaluation.judging import thinned
+from pipeline.evaluation.statistics import mean
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.loop import check_physics
@@ -50,14 +50,13 @@ def strides(cfg: dict[str, Any]) -> dict[int, dict[str, Any]]:
     graph, rows = build_table(cfg, root / "strides")
     graph.run(list(rows.values()))
     found = {number: graph.result(name) for number, name in rows.items()}
-    write_text(root / "strides.json", json.dumps(found, indent=1))
+    write_json(root / "strides.json", found)
     print(f"| {' | '.join(_HEADINGS)} |\n|{' --- |' * len(_HEADINGS)}")
     for number, row in found.items():
+        decibels = ("-" if (value := row[key]) is None else f"{value:.2f}" for key in ("psnr", "psnr_common"))
         verdicts = (verdict_text(row["verdicts"], video) for video in ("generated", "recorded"))
-        print(
-            f"| {number} | {row['covers']:.1f} s | {row['seconds']:.3f} | {row['psnr']:.2f} |"
-            f" {row['psnr_common']:.2f} | {' | '.join(verdicts)} |"
-        )
+        told = [f"{row['covers']:.1f} s", f"{row['seconds']:.3f}", *decibels, *verdicts]
+        print(f"| {number} | {' | '.join(told)} |")
     return found
 
 
@@ -112,7 +111,7 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     return {
         "covers": stride * store.spec.chunk / store.fps,
         "seconds": seconds,
-        "psnr": float(psnr[seen].mean()),
-        "psnr_common": float(psnr[alike].mean()),
+        "psnr": mean(psnr[seen]),
+        "psnr_common": mean(psnr[alike]),
         "verdicts": verdicts,
     }

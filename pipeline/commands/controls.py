@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from envs.files import write_text
+from envs.files import write_json, write_text
 from envs.targets import ConfigError, target
 from pipeline.evaluation.report import build_report
 from pipeline.evaluation.result import outcomes
@@ -83,7 +83,7 @@ def run_controls(cfg: Cfg, root: Path, tracker: Tracker | None = None) -> dict[s
     for row in (row for row in rows if not only or row.name in only):
         row.graph.run(row.node, tracker)
         table = control_table(loop, [row for row in rows if row.graph.finished(row.node)])
-        write_text(root / "controls.json", json.dumps(table, indent=1, default=float))
+        write_json(root / "controls.json", table)
         result = json.loads((root / "result.json").read_text())
         page = build_report(loop.view("report"), loop.inputs("report"), result, table)
         write_text(root / "report.html", page)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from envs.targets import ConfigError
-from pipeline.evaluation.statistics import percent_line, points_line, rate_line, rise
+from pipeline.evaluation.statistics import percent_line, points_line, psnr_line, rate_line, rise
 
 Result = Mapping[str, Any]
 
@@ -61,9 +61,9 @@ def _figure(form: Callable[[Result], str]) -> Callable[[Result], str]:
 
 
 def _error(key: str, digits: int) -> Callable[[Result], str]:
-    """Median and 90th percentile of a rollout's error, "-" where it was not measured."""
+    """Median and 90th percentile of a rollout's error, "-" where nobody knows it."""
     return _figure(
-        lambda d: f"{d[key]['median']:.{digits}f} / {d[key]['p90']:.{digits}f}" if key in d else "-"
+        lambda d: f"{d[key]['median']:.{digits}f} / {d[key]['p90']:.{digits}f}" if d.get(key) else "-"
     )
 
 
@@ -101,7 +101,7 @@ _ROWS: tuple[tuple[str, Callable[[Result], str]], ...] = (
     ("RL in imagination", _minutes("rl")),
     (
         "PSNR dB, first → last frames",
-        _figure(lambda d: f"{d['psnr_first_frames']:.1f} → {d['psnr_last_frames']:.1f}"),
+        _figure(lambda d: psnr_line(d["psnr_first_frames"], d["psnr_last_frames"])),
     ),
     ("state, spreads, median / p90", _error("state", 3)),
     ("object px", _error("object_px", 2)),

@@ -15,7 +15,7 @@ from envs.episodes.clips import ClipStore
 from envs.simulators.base import Simulator
 from envs.simulators.replay import SIDE_BY_SIDE, Replay, replay, side_by_side
 from pipeline.evaluation.objects.error import object_error
-from pipeline.evaluation.statistics import quantiles
+from pipeline.evaluation.statistics import mean, quantiles
 
 _LAST = 4  # frames at the end of an episode
 _CHUNKS = 10  # of an episode at most, by which speed is measured
@@ -56,9 +56,9 @@ def rollout_error(store: ClipStore, episodes: Tensor, made: Replay) -> dict[str,
 
     Returns:
         episodes; PSNR of the first chunk's worth of frames and of the last in dB, over all views, as far as
-        pictures were recorded; `state`, the absolute error of the decoded states in units of each number's
-        spread over the data (median, 90th percentile); and the object's error where physics recorded its
-        place (see objects/error.py).
+        pictures were recorded, else None; `state`, the absolute error of the decoded states in units of each
+        number's spread over the data (median, 90th percentile), None if none of them moves; and the object's
+        error where physics recorded its place (see objects/error.py).
     """
     truth, shown = store.frames(made.rows), made.pictured(store)
     count = made.valid.shape[1]
@@ -79,8 +79,8 @@ def rollout_error(store: ClipStore, episodes: Tensor, made: Replay) -> dict[str,
     off = units.change(made.states, states[made.rows]).abs()[..., moving]
     return {
         "episodes": len(episodes),
-        "psnr_first_frames": float(psnr[shown.valid & early].mean()),
-        "psnr_last_frames": float(psnr[shown.valid & late].mean()),
+        "psnr_first_frames": mean(psnr[shown.valid & early]),
+        "psnr_last_frames": mean(psnr[shown.valid & late]),
         "state": quantiles(off[made.valid].flatten()),
         **object_error(store, episodes, shown, truth),
     }

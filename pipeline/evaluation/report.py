@@ -15,7 +15,7 @@ from pipeline.evaluation.charts import Curve, line_chart, progress_chart
 from pipeline.evaluation.heat import heat_maps
 from pipeline.evaluation.media import inline, smooth
 from pipeline.evaluation.result import manifests
-from pipeline.evaluation.statistics import percent_line, points_line, rate, rise
+from pipeline.evaluation.statistics import percent_line, points_line, psnr_line, rate, rise
 from pipeline.graph.stage import Inputs
 from pipeline.track import read_metrics
 
@@ -82,6 +82,7 @@ def templates() -> Environment:
         "rate": rate,
         "rise": rise,
         "percent": percent_line,
+        "psnr": psnr_line,
         "points": points_line,
         "progress_chart": progress_chart,
     }

@@ -12,7 +12,7 @@ from envs.episodes.privileged import read_privileged
 from envs.physics.gridworld import COLOURS, EDGE, SIDE
 from envs.simulators.replay import Replay
 from pipeline.evaluation.objects.error import POSES
-from pipeline.evaluation.statistics import quantiles
+from pipeline.evaluation.statistics import mean, quantiles
 
 _NEAR = 90.0  # grey levels by which a pixel may differ from a square's colour, in its worst channel
 _HIDDEN = 0.35  # share of a square's area below which it is not counted as seen
@@ -41,9 +41,9 @@ def square_errors(store: ClipStore, episodes: Tensor, made: Replay, steps: tuple
     Squares that the finder does not see in the true picture, for others lie over them, are left out.
 
     Returns:
-        by step: error (median and 90th percentile) of squares that are seen, share that is lost, `still`, the
-        median error of whoever takes the squares to stay where they began, and `finder`, the finder's own on
-        true pictures.
+        by step: error (median and 90th percentile) of squares that are seen, None if all are lost; `lost`,
+        the share that is; `still`, the median error of whoever takes the squares to stay where they began;
+        and `finder`, the finder's own on true pictures. All are None where no true picture shows a square.
 
     Raises:
         ValueError: if the data do not say where squares were.
@@ -60,10 +60,11 @@ def square_errors(store: ClipStore, episodes: Tensor, made: Replay, steps: tuple
         known, shown = find_squares(store.frames(rows)[:, 0], count)
         found, seen = find_squares(made.frames[:, step - 1, 0], count)
         use = shown & made.valid[:, step - 1, None]
+        still, finder = (quantiles((place - truth).norm(dim=-1)[use]) for place in (first, known))
         out[str(step)] = {
             "error": quantiles((found - truth).norm(dim=-1)[use & seen]),
-            "lost": float((use & ~seen).sum() / use.sum().clamp(min=1)),
-            "still": quantiles((first - truth).norm(dim=-1)[use])["median"],
-            "finder": quantiles((known - truth).norm(dim=-1)[use])["median"],
+            "lost": mean((~seen)[use].float()),
+            "still": None if still is None else still["median"],
+            "finder": None if finder is None else finder["median"],
         }
     return out

@@ -63,6 +63,11 @@ def points_line(difference: float | None) -> str:
     return "unknown" if difference is None else f"{100 * difference:+.1f}"
 
 
+def psnr_line(first: float | None, last: float | None) -> str:
+    """PSNR of the first and the last frames in dB; "-" for what nobody knows."""
+    return " → ".join("-" if value is None else f"{value:.1f}" for value in (first, last))
+
+
 def mcnemar(before: Tensor, after: Tensor) -> dict[str, Any]:
     """Exact two-sided McNemar test of paired outcomes bool [N] -> {"gained", "lost", "p"}."""
     gained, lost = int((after & ~before).sum()), int((before & ~after).sum())
@@ -92,10 +97,15 @@ def confusion(predicted: Tensor, truth: Tensor) -> dict[str, Any]:
     return {"tp": tp, "fp": fp, "fn": fn, "tn": tn, "accuracy": accuracy}
 
 
-def quantiles(values: Tensor) -> dict[str, float]:
-    """{"median", "p90"} of the finite values [N], NaN where there is none."""
+def mean(values: Tensor) -> float | None:
+    """The mean of values [N]; None of none."""
+    return float(values.mean()) if len(values) else None
+
+
+def quantiles(values: Tensor) -> dict[str, float] | None:
+    """{"median", "p90"} of the finite values [N]; None where there is none."""
     values = values[torch.isfinite(values)]
     if not len(values):
-        return {"median": float("nan"), "p90": float("nan")}
+        return None
     values = values[:: len(values) // _MOST + 1]
     return {"median": float(values.median()), "p90": float(values.quantile(0.9))}

@@ -37,7 +37,7 @@ from pipeline.evaluation.by_task import (
 from pipeline.evaluation.disagreement import compared
 from pipeline.evaluation.judging import episode_success, judge_both, judge_frames, judge_table
 from pipeline.evaluation.media import REST, paired_frames
-from pipeline.evaluation.statistics import rate_entry
+from pipeline.evaluation.statistics import mean, rate, rate_entry
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import PHYSICS, WORLD, Cfg, load_world, open_store
 from pipeline.stages.judging.cost import priced
@@ -133,11 +133,12 @@ def _true_success(cfg: Cfg, folder: Path, inputs: Inputs, changes: Mapping[str, 
         "seeds": torch.tensor(seeds),
     }
     write_atomically(folder / "outcomes.pt", lambda path: torch.save(kept, path))
+    entry = _counted(outcome.success, outcome.counted)
     return {
-        "rate": outcome.rate,
-        **_counted(outcome.success, outcome.counted),
+        "rate": rate(entry),
+        **entry,
         "tasks": by_task(tasks_of_seeds(cfg, seeds), _counted, outcome.success, outcome.counted),
-        "progress": float(outcome.progress[outcome.counted].mean()),
+        "progress": mean(outcome.progress[outcome.counted]),
         "evaluation_seconds": time.perf_counter() - began,
     }
 

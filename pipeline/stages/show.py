@@ -19,7 +19,7 @@ from envs.episodes.clips import ClipStore
 from envs.episodes.episode import Episode
 from envs.episodes.filming import write_film, write_gif
 from envs.episodes.formats.lerobot_writer import LeRobotWriter
-from envs.files import write_text
+from envs.files import write_json, write_text
 from envs.judges.base import Judge
 from envs.physics.suite import task_names
 from envs.rng import Purpose, episode_seeds
@@ -150,7 +150,7 @@ def report(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     root = folder.parent.parent
     (root / "controls.json").unlink(missing_ok=True)
     result = build_result(cfg, inputs)
-    write_text(root / "result.json", json.dumps(result, indent=1, default=float))
+    write_json(root / "result.json", result)
     write_text(root / "report.html", build_report(cfg, inputs, result))
     shutil.copy(root / "report.html", folder / "report.html")
     return {"verdict": result["verdict"]}

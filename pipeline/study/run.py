@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
 from markupsafe import Markup
 from tqdm import tqdm
 
-from envs.files import write_text
+from envs.files import write_json, write_text
 from pipeline.study.deadline import deadline
 from pipeline.study.plan import Row, Study
 from pipeline.study.show import markdown, page
@@ -53,8 +52,8 @@ def write_table(study: Study) -> str:
     table = study_table(study)
     text = markdown(table, study.columns)
     shown = page(table, study.columns, charts(study))
-    contents = (json.dumps(table, indent=1, default=float), text, shown)
-    for name, content in zip(NAMES, contents, strict=True):
+    write_json(study.root / NAMES[0], table)
+    for name, content in zip(NAMES[1:], (text, shown), strict=True):
         write_text(study.root / name, content)
     return text
 

@@ -4,7 +4,6 @@ the recorded actions of held-out episodes (EWMBench, Genie Envisioner, section 6
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from tqdm import tqdm
 from actors.factory import build_judge
 from envs.embodiment import EmbodimentError
 from envs.episodes.clips import ClipStore
-from envs.files import write_text
+from envs.files import write_json, write_text
 from envs.judges.vlm import VLMJudge
 from envs.targets import ConfigError, build, target
 from pipeline.commands.worlds.subject import Subject
@@ -179,7 +178,7 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
         "notes": notes,
     }
     page = subject.pages / "ewmbench.html"
-    write_text(page.with_suffix(".json"), json.dumps(result, indent=1))
+    write_json(page.with_suffix(".json"), result)
     films = {row["episode"]: samples.film(row["episode"], row["best"]) for row in rows}
     write_text(page, build_page(result, films))
     reused = f"{samples.made.reused} samples were reused"

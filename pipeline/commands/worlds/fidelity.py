@@ -4,7 +4,6 @@ episodes.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -16,7 +15,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from envs.episodes.clips import ClipStore
-from envs.files import write_text
+from envs.files import write_json, write_text
 from envs.targets import ConfigError, build
 from pipeline.commands.worlds.subject import Subject
 from pipeline.evaluation.fidelity.end_effector import end_effector_ruler
@@ -104,7 +103,7 @@ def fidelity(cfg: Cfg, root: Path) -> str:
     if settled:
         result["grid"] = _grid(cfg, subject, alone, tried, len(settled))
     page = subject.pages / "fidelity.html"
-    write_text(page.with_suffix(".json"), json.dumps(result, indent=1))
+    write_json(page.with_suffix(".json"), result)
     write_text(page, build_page(result))
     return f"{summary_text(result)}\n{page}, {page.with_suffix('.json')}\n{kept.reused} parts were reused"
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from actors.factory import build_simulator
-from envs.files import write_text
+from envs.files import write_json
 from envs.simulators.replay import replay
 from envs.targets import TARGET
 from pipeline.evaluation.measurement import followed
@@ -54,7 +53,7 @@ def gridworld(cfg: Mapping[str, Any], root: Path, squares: Sequence[int], tracke
                 **_measured(variant(cfg, count, representation), root, tracker),
             }
             rows.append(row)
-            write_text(root / "gridworld.json", json.dumps(rows, indent=1))
+            write_json(root / "gridworld.json", rows)
             print(f"{count} squares, actions as {representation}: {row['errors']}", flush=True)
     return table(rows)
 
@@ -93,11 +92,17 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     ]
     for row in rows:
         found = [row["errors"][step] for step in steps]
-        cells = [
-            f"{e['error']['median']:.1f} ({e['error']['p90']:.1f}), {100 * e['lost']:.0f}%" for e in found
-        ]
+        still = found[-1]["still"]
         lines.append(
             f"| {row['squares']} | {row['representation']} | {row['parameters'] / 1e6:.1f} |"
-            f" {' | '.join(cells)} | {found[-1]['still']:.0f} |"
+            f" {' | '.join(map(_cell, found))} | {'-' if still is None else f'{still:.0f}'} |"
         )
     return "\n".join(lines)
+
+
+def _cell(found: Mapping[str, Any]) -> str:
+    """What `square_errors` found after some step."""
+    error, lost = found["error"], found["lost"]
+    if lost is None:
+        return "no square to be seen"
+    return "all lost" if error is None else f"{error['median']:.1f} ({error['p90']:.1f}), {100 * lost:.0f}%"

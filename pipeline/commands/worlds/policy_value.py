@@ -8,14 +8,13 @@ true column stays empty.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from envs.files import write_text
+from envs.files import write_json, write_text
 from envs.targets import ConfigError
 from pipeline.commands.worlds.subject import WEIGHTS, Subject, weights_at
 from pipeline.evaluation.value.agreement import ALL, Cell, agreement, overall
@@ -80,7 +79,7 @@ def policy_value(cfg: Mapping[str, Any], root: Path) -> str:
         "notes": notes(section, starts, everybody, cells),
     }
     page = subject.pages / "policy-value.html"
-    write_text(page.with_suffix(".json"), json.dumps(result, indent=1))
+    write_json(page.with_suffix(".json"), result)
     write_text(page, build_page(result))
     return f"{table_text(result)}\n{page}, {page.with_suffix('.json')}\n{kept.reused} parts were reused"
 

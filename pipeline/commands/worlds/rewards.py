@@ -7,7 +7,6 @@ round, as that run's own judge is, and asked about episodes that none of them ha
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -19,7 +18,7 @@ from torch import Tensor
 
 from actors.factory import build_judge, build_simulator, open_clips
 from envs.episodes.clips import ClipStore
-from envs.files import write_text
+from envs.files import write_json, write_text
 from envs.judges.base import Judge
 from envs.judges.rule import RuleJudge
 from envs.simulators.base import Simulator
@@ -99,7 +98,7 @@ def compare_rewards(cfg: Cfg, root: Path, plan: Plan, tracker: Tracker | None = 
     }
     about = {"name": cfg["name"], "simulator": cfg["simulator"]["_target_"].rpartition(".")[2]}
     result = {**about, "domains": domains}
-    write_text(root / "rewards.json", json.dumps(result, indent=1))
+    write_json(root / "rewards.json", result)
     write_text(root / "rewards.html", build_page(result))
     return table_text(result)
 

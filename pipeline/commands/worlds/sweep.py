@@ -4,7 +4,6 @@ out as a contact sheet for each, so that one sees whether a world has understood
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,7 +21,7 @@ from tqdm import tqdm
 from actors.factory import build_world
 from envs.episodes.clips import ClipStore
 from envs.episodes.filming import side_by_side, titled
-from envs.files import write_atomically, write_text
+from envs.files import write_atomically, write_json
 from envs.initial_states import InitialStates
 from envs.specs import CHUNK, COMMAND, WorldSpec, at_rest, to_chunk
 from envs.targets import ConfigError
@@ -66,7 +65,7 @@ def sweep(cfg: Mapping[str, Any], root: Path) -> list[Path]:
         made.append(path)
         moved = (frames.float() - frames[:1].float()).abs().mean((1, 2, 3, 4, 5))
         about.append({"name": name, "travel": travel[:, number].tolist(), "changed": moved.tolist()})
-    write_text(folder / "sweep.json", json.dumps({**subject.about(), "numbers": about}, indent=1))
+    write_json(folder / "sweep.json", {**subject.about(), "numbers": about})
     return made
 
 

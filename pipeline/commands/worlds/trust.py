@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from actors.factory import (
     build_world,
 )
 from actors.policies.safe import SafePolicyWrapper
-from envs.files import write_text
+from envs.files import write_json
 from envs.initial_states import DecisionPoints
 from envs.rng import order_generator, seed_process
 from envs.targets import ConfigError
@@ -79,7 +78,7 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
     finally:
         physics.close()
     rows, compared = agreement(branches, cfg["seed"]), len(branches.outcome)
-    write_text(root / f"trust-{number}.json", json.dumps({"moments": compared, "depths": rows}, indent=1))
+    write_json(root / f"trust-{number}.json", {"moments": compared, "depths": rows})
     return _table(rows, compared, futures)
 
 

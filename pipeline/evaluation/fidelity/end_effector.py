@@ -112,8 +112,8 @@ def end_effector_summary(
             "unknown": "the detector finds no gripper in recorded video; raise ewmbench.detector.fit.steps"
         }
     return {
-        "generated_cm": _known(flat["made"]),
-        "recorded_cm": _known(flat["recorded"]),
+        "generated_cm": quantiles(flat["made"]),
+        "recorded_cm": quantiles(flat["recorded"]),
         "lost": float((~torch.isfinite(flat["made"])).float().mean()),
         "recorded_lost": float((~torch.isfinite(flat["recorded"])).float().mean()),
         "method": ruler.method,
@@ -139,7 +139,3 @@ def end_effector_text(found: Mapping[str, Any]) -> str:
         " found in"
         f" {100 * found['lost']:.1f}% {how}; {floor}."
     )
-
-
-def _known(values: Tensor) -> dict[str, float] | None:
-    return quantiles(values) if torch.isfinite(values).any() else None

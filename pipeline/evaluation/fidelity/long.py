@@ -29,6 +29,7 @@ from envs.rng import Purpose, episode_seeds
 from envs.simulators.base import Simulator
 from envs.simulators.replay import replay, side_by_side
 from pipeline.evaluation.fidelity.frames import by_frame, frame_errors, psnr
+from pipeline.evaluation.statistics import mean
 from pipeline.graph.kept import Tensors
 
 Keep = Callable[[list[int], Callable[[], Tensors]], Tensors]
@@ -129,10 +130,10 @@ def drift(
         "sharpness": _line(sharp, valid),
         "still": _line(psnr(still), valid),
         "unrelated": _line(psnr(unrelated), both) if len(episodes) > 1 else None,
-        "end": {"psnr": _mean(psnr(errors["mse"])[ends]), "sharpness": _mean(sharp[ends])},
+        "end": {"psnr": mean(psnr(errors["mse"])[ends]), "sharpness": mean(sharp[ends])},
         "collapsed": None,
     }
-    error, sharpness = _mean(errors["mse"].mean(-1)[ends]), out["end"]["sharpness"]
+    error, sharpness = mean(errors["mse"].mean(-1)[ends]), out["end"]["sharpness"]
     if sharpness is not None and not 0.5 <= sharpness <= 2.0:
         out["collapsed"] = True
     elif error is not None and bool((both & ends).any()):
@@ -194,8 +195,4 @@ def _gradient(frames: Tensor) -> Tensor:
 
 def _line(values: Tensor, valid: Tensor) -> list[float | None]:
     """Means [T] over episodes of values [N, T]."""
-    return [_mean(values[valid[:, t], t]) for t in range(valid.shape[1])]
-
-
-def _mean(values: Tensor) -> float | None:
-    return float(values.mean()) if len(values) else None
+    return [mean(values[valid[:, t], t]) for t in range(valid.shape[1])]

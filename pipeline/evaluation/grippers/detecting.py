@@ -221,7 +221,7 @@ def detector_error(detector: GripperDetector, sights: Sights, episodes: Tensor) 
         seen = torch.isfinite(found[:, n]).all(-1)
         off = (found[:, n] - wanted[:, n]).norm(dim=-1)
         out[store.spec.embodiment.views[view]] = {
-            "px": quantiles(off[there & seen]) if (there & seen).any() else None,
+            "px": quantiles(off[there & seen]),
             "missed": float((~seen)[there].float().mean()) if there.any() else None,
             "imagined": float(seen[~there].float().mean()) if (~there).any() else None,
             "frames": len(rows),

@@ -75,10 +75,11 @@ def object_summary(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Any]:
     """What the `object_offsets` of some episodes come to, those of all parts in one.
 
     Returns:
-        object_px and object_cm (median, 90th percentile over the frames in which it was found), their
-        object_cm_at_end, object_lost (share of the frames that truly show it), and locator_px and
-        locator_cm, the locator's own error on true video. Where the locator fails there: object_unknown,
-        saying so, in place of all that it says of generated video. {} where nothing can be measured.
+        object_px and object_cm (median, 90th percentile over the frames in which it was found, None if it
+        was in none), their object_cm_at_end, object_lost (share of the frames that truly show it), and
+        locator_px and locator_cm, the locator's own error on true video. Where the locator fails there:
+        object_unknown, saying so, in place of all that it says of generated video. {} where nothing can be
+        measured.
     """
     known = [part for part in parts if part]
     if not known:
@@ -89,9 +90,11 @@ def object_summary(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Any]:
     own = {name: quantiles(whole[name]) for name in _NAMES[1]}
     failed = float(whole["failed"].float().mean())
     if failed > _FAILS:
+        pixels = own["locator_px"]
+        assert pixels is not None  # some err by so much
         why = (
-            f"the locator, which goes by its colour, errs by {own['locator_px']['median']:.1f} pixels (90%"
-            f" within {own['locator_px']['p90']:.1f}) in recorded video, and in {100 * failed:.0f}% of its"
+            f"the locator, which goes by its colour, errs by {pixels['median']:.1f} pixels (90%"
+            f" within {pixels['p90']:.1f}) in recorded video, and in {100 * failed:.0f}% of its"
             f" frames by more than {100 * _BAR:.2g}% of the picture's side"
         )
         return {"object_unknown": why, **own}

@@ -74,7 +74,7 @@ def test_every_row_can_be_built_of_every_engine_before_any_work(engine: str, tmp
 
 
 def test_a_student_meets_all_that_it_should_or_it_is_said_what_it_missed() -> None:
-    def row(evaluations: int, *figures: float) -> dict[str, float]:
+    def row(evaluations: int, *figures: float | None) -> dict[str, float | None]:
         names = ("speed_1", "speed_32", "rollout_psnr", "rollout_detail", "judge_gap")
         return {"evaluations": evaluations, **dict(zip(names, figures, strict=True))}
 
@@ -83,13 +83,14 @@ def test_a_student_meets_all_that_it_should_or_it_is_said_what_it_missed() -> No
         "DMD2, 3": row(3, 41.0, 80.0, 24.5, 0.75, 4.0),
         "DMD2, 8": row(8, 41.0, 79.0, 24.4, 0.75, 4.1),
         "mean picture": row(1, 90.0, 90.0, 26.0, 0.5, 0.0),
-        "nobody judged": row(3, 41.0, 80.0, 24.5, 0.75, math.nan),
+        "nobody judged": row(3, 41.0, 80.0, 24.5, 0.75, None),
     }
     met, missed, mean, unknown = reached({"teacher, 15": teacher, "not distilled, 1": teacher, **rows})
     assert met.startswith("DMD2, 3: met (4.1 and 4.0 times the frames/s of teacher, 15 at 1 and 32, 0.50 dB")
     assert missed.startswith("DMD2, 8: missed by 8 evaluations, frames/s, PSNR, gap to truth (")
     assert mean.startswith("mean picture: missed by detail (") and "56% of its detail" in mean
     assert unknown.startswith("nobody judged: missed by gap to truth (")
+    assert unknown.endswith("imagined less true success unknown and -4.0 points)")
 
 
 def test_strides_reach_as_many_times_further(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from actors.factory import open_clips
+from envs.files import write_json
 from envs.physics.gridworld import EDGE, Gridworld
 from envs.rng import Stream, episode_rng
+from envs.simulators.replay import Replay
 from envs.targets import ConfigError, build
-from pipeline.commands.worlds.gridworld import gridworld, variant
+from pipeline.commands.worlds.gridworld import gridworld, table, variant
 from pipeline.config import load_config
-from pipeline.evaluation.squares import find_squares
+from pipeline.evaluation.squares import find_squares, square_errors
 from tests.pipeline.commands.test_cli import worldloop
 
 TINY = [
@@ -84,6 +88,23 @@ def test_the_study_runs_and_goes_on_where_it_was(tmp_path: Path) -> None:
     assert len(made) == 4 and len(list(tmp_path.glob("stages/collect-*"))) == 1
     assert gridworld(cfg, tmp_path, [1], None) == out
     assert {path: path.stat().st_mtime_ns for path in made} == made
+    nothing_is_seen(variant(cfg, 1, "numbers"), tmp_path, rows[0])
+
+
+def nothing_is_seen(cfg: dict[str, Any], root: Path, row: dict[str, Any]) -> None:
+    """Lost squares, and those that are in no true picture, have no errors, and the table says so."""
+    store = open_clips(cfg, list(root.glob("stages/collect-*/dataset")))
+    episodes = store.split("held_out")
+    rows, valid = store.whole(episodes)
+    dark = torch.zeros_like(store.frames(rows))
+    made = Replay(dark, rows, valid, torch.zeros(0), torch.zeros(0))
+    lost = square_errors(store, episodes, made, (1,))
+    none = square_errors(store, episodes, made._replace(valid=torch.zeros_like(valid)), (1,))
+    assert lost["1"]["error"] is None and lost["1"]["lost"] == 1.0 and lost["1"]["still"] > 0
+    assert set(none["1"].values()) == {None}
+    write_json(root / "lost.json", [lost, none])  # which refuses NaN
+    said = table([{**row, "errors": lost}, {**row, "errors": none}]).splitlines()[-2:]
+    assert "| all lost |" in said[0] and said[1].endswith("| no square to be seen | - |")
 
 
 def test_numbers_of_squares_are_checked() -> None:

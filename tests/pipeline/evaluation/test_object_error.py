@@ -12,6 +12,7 @@ import torch
 
 from envs.episodes import Episode, LeRobotWriter
 from envs.episodes.clips import ClipStore
+from envs.files import write_json
 from envs.geometry.cameras import project
 from envs.physics.pool import TaskPool
 from envs.physics.suite import build_suite
@@ -157,6 +158,9 @@ def test_a_lost_object_is_said_to_be_lost(tmp_path: Path) -> None:
     assert "the same locator errs" in said[1]
     assert "median over the frames in which it is found) and is lost in 50.0% of those" in said[1]
     assert said[2].startswith("The first object is not measured")
+    found = rollout_error(store, episodes, black)
+    assert found["object_px"] is found["object_cm"] is None and found["object_lost"] == 1.0
+    write_json(tmp_path / "found.json", found)  # or there would be numbers in it that are none
 
 
 def test_poses_that_are_no_rows_of_objects_are_left_alone(tmp_path: Path) -> None:

@@ -38,9 +38,11 @@ def result(**changes: Any) -> dict[str, Any]:
         },
         "random": {
             "episodes": 4,
-            "psnr_first_frames": 20.0,
+            "psnr_first_frames": None,
             "psnr_last_frames": 15.0,
             "state": {"median": 0.1, "p90": 0.2},
+            "object_px": None,
+            "object_lost": 1.0,
         },
     }
     told = {"value": 0.31, "measured": (0.42, 0.1), "known": (0.37, 0.08), "moments": 96}
@@ -225,6 +227,10 @@ def test_a_judge_that_judged_nothing_is_not_wrong(inputs: Inputs, tmp_path: Path
     table = compare([tmp_path / "one"])
     assert "| verdicts right, %, recorded video | expert 50.0 |" in table
     assert "| verdicts right, %, generated video | expert - |" in table
+    # nor is what nobody knows of a rollout a number
+    assert "| object px | expert 1.00 / 2.00; random - |" in table
+    assert "| PSNR dB, first → last frames | expert 20.0 → 15.0; random - → 15.0 |" in table
+    assert "<td>- → 15.0</td>" in page and "nan" not in page
 
 
 def test_the_worst_disagreements_come_first_and_pairs_stay_together(inputs: Inputs) -> None:
