@@ -55,10 +55,11 @@ class HTTPChat:
         body: Mapping[str, Any],
     ):
         place = urlsplit(url)
-        if place.scheme not in ("http", "https") or not place.hostname or place.username:
+        if place.scheme not in ("http", "https") or not place.hostname or "@" in place.netloc:
+            shown = "" if "@" in url else f"; got {url!r}"  # a name or a password may stand before it
             raise ConfigError(
                 "judge.chat.url must be the address of a chat server up to its version, such as"
-                f" http://127.0.0.1:8000/v1, without a key in it{'' if place.username else f'; got {url!r}'}"
+                f" http://127.0.0.1:8000/v1, without a user, password or key in it{shown}"
             )
         if not model:
             raise ConfigError(

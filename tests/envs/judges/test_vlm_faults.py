@@ -187,7 +187,10 @@ def test_a_dead_server_stops_the_run(make: Make, server: ChatServer) -> None:
     [
         ({"url": "http://127.0.0.1:9/v1"}, r"judge\.chat\.url=http://127\.0\.0\.1:9/v1: nobody answers"),
         ({"url": "nonsense"}, r"judge\.chat\.url must be the address"),
-        ({"url": "http://me:secret@127.0.0.1/v1"}, r"without a key in it$"),
+        *(
+            ({"url": f"{begin}secret@127.0.0.1/v1"}, r"without a user, password or key in it$")
+            for begin in ("http://me:", "http://:", "http://", "http//:", "//me:")
+        ),
         ({"model": ""}, r"judge\.chat\.model is empty"),
         ({"model": "tiny-vml"}, r"judge\.chat\.model=tiny-vml is not served by .*did you mean tiny-vlm"),
         (
