@@ -76,8 +76,15 @@ class SuccessOverTime(Column):
         return "not reached" if cell["seconds"] is None else f"{cell['seconds']:.0f} s"
 
     def pool(self, several: Sequence[Measured]) -> Measured:
-        """The mean curve of all seeds of training, trial by trial."""
-        trials = zip(*(one.curve for one in several), strict=True)
+        """The mean curve of all seeds of training, trial by trial.
+
+        Where RL ended after fewer trials, as it may in physics, whose iterations hold more or fewer episodes,
+        that seed's last trial stands for all later ones: its policy stays what it is. So every point is of
+        all seeds, and the last one of the policies that each of them ended with; a mean of those seeds alone
+        that went on would change with who is in it, and to stop with the first would leave their ends out.
+        """
+        longest = max(len(one.curve) for one in several)
+        trials = [[one.curve[min(n, len(one.curve) - 1)] for one in several] for n in range(longest)]
         points = [(_mean([x for x, _ in some]), _mean([y for _, y in some])) for some in trials]
         episodes = sum(one.cells["first"]["episodes"] for one in several)
         spent = _mean([one.cells["learned for"]["seconds"] for one in several])

@@ -142,6 +142,9 @@ def test_a_curve_goes_on_from_stage_to_stage_in_the_time_of_learning(
     assert column.text(never.cells["+40 points after"]) == "not reached"
     pooled = column.pool([never, never])
     assert pooled.curve == never.curve and pooled.cells["first"]["episodes"] == 8
+    unlike = column.pool([one, never])  # whose RL ended after one trial
+    assert unlike.curve == [(0.0, 0.25), (7.5, 0.375), (12.5, 0.625), (15.5, 0.5)]
+    assert unlike.cells["last"]["successes"] == unlike.cells["last"]["episodes"] / 2 == 4
     drawn = column.chart({"proxy": one, "learned": never})
     assert drawn.count('<path class="line') == 2 and "proxy" in drawn
 
