@@ -79,6 +79,23 @@ def observation(suite: TaskSuite, before: Observation | None = None) -> Observat
     return replace(seen, **found)
 
 
+def beginning(suite: TaskSuite) -> Observation:
+    """What the suite says at the start of an episode that somebody is to play.
+
+    Raises:
+        SuiteError: see observation.
+        ValueError: if the task is done there; that is one episode's.
+    """
+    seen = observation(suite)
+    if seen.success:
+        raise ValueError(
+            f"task.suite: {type(suite).__name__}.observe gives success=True at the start of an episode, which"
+            " would count as a success of whoever does nothing; let reset draw again until the task is not"
+            " done"
+        )
+    return seen
+
+
 def privileged(suite: TaskSuite, before: Mapping[str, Sequence[Array]]) -> dict[str, Array]:
     """What only physics knows.
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics.checked import observation, privileged, rendered
+from envs.physics.checked import beginning, observation, privileged, rendered
 from envs.physics.suite import Array, Observation, TaskSuite, build_suite, check_task, expert_of, task_of
 from envs.rng import Stream, episode_rng
 from envs.targets import ConfigError
@@ -130,7 +130,7 @@ class Worker:
             slot = self.slots[index]
             self._lay_out(slot.suite, seed)
             slot.steps, slot.over, slot.track = 0, False, None
-            slot.observed = observed = observation(slot.suite)
+            slot.observed = observed = beginning(slot.suite)
             if record:
                 slot.track = Track(seed, observed.instruction, observed.intrinsic)
                 slot.track.add(slot.suite, observed)
@@ -192,7 +192,7 @@ class Worker:
             self._lay_out(suite, seed)
             task, rng = task_of(self.spec.tasks, seed), episode_rng(seed, Stream.BEHAVIOUR)
             act = expert_of(suite, task, noise_level, rng) if self.spec.horizon else None
-            observed = observation(suite)
+            observed = beginning(suite)
             track = Track(seed, observed.instruction, observed.intrinsic)
             track.add(suite, observed)
             for step in range(self.spec.horizon):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from envs.embodiment import Camera
 from envs.episodes import Episode, LeRobotWriter
 from envs.episodes.episode import EpisodeError
 from envs.physics.checked import observation
-from envs.physics.pool import TaskPool
+from envs.physics.pool import PoolError, TaskPool
 from envs.physics.suite import Array, Observation, SuiteError
 from envs.targets import ConfigError
 from tests.envs.physics.sections import Counting
@@ -170,6 +171,33 @@ def test_what_can_be_brought_to_the_contract_is(what: str) -> None:
     assert (seen.success, seen.progress) == (False, 0.25)
     assert type(seen.success) is bool and type(seen.progress) is float
     assert seen.state.shape == seen.command.shape == (1,) and seen.command.dtype == np.float64
+
+
+class Done(Counting):
+    """Counts; what seeds from 5 to 7 lay out is done before anybody acts."""
+
+    def observe(self) -> Observation:
+        return replace(super().observe(), success=self.count >= 5)
+
+    def reset(self, task: str, seed: int) -> None:
+        super().reset(task, seed)
+        self.count = float(seed if 5 <= seed < 8 else -20)
+
+
+def test_episodes_that_begin_with_their_task_done_are_dropped_and_counted(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    for ask in (
+        lambda pool, *seeds: [track.seed for track in pool.script([(seed, 0.0) for seed in seeds], 1)],
+        lambda pool, *seeds: [seeds[slot] for slot in pool.reset(dict(enumerate(seeds)), True)],
+    ):
+        caplog.clear()
+        with closing(TaskPool({"_target_": f"{__name__}.Done", "fault": ""}, "count", 3, 8, 1)) as pool:
+            assert ask(pool, 4, 5, 8) == [4, 8] and pool.lost == [5]
+            assert "Done.observe gives success=True at the start of an episode" in caplog.text
+            assert "seed 5; it is dropped" in caplog.text
+            with pytest.raises(PoolError, match=r"(?s)seeds \[5, 6\].*let reset draw again"):
+                ask(pool, 6)
 
 
 def test_a_success_that_is_taken_back_is_refused_wherever_it_is_played() -> None:
