@@ -31,7 +31,7 @@ from pipeline.evaluation.ewmbench.semantics import Reader
 from pipeline.evaluation.fidelity.extractors import Extractor
 from pipeline.evaluation.grippers.ruler import GripperRuler, gripper_ruler, known_ends, looked_through
 from pipeline.evaluation.judging import cost_text
-from pipeline.graph.code_version import code_of
+from pipeline.graph.code_version import code_of, json_digest
 from pipeline.stages.judging.cost import COST, Spending
 
 _MODULE = "pipeline.evaluation.ewmbench.samples"
@@ -132,7 +132,8 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
         cfg["simulator"]["bf16"],
         set(chosen.episodes[: section["videos"]].tolist()),
     )
-    with Spending(cfg["judge"], root / "ewmbench" / COST) as spending:
+    # by world and model: others have paid their own
+    with Spending(cfg["judge"], root / "ewmbench" / f"{json_digest(world)}-{COST}") as spending:
         true, made = measured(samples, chosen.episodes, section["samples"])
         cost = {} if reader is None else spending.total
     scoring = Scoring(

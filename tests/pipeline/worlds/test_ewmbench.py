@@ -52,9 +52,15 @@ def test_two_arms_in_physics_with_a_model_that_reads(tmp_path: Path) -> None:
         more = load_config([*words, "ewmbench.samples=3", "ewmbench.strict_parity=false"])
         assert "4 samples were reused" in ewmbench(more, tmp_path / "run")
         assert server.tries == asked + 3 * 2
-        paid = json.loads(written(tmp_path / "run", "ewmbench.json").read_text())["judge_cost"]
+        first = written(tmp_path / "run", "ewmbench.json")
+        paid = json.loads(first.read_text())["judge_cost"]
         assert paid["calls"] == server.tries  # of all three lives
-    result = json.loads(written(tmp_path / "run", "ewmbench.json").read_text())
+        asked = server.tries
+        other = untrained_world(load_config([*words, "seed=1"]), tmp_path / "other")
+        ewmbench(load_config([*words, *other, "ewmbench.samples=1", "ewmbench.videos=0"]), tmp_path / "run")
+        (page,) = set((tmp_path / "run").glob("simulators/*/ewmbench.json")) - {first}
+        assert json.loads(page.read_text())["judge_cost"]["calls"] == server.tries - asked == 3 * 2
+    result = json.loads(first.read_text())
     assert len(result["rows"]) == 2 and len(result["rows"][0]["samples"]) == 3
     assert result["set"]["of"] == 4 and "end effectors in space (commanded poses)" in result["set"]["by"]
     whole = result["overall"]
@@ -71,7 +77,7 @@ def test_two_arms_in_physics_with_a_model_that_reads(tmp_path: Path) -> None:
     assert (
         set(result["detector"]["cameras"]) == {"head"} and result["detector"]["source"] == "commanded poses"
     )
-    page = written(tmp_path / "run", "ewmbench.html").read_text()
+    page = first.with_suffix(".html").read_text()
     assert f"Asking the model: calls {paid['calls']:g}, prompt tokens" in page
     assert "Best samples" in page and page.count("<video") == 1 and "best of 2" in said
     assert not re.findall(r'(?:src|href)=(?!"(?:#|data:))', page)
