@@ -77,10 +77,12 @@ class JudgeServer:
         self.worker: asyncio.Task[None] | None = None
 
     async def describe(self) -> dict[str, Any]:
-        """Threshold and hold of the judge, by which callers turn frames into episodes, and what it reads."""
+        """Threshold and hold of the judge, by which callers turn frames into episodes, what it reads, and
+        whether it charges.
+        """
         judge = self.judge
         about = {"threshold": float(judge.threshold), "hold": judge.hold}
-        return about | {"reads_features": judge.reads_features}
+        return about | {"reads_features": judge.reads_features, "charges": judge.charges}
 
     async def stats(self) -> dict[str, int]:
         """How many clips came, were judged or remembered, in how many batches."""
@@ -189,7 +191,7 @@ class JudgeClient(Judge):
                 " launch.judge_service=false"
             ) from error
         super().__init__(about["hold"], about["threshold"])
-        self.reads_features = about["reads_features"]
+        self.reads_features, self.charges = about["reads_features"], about["charges"]
 
     def submit(
         self, frames: Tensor, first: Tensor, instruction: list[str], features: Tensor | None = None

@@ -80,6 +80,8 @@ class Judge(nn.Module):
             apart.
         discount: per frame, of the progress that `loss` is given: discount ** (frames until success).
         calibrates: whether the threshold is to be set on recorded video (learners/stages/judge.py).
+        charges: whether each clip costs, and is judged apart from the others; those of episodes that have
+            succeeded are then spared.
         rehearsed: whether one may be built before any work, to see that it can; not where that is dear.
 
     Raises:
@@ -94,6 +96,7 @@ class Judge(nn.Module):
     reads_instruction = True
     discount = 1.0
     calibrates = True
+    charges = False
 
     def __init__(self, hold: int, threshold: float = 0.5):
         super().__init__()

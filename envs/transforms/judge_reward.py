@@ -42,6 +42,7 @@ class JudgeReward(Transform):
         self._tickets: list[Any] = []
         self._opening = (torch.zeros(0, 1), torch.zeros(0, dtype=torch.int64))
         self._run = torch.zeros(0, dtype=torch.int64)
+        self._won = torch.zeros(0, dtype=torch.bool)
         self._progress = torch.zeros(0, 1)
         self._begun = torch.zeros(0, dtype=torch.int64)  # status of the judgement at the episode's beginning
         self._first = torch.zeros(0, dtype=torch.uint8)
@@ -63,8 +64,25 @@ class JudgeReward(Transform):
             )
             next_tensordict[JUDGE_STATUS] = torch.full_like(self._run, Status.OK.value).unsqueeze(-1)
             return next_tensordict.exclude(FRAMES, FEATURES, "world")
-        self._decide(ask(self.judge, *clips), next_tensordict)
+        self._decide(self._judgement(*clips), next_tensordict)
         return next_tensordict.exclude(FRAMES, FEATURES, "world")
+
+    def _judgement(self, frames: Tensor, first: Tensor, texts: list[str], *features: Tensor) -> Judgement:
+        """The judge's judgement on clips of all episodes, see Judge.score. One that charges is asked only
+        about those that have not succeeded, and the others stay successes. One that does not is asked about
+        all, as smaller batches may round otherwise.
+        """
+        rows = (~self._won).nonzero().flatten()
+        if not self.judge.charges or len(rows) == len(frames):
+            return ask(self.judge, frames, first, texts, *features)
+        success = torch.ones(frames.shape[:2], device=frames.device)
+        out = Judgement(success, success.clone(), torch.full_like(self._run, Status.OK.value))
+        if len(rows):
+            shown = (frames[rows], first[rows], [texts[row] for row in rows.tolist()])
+            found = ask(self.judge, *shown, *(part[rows] for part in features))
+            for whole, some in zip(out, found, strict=True):
+                whole[rows] = some.to(whole)
+        return out
 
     def forget(self) -> None:
         """Drop what waits for a judgement, of a rollout that came to nothing."""
@@ -80,6 +98,7 @@ class JudgeReward(Transform):
             )
         # By now the collector has begun the next episodes; these begin where theirs did.
         self._run, (self._progress, self._begun) = torch.zeros_like(self._run), self._opening
+        self._won = torch.zeros_like(self._won)
         for number, ticket in enumerate(tickets):
             after = batch["next"][:, number]
             self._decide(self.judge.fetch(ticket), after)
@@ -96,6 +115,7 @@ class JudgeReward(Transform):
         success = done.any(1, keepdim=True) & ~failed
         progress = torch.where(failed, self._progress, judgement.progress[:, -1:])
         progress = torch.where(success, 1.0, progress)  # what is done is done, as where physics says it
+        self._won = self._won | success.squeeze(-1)
         next_tensordict["reward"] = self.rewards(self._progress, progress, success)
         self._progress = progress
         next_tensordict[SUCCESS], next_tensordict[PROGRESS] = success, progress
@@ -110,10 +130,12 @@ class JudgeReward(Transform):
         progress, status = self._beginning(image, world)
         if mask is None or self._run.shape[0] != progress.shape[0]:
             self._run = torch.zeros(progress.shape[0], dtype=torch.int64, device=progress.device)
+            self._won = torch.zeros_like(self._run, dtype=torch.bool)
             self._progress, self._begun, self._first = progress, status, world.opening.clone()
         else:
             mask = mask.reshape(-1, 1)
             self._run = torch.where(mask.squeeze(-1), 0, self._run)
+            self._won = self._won & ~mask.squeeze(-1)
             self._progress = torch.where(mask, progress, self._progress)
             self._begun = torch.where(mask.squeeze(-1), status, self._begun)
             self._first = torch.where(mask[..., None, None, None], world.opening, self._first)

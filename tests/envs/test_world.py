@@ -71,6 +71,19 @@ class Fixed(Judge):
         return Judgement(filled, filled, torch.full(frames.shape[:1], self.said.value))
 
 
+class Charging(Fixed):
+    """The same, and what episodes of task 3 show is a success; each clip costs, if it `charges`."""
+
+    def __init__(self, charges: bool):
+        super().__init__(0.1)
+        self.charges = charges
+
+    def score(self, frames: torch.Tensor, first: torch.Tensor, instruction: list[str]) -> Judgement:
+        said = super().score(frames, first, instruction)
+        won = torch.tensor([text == "do task 3" for text in instruction])[:, None]
+        return Judgement(torch.where(won, 0.9, said.success), said.progress, said.status)
+
+
 def world(
     name: str, batch: int, judge: Judge | None = None, horizon: int = 12, progress: float = 1.0
 ) -> TransformedEnv:
@@ -224,6 +237,30 @@ def test_success_must_hold_across_chunks() -> None:
     judge = Fixed(0.9, hold=6)
     env = world("one_arm_deltas", 1, judge)
     assert not bool(play(env, [0], 1)[SUCCESS]) and bool(play(env, [0], 2)[SUCCESS])
+
+
+def test_a_judge_that_charges_is_not_asked_about_episodes_that_have_succeeded() -> None:
+    asked, found = [], []
+    for charges in (True, False):
+        judge = Charging(charges)
+        env = world("one_arm_deltas", 3, judge, progress=0.0)
+        env.base_env.schedule([3, 1, 11, 2])
+        now, won = env.reset(), torch.zeros(3, dtype=torch.bool)
+        for _ in range(2):
+            now[CHUNK] = torch.zeros_like(env.action_spec.zero()[CHUNK])
+            now = env.step(now)["next"]
+            won |= now[SUCCESS].squeeze(-1)
+        found.append((won, now[PROGRESS][1], now[JUDGE_STATUS]))
+        now["_reset"] = torch.tensor([[True], [False], [False]])
+        now = env.reset(now.clone())
+        now[CHUNK] = torch.zeros_like(env.action_spec.zero()[CHUNK])
+        assert env.step(now)["next", SUCCESS].flatten().tolist() == [False, False, True]
+        play(env, [3, 11, 3], 2)
+        asked.append([[int(text[-1]) for text in texts] for texts in judge.asked])
+    assert asked[0] == [[3, 1, 3], [1], [2, 1], [3, 3, 3]]
+    assert asked[1] == [[3, 1, 3], [3, 1, 3], [2, 1, 3], [3, 3, 3], [3, 3, 3]]
+    assert found[0][0].tolist() == [True, False, True]
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
 
 
 def test_initial_states_of_other_views_are_refused() -> None:

@@ -75,6 +75,7 @@ class VLMJudge(Judge):
     """
 
     rehearsed = False  # a local model is read from its folder
+    charges = True
 
     def __init__(
         self,
