@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from actors.fleets.fleet import EpisodeLedger
 from actors.fleets.launch import build_fleet
 from actors.policies.contract import device_of, trained_part
 from actors.rollouts.host import trained_weights
-from envs.files import write_text
+from envs.files import write_json
 from envs.rng import order_generator
 from envs.targets import ConfigError
 from learners.rl.feed import build_feed
@@ -65,8 +64,12 @@ def gradients(cfg: Mapping[str, Any], root: Path, number: int, batches: int) -> 
     found = measured(ready, batches)
     rows = compared(found)
     used = ready.algorithm.config.lam if isinstance(ready.algorithm, PPO) else None
-    kept = {**{key: getattr(found, key) for key in ("decisions", "recorded_decisions")}, "rows": rows}
-    write_text(root / f"gradients-{number}.json", json.dumps(kept, indent=1, default=asdict))
+    kept = [
+        {key: asdict(cell) if isinstance(cell, Measured) else cell for key, cell in row.items()}
+        for row in rows
+    ]
+    about = {"decisions": found.decisions, "recorded_decisions": found.recorded_decisions}
+    write_json(root / f"gradients-{number}.json", {**about, "rows": kept})
     return table(rows, batches, found.decisions, used)
 
 
