@@ -98,6 +98,8 @@ class Imagination:
         true: what physics has told.
         rollout: those true episodes [N, T] as the critic values them, if there are any.
         known: figures of all this.
+        store: of all recordings; inside: its episodes in which imagined ones begin, all if None; beyond: of
+            first frames alone.
     """
 
     policy: Any
@@ -108,6 +110,9 @@ class Imagination:
     true: TrueExperience
     rollout: TensorDict | None
     known: dict[str, float]
+    store: ClipStore
+    inside: Tensor | None
+    beyond: ClipStore | None
 
 
 def begin(cfg: ConfigView, inputs: Inputs) -> Imagination:
@@ -147,12 +152,14 @@ def begin(cfg: ConfigView, inputs: Inputs) -> Imagination:
     )
     starts = starts_of(cfg, *_begun(store, inside, settings.starts == "key"), len(extra))
     if worth := worth_in(inputs):
-        starts, mean = by_worth(starts, _tasks_of_starts(cfg, store, inside, beyond), worth)
+        starts, mean = by_worth(starts, tasks_of_starts(cfg, store, inside, beyond), worth)
         if decisions is not None and settings.recorded:
             settings = replace(settings, imagined=settings.imagined * mean)
         known["imagined_weight"] = settings.imagined
     true = TrueExperience(anchor, decisions)
-    return Imagination(policy, algorithm, settings, recipe, starts, true, rollout, known)
+    return Imagination(
+        *(policy, algorithm, settings, recipe, starts, true, rollout, known), store, inside, beyond
+    )
 
 
 def _begun(store: ClipStore, inside: Tensor | None, key: bool) -> tuple[int, Sequence[int]]:
@@ -193,9 +200,7 @@ def by_worth(starts: Starts, tasks: Sequence[str], worth: Mapping[str, float]) -
     return replace(starts, pool=weighed(starts.pool, each)), sum(each) / len(each)
 
 
-def _tasks_of_starts(
-    cfg: Cfg, store: ClipStore, inside: Tensor | None, beyond: ClipStore | None
-) -> list[str]:
+def tasks_of_starts(cfg: Cfg, store: ClipStore, inside: Tensor | None, beyond: ClipStore | None) -> list[str]:
     """The task of each start number: of moments or episodes, then of the first frames beyond."""
     every = torch.arange(len(store)) if inside is None else inside
     tasks = dict(zip(every.tolist(), tasks_of_episodes(cfg, store, every), strict=True))

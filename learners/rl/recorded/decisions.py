@@ -86,8 +86,12 @@ class RecordedDecisions:
             self.known[key] = rollout[key].flatten(0, 1)[self.at].cpu()
 
     def sample(self, count: int, like: TensorDict, generator: torch.Generator) -> TensorDict:
-        """Random ones, `count` at most, with the keys and on the device of the transitions `like`."""
-        seen = self._seen(self.known[torch.randperm(len(self.known), generator=generator)[:count]])
+        """Random ones, `count` at most; see taken."""
+        return self.taken(torch.randperm(len(self.known), generator=generator)[:count], like)
+
+    def taken(self, which: torch.Tensor, like: TensorDict) -> TensorDict:
+        """These of them, int64 [N], with the keys of the transitions `like`, on the policy's device."""
+        seen = self._seen(self.known[which])
         return seen.select(*like.keys(True, True)).to(device_of(self.policy))
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
+from torch import Tensor
 from tqdm import tqdm
 
 from actors.fleets.fleet import EpisodeLedger
@@ -16,35 +18,60 @@ from actors.policies.contract import device_of, trained_part
 from actors.rollouts.host import trained_weights
 from envs.files import write_json
 from envs.rng import order_generator
+from envs.specs import EPISODE
 from envs.targets import ConfigError
+from learners.rl.algorithm import sound
 from learners.rl.feed import build_feed
 from learners.rl.ppo import PPO
+from learners.rl.recorded.decisions import RecordedDecisions
 from pipeline.commands.worlds.subject import round_inputs
+from pipeline.evaluation.by_task import tasks_of_episodes
 from pipeline.evaluation.trust.gradients import PER, Measured, alignment, policy_gradient, signal
 from pipeline.loop import build_loop
-from pipeline.stages.rl import Imagination, begin, rl
+from pipeline.stages.rl import Imagination, begin, rl, tasks_of_starts
 
 LAMS = (0.0, 0.5, 0.8, 0.95)  # and the one in use; the largest hardly leans on the critic
 _PARTS = 16  # of the recorded decisions
+_FEWEST = 2  # decisions of a part of which a gradient is taken
+_COLUMNS = ("signal of imagined", "of recorded", "imagined along recorded")
 
 
 @dataclass
 class Gradients:
-    """Of the policy that RL of a round begins with, by lambda of GAE; None is an algorithm without one.
-
-    Args:
-        imagined: [M, P] of M batches of `decisions` imagined decisions; recorded: [16, P] of parts of
-            `recorded_decisions` each, {} where there are none.
+    """Of one policy: [P] of each imagined batch and of each part of the recorded decisions, and how many
+    decisions each was of.
     """
 
-    imagined: dict[float | None, torch.Tensor]
-    decisions: int
-    recorded: dict[float | None, torch.Tensor]
-    recorded_decisions: int
+    imagined: list[Tensor] = field(default_factory=list)
+    imagined_decisions: list[int] = field(default_factory=list)
+    recorded: list[Tensor] = field(default_factory=list)
+    recorded_decisions: list[int] = field(default_factory=list)
+
+    def signals(self) -> dict[str, Measured | None]:
+        """Of both kinds; None of one of which too few gradients were taken."""
+        return {
+            "imagined": _signal(self.imagined, self.imagined_decisions),
+            "recorded": _signal(self.recorded, self.recorded_decisions),
+        }
+
+
+@dataclass
+class Found:
+    """What was measured of a round.
+
+    Args:
+        by_lambda: by lambda of GAE; None is an algorithm without one.
+        by_task: with the lambda in use, {} for algorithms that have none, or of a single task.
+        used: the lambda in use.
+    """
+
+    by_lambda: dict[float | None, Gradients]
+    by_task: dict[str, Gradients]
+    used: float | None
 
 
 def gradients(cfg: Mapping[str, Any], root: Path, number: int, batches: int) -> str:
-    """A table of what imagined and recorded decisions of a round tell RL, and gradients-<round>.json.
+    """Tables of what imagined and recorded decisions of a round tell RL, and gradients-<round>.json.
 
     Args:
         cfg: the resolved config.
@@ -61,103 +88,161 @@ def gradients(cfg: Mapping[str, Any], root: Path, number: int, batches: int) -> 
     inputs = round_inputs(graph, root, number, "rl")
     name = f"rl-{number}"
     ready = begin(rl.view(name, graph.cfg, graph.nodes[name].settings), inputs)
-    found = measured(ready, batches)
-    rows = compared(found)
-    used = ready.algorithm.config.lam if isinstance(ready.algorithm, PPO) else None
-    kept = [
-        {key: asdict(cell) if isinstance(cell, Measured) else cell for key, cell in row.items()}
-        for row in rows
-    ]
-    about = {"decisions": found.decisions, "recorded_decisions": found.recorded_decisions}
-    write_json(root / f"gradients-{number}.json", {**about, "rows": kept})
-    return table(rows, batches, found.decisions, used)
+    found = measured(graph.cfg, ready, batches)
+    lambdas, tasks = rows_by_lambda(found), rows_by_task(found)
+    kept = [[{key: _plain(cell) for key, cell in row.items()} for row in rows] for rows in (lambdas, tasks)]
+    about = {"round": number, "batches": batches, "lambda": found.used}
+    write_json(root / f"gradients-{number}.json", {**about, "by_lambda": kept[0], "by_task": kept[1]})
+    return tables(lambdas, tasks, found, batches)
 
 
-def measured(ready: Imagination, batches: int) -> Gradients:
+def measured(cfg: Mapping[str, Any], ready: Imagination, batches: int) -> Found:
     """Gradients of so many imagined batches and of all recorded decisions, none of which is a step."""
     algorithm, policy = ready.algorithm, trained_part(ready.policy)
-    settings = replace(ready.settings, schedule="sync")
-    lams: tuple[float | None, ...] = (None,)
-    if isinstance(algorithm, PPO):
-        lams = tuple(sorted({*LAMS, algorithm.config.lam}))
-    imagined: dict[float | None, list[torch.Tensor]] = {lam: [] for lam in lams}
-    device = device_of(algorithm.modules())
+    settings, device = replace(ready.settings, schedule="sync"), device_of(algorithm.modules())
+    used = algorithm.config.lam if isinstance(algorithm, PPO) else None
+    lams = (None,) if used is None else tuple(sorted({*LAMS, used}))
+    found = Found({lam: Gradients() for lam in lams}, {}, used)
+    tasks = [] if used is None else tasks_of_starts(cfg, ready.store, ready.inside, ready.beyond)
+
+    def of(data: TensorDict) -> Tensor:
+        return policy_gradient(algorithm, policy, data, settings.minibatch)
+
     fleet = build_fleet(ready.recipe)
     try:
         fleet.ledger = EpisodeLedger()
         feed, weights = build_feed(fleet, algorithm, settings, ready.starts), trained_weights(ready.policy)
         for number in tqdm(range(batches), desc="imagined batches", unit="batch", dynamic_ncols=True):
-            batch, _ = feed.gather(number, weights)
-            for lam in lams:
-                data, _ = algorithm.prepare(_credited(algorithm, lam, batch.to(device)))
-                imagined[lam].append(policy_gradient(algorithm, policy, data, settings.minibatch))
+            batch = feed.gather(number, weights)[0].to(device)
+            for lam, mine in found.by_lambda.items():
+                _credit(algorithm, lam)
+                data, _ = algorithm.prepare(batch.clone())
+                mine.imagined.append(of(data))
+                mine.imagined_decisions.append(len(data))
+                if lam is not None and lam == used and len(set(tasks)) > 1:
+                    begun = batch[EPISODE] % ready.starts.count if ready.starts.count else batch[EPISODE]
+                    known = [tasks[start] for start in begun.reshape(batch.shape)[sound(batch)].tolist()]
+                    for task, part in _by_task(data, known):
+                        its = found.by_task.setdefault(task, Gradients())
+                        its.imagined.append(of(part))
+                        its.imagined_decisions.append(len(part))
     finally:
         fleet.close()
-    stacked = {lam: torch.stack(some) for lam, some in imagined.items()}
-    decisions, rollout = ready.true.decisions, ready.rollout
-    if decisions is None or rollout is None or len(decisions) < 2 * _PARTS:
-        return Gradients(stacked, len(data), {}, 0)
-    recorded = {}
-    for lam in tqdm(lams, desc="recorded decisions", unit="lambda", dynamic_ncols=True):
-        assert isinstance(algorithm, PPO), "whoever learns from recorded decisions has a critic"
-        algorithm.credit(lam if lam is not None else algorithm.config.lam)
-        algorithm.value(rollout)
-        decisions.revalue(rollout)
-        every = decisions.sample(len(decisions), data, order_generator(settings.seed))
-        parts = (every[part::_PARTS] for part in range(_PARTS))
-        recorded[lam] = torch.stack(
-            [policy_gradient(algorithm, policy, part, settings.minibatch) for part in parts]
-        )
-    return Gradients(stacked, len(data), recorded, len(decisions) // _PARTS)
+    decisions = ready.true.decisions
+    if decisions is not None and ready.rollout is not None and len(decisions) >= _FEWEST * _PARTS:
+        _of_recorded(cfg, ready, decisions, found, of, data)
+    return found
 
 
-def _credited(algorithm: Any, lam: float | None, batch: Any) -> Any:
-    """A copy of the batch, of which the algorithm will share out returns by `lam`."""
+def _of_recorded(
+    cfg: Mapping[str, Any],
+    ready: Imagination,
+    decisions: RecordedDecisions,
+    found: Found,
+    of: Callable[[TensorDict], Tensor],
+    like: TensorDict,
+) -> None:
+    """Add gradients of the recorded decisions, with the keys of the transitions `like`."""
+    order = torch.randperm(len(decisions), generator=order_generator(ready.settings.seed))
+    episodes = torch.searchsorted(ready.store.start, decisions.known["row"], right=True) - 1
+    played = episodes.unique()
+    names = dict(zip(played.tolist(), tasks_of_episodes(cfg, ready.store, played), strict=True))
+    for lam, mine in tqdm(found.by_lambda.items(), desc="recorded decisions", unit="lambda", leave=False):
+        _credit(ready.algorithm, lam)
+        ready.algorithm.value(ready.rollout)  # type: ignore[attr-defined]
+        decisions.revalue(ready.rollout)
+        for part in range(_PARTS):
+            some = order[part::_PARTS]
+            data = decisions.taken(some, like)
+            mine.recorded.append(of(data))
+            mine.recorded_decisions.append(len(data))
+            if lam == found.used and found.by_task:
+                for task, own in _by_task(data, [names[number] for number in episodes[some].tolist()]):
+                    its = found.by_task.setdefault(task, Gradients())
+                    its.recorded.append(of(own))
+                    its.recorded_decisions.append(len(own))
+
+
+def _by_task(data: TensorDict, tasks: Sequence[str]) -> list[tuple[str, TensorDict]]:
+    """Parts of transitions [N] by their tasks [N]."""
+    rows = {task: [n for n, name in enumerate(tasks) if name == task] for task in sorted(set(tasks))}
+    return [(task, data[torch.tensor(mine)]) for task, mine in rows.items() if len(mine) >= _FEWEST]
+
+
+def _credit(algorithm: Any, lam: float | None) -> None:
     if lam is not None:
         algorithm.credit(lam)
-    return batch.clone()
 
 
-def compared(found: Gradients) -> list[dict[str, Any]]:
-    """Rows by lambda: signals of imagined and recorded decisions, and cosines of their true directions with
-    that of recorded ones at the largest lambda.
-    """
-    rows: list[dict[str, Any]] = []
-    for lam, imagined in found.imagined.items():
-        row: dict[str, Any] = {"lam": lam, "imagined": signal(imagined, found.decisions)}
-        if found.recorded:
-            last = list(found.recorded)[-1]
-            mine, truth = found.recorded[lam], found.recorded[last]
-            row |= {
-                "recorded": signal(mine, found.recorded_decisions),
-                "imagined_with_recorded": alignment(imagined, truth),
-                "recorded_with_recorded": None if lam == last else alignment(mine, truth, apart=False),
-            }
-        rows.append(row)
-    return rows
+def _signal(gradients: Sequence[Tensor], decisions: Sequence[int]) -> Measured | None:
+    few = len(gradients) < 3
+    return None if few else signal(torch.stack(list(gradients)), sum(decisions) / len(decisions))
 
 
-def table(rows: Sequence[Mapping[str, Any]], batches: int, decisions: int, used: float | None) -> str:
+def _along(one: Sequence[Tensor], other: Sequence[Tensor], apart: bool = True) -> Measured | None:
+    few = min(len(one), len(other)) < 3
+    return None if few else alignment(torch.stack(list(one)), torch.stack(list(other)), apart)
+
+
+def rows_by_lambda(found: Found) -> list[dict[str, Any]]:
+    """Signals, and cosines of the true directions with that of recorded decisions at the largest lambda."""
+    last, truth = list(found.by_lambda.items())[-1]
+    return [
+        {
+            "lambda": lam,
+            **mine.signals(),
+            "imagined_along_recorded": _along(mine.imagined, truth.recorded),
+            "recorded_along_themselves": None
+            if lam == last
+            else _along(mine.recorded, truth.recorded, apart=False),
+        }
+        for lam, mine in found.by_lambda.items()
+    ]
+
+
+def rows_by_task(found: Found) -> list[dict[str, Any]]:
+    """Signals, and cosines of the true directions of imagined and recorded decisions of the same task."""
+    return [
+        {
+            "task": task,
+            **mine.signals(),
+            "imagined_along_recorded": _along(mine.imagined, mine.recorded),
+        }
+        for task, mine in found.by_task.items()
+    ]
+
+
+def tables(
+    lambdas: Sequence[Mapping[str, Any]], tasks: Sequence[Mapping[str, Any]], found: Found, batches: int
+) -> str:
     """Markdown, and what follows for the lambda in use."""
+    each = round(sum(found.by_lambda[found.used].imagined_decisions) / batches)
     lines = [
-        f"What the gradients of {batches} batches of {decisions} imagined decisions have in common, per {PER}"
-        " decisions [95% interval]",
+        f"Signal per {PER} decisions, and cosines of true directions [95% interval], of {batches} batches of"
+        f" {each} imagined decisions",
         "",
-        "| lambda | signal of imagined | of recorded | imagined along recorded | recorded along themselves |",
+        f"| lambda | {' | '.join(_COLUMNS)} | recorded along themselves |",
         "| --- | --- | --- | --- | --- |",
     ]
-    for row in rows:
-        cells = (row["imagined"], row.get("recorded"), row.get("imagined_with_recorded"))
-        said = [_said(cell) for cell in (*cells, row.get("recorded_with_recorded"))]
-        lam = "none" if row["lam"] is None else f"{row['lam']:g}"
-        lines.append(f"| {lam}{' (in use)' if used == row['lam'] else ''} | {' | '.join(said)} |")
-    (mine,) = (row for row in rows if row["lam"] == used)
-    return "\n".join([*lines, "", *_follows(mine, decisions)])
+    for row in lambdas:
+        lam = "none" if row["lambda"] is None else f"{row['lambda']:g}"
+        used = " (in use)" if found.used == row["lambda"] else ""
+        lines.append(f"| {lam}{used} | {' | '.join(_said(cell) for cell in list(row.values())[1:])} |")
+    if tasks:
+        lines += [
+            "",
+            f"| task, with the lambda in use | {' | '.join(_COLUMNS)} |",
+            "| --- | --- | --- | --- |",
+        ]
+        for row in tasks:
+            lines.append(f"| {row['task']} | {' | '.join(_said(cell) for cell in list(row.values())[1:])} |")
+    (mine,) = (row for row in lambdas if row["lambda"] == found.used)
+    return "\n".join([*lines, "", *_follows(mine, each)])
 
 
 def _follows(row: Mapping[str, Any], decisions: int) -> list[str]:
     """What a row means for who sets rl.envs and rl.recorded."""
-    imagined, recorded = row["imagined"], row.get("recorded")
+    imagined, recorded, along = (row[key] for key in ("imagined", "recorded", "imagined_along_recorded"))
     if not imagined.found:
         least = PER / max(imagined.value + 2 * imagined.error, 1e-9)
         return [
@@ -169,11 +254,10 @@ def _follows(row: Mapping[str, Any], decisions: int) -> list[str]:
         f"A gradient that is half signal takes {PER / imagined.value:.0f} imagined decisions (the gradient"
         f" noise scale); an iteration has {decisions}."
     ]
-    along = row.get("imagined_with_recorded")
     if recorded is not None and recorded.found and along is not None and along.value > 0:
-        each = recorded.value / (imagined.value * along.value**2)
+        times = recorded.value / (imagined.value * along.value**2)
         lines.append(
-            f"One recorded decision tells as much of the true direction as {each:.1f} imagined ones."
+            f"One recorded decision tells as much of the true direction as {times:.1f} imagined ones."
         )
     return lines
 
@@ -182,3 +266,7 @@ def _said(cell: Measured | None) -> str:
     if cell is None:
         return "-"
     return f"{cell.value:.3f} [{cell.value - 2 * cell.error:.3f}, {cell.value + 2 * cell.error:.3f}]"
+
+
+def _plain(cell: Any) -> Any:
+    return asdict(cell) if isinstance(cell, Measured) else cell

@@ -51,12 +51,12 @@ def policy_gradient(algorithm: Algorithm, policy: nn.Module, data: TensorDict, m
     return total
 
 
-def signal(gradients: Tensor, decisions: int) -> Measured:
+def signal(gradients: Tensor, decisions: float) -> Measured:
     """Signal per PER decisions: |G|^2 over the variance that the gradient of so many decisions has.
 
     Args:
         gradients: [M, P] of M >= 3 batches.
-        decisions: of a batch.
+        decisions: of a batch, on average.
     """
     products = gradients.double() @ gradients.double().T
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,15 @@ import torch
 
 from envs.episodes import LeRobotWriter
 from envs.targets import ConfigError
-from pipeline.commands.worlds.gradients import LAMS, compared, gradients, measured, table
+from pipeline.commands.worlds.gradients import (
+    LAMS,
+    Found,
+    gradients,
+    measured,
+    rows_by_lambda,
+    rows_by_task,
+    tables,
+)
 from pipeline.config import load_config
 from pipeline.graph.stage import Inputs
 from pipeline.stages.given import DATASETS
@@ -24,11 +33,14 @@ SQUARE = ("experiment=smoke", "task=lerobot", "task.size=[32,32]", "task.chunk=4
 OPTIONS = ("task.mode=absolute", "launch.device=cpu", "imitation.demos=4")
 
 
-def begun(folder: Path, *words: str) -> Imagination:
-    """What `rl` begins with in a world that has learned nothing, whose policy was deployed in 24 episodes."""
+def begun(folder: Path, *words: str) -> tuple[dict[str, Any], Imagination]:
+    """What `rl` begins with in a world that has learned nothing, whose policy was deployed in 24 episodes of
+    two tasks.
+    """
     data, robot = folder / "dataset", ARM_DELTAS
     made = [moving_square(robot, seed, "expert" if seed < 8 else "policy-0") for seed in range(32)]
-    LeRobotWriter(data, robot.at(SIZE)).write(made)
+    told = [replace(one, instruction=f"{one.instruction}, {seed % 2}") for seed, one in enumerate(made)]
+    LeRobotWriter(data, robot.at(SIZE)).write(told)
     cfg: dict[str, Any] = load_config([*SQUARE, *OPTIONS, f"task.data=[{data}]", *words])
     untrained_world(cfg, folder)
     (folder / "recordings").mkdir()
@@ -36,29 +48,42 @@ def begun(folder: Path, *words: str) -> Imagination:
     roles: dict[str, Any] = {name: folder / name for name in ("policy", "simulator", "state", "judge")}
     settings = {"number": 1, "iterations": 1}
     inputs = Inputs({**roles, "data": (folder / "recordings",)}, settings)
-    return begin(rl.view("rl-1", cfg, settings), inputs)
+    return cfg, begin(rl.view("rl-1", cfg, settings), inputs)
 
 
-def test_imagined_and_recorded_decisions_by_lambda(tmp_path: Path) -> None:
-    ready = begun(tmp_path)
+def said(found: Found, batches: int) -> str:
+    return tables(rows_by_lambda(found), rows_by_task(found), found, batches)
+
+
+def test_imagined_and_recorded_decisions_by_lambda_and_task(tmp_path: Path) -> None:
+    cfg, ready = begun(tmp_path)
     before = {name: value.clone() for name, value in ready.policy.state_dict().items()}
-    found = measured(ready, 3)
-    used = ready.algorithm.config.lam  # type: ignore[attr-defined]
-    assert list(found.imagined) == list(found.recorded) == sorted({*LAMS, used})
+    found = measured(cfg, ready, 3)
+    assert list(found.by_lambda) == sorted({*LAMS, found.used})  # type: ignore[type-var]
     decisions = ready.true.decisions
-    assert decisions is not None and found.recorded_decisions == len(decisions) // 16 >= 2
-    for kind, count in ((found.imagined, 3), (found.recorded, 16)):
-        assert all(len(some) == count and some.isfinite().all() and some.any() for some in kind.values())
-        assert not torch.equal(kind[0.0], kind[0.95])
+    assert decisions is not None and len(decisions) >= 32
+    for mine in found.by_lambda.values():
+        assert len(mine.imagined) == 3 and sum(mine.recorded_decisions) == len(decisions)
+        assert all(one.isfinite().all() and one.any() for one in (*mine.imagined, *mine.recorded))
+    least, most = found.by_lambda[0.0], found.by_lambda[0.95]
+    assert not torch.equal(least.imagined[0], most.imagined[0])
+    assert not torch.equal(least.recorded[0], most.recorded[0])
+    assert [task[-3:] for task in found.by_task] == [", 0", ", 1"]
+    whole = found.by_lambda[found.used]
+    apart = list(found.by_task.values())
+    assert sum(sum(its.imagined_decisions) for its in apart) == sum(whole.imagined_decisions)
+    assert (
+        32 <= sum(sum(its.recorded_decisions) for its in apart) <= len(decisions)
+    )  # single ones are left out
     assert all(torch.equal(value, before[name]) for name, value in ready.policy.state_dict().items())
-    text = table(compared(found), 3, found.decisions, used)
-    assert text.count("(in use)") == 1 and "half signal" in text
+    text = said(found, 3)
+    assert text.count("(in use)") == 1 and "half signal" in text and text.count("| move the square") == 2
 
 
 def test_an_algorithm_without_lambda_has_one_row(tmp_path: Path) -> None:
-    found = measured(begun(tmp_path, "algorithm=grpo", "algorithm.group=2"), 3)
-    text = table(compared(found), 3, found.decisions, None)
-    assert list(found.imagined) == [None] and not found.recorded and "| none (in use) |" in text
+    found = measured(*begun(tmp_path, "algorithm=grpo", "algorithm.group=2"), 3)
+    assert list(found.by_lambda) == [None] and not found.by_task and not found.by_lambda[None].recorded
+    assert "| none (in use) |" in said(found, 3)
 
 
 def test_what_cannot_be_asked_is_told(tmp_path: Path) -> None:
