@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from actors.factory import at_once, build_physics, build_policy
-from actors.rollouts.evaluate import evaluate
+from actors.rollouts.evaluate import Outcome, evaluate
+from envs.files import write_json
 from envs.rng import Purpose, episode_seeds
 from envs.targets import ConfigError
 from pipeline.evaluation.by_task import by_task, tasks_of_episodes, tasks_of_seeds, unseen_first, variant_of
-from pipeline.evaluation.statistics import rate_entry, rate_line
+from pipeline.evaluation.statistics import mcnemar, points_line, rate_entry, rate_line
 from pipeline.graph.graph import Graph
 from pipeline.loop import build_loop
 from pipeline.stages.given import load_world, open_store
@@ -21,12 +24,15 @@ from pipeline.stages.given import load_world, open_store
 Cfg = Mapping[str, Any]
 _WORLDS = ["imagined", "physics"]
 _SIDE_BY_SIDE = 64  # imagined episodes
+_FIRST = "evaluate-before"
 
 
 def evaluate_policy(
     cfg: Mapping[str, Any], root: Path, weights: str = "", world: str = "physics", variant: str = ""
 ) -> str:
-    """Successes of episodes, with their interval, in one line, and one more for each of several tasks.
+    """Successes of episodes, with their interval, in one line, and one more for each of several tasks; in
+    physics also beside the run's first policy, where its stage has tried that on the same episodes. What came
+    of each episode is kept in evaluations/<policy>-<world>[-<variant>].json of the run's folder.
 
     Args:
         cfg: the resolved config.
@@ -55,7 +61,41 @@ def evaluate_policy(
     name = f"{weights or cfg['policy']['_target_']} in {world}{', ' if variant else ''}{variant}"
     parts = by_task(tasks, _line, outcome.success, outcome.counted)
     lines = [f"{name}: {_line(outcome.success, outcome.counted)}"]
-    return "\n".join([*lines, *(f"  {task}: {line}" for task, line in parts.items())])
+    lines += [f"  {task}: {line}" for task, line in parts.items()]
+    if world == "physics" and not variant:
+        lines += _beside_first(graph, seeds, outcome)
+    kept = (
+        root
+        / "evaluations"
+        / f"{'-'.join([_slug(weights or 'built'), world, *filter(None, [variant])])}.json"
+    )
+    rows = zip(seeds, tasks, outcome.success.tolist(), outcome.counted.tolist(), strict=True)
+    each = [dict(zip(("seed", "task", "success", "counted"), row, strict=True)) for row in rows]
+    about = {"policy": weights or cfg["policy"]["_target_"], "world": world, "variant": variant}
+    write_json(kept, {**about, **rate_entry(outcome.success[outcome.counted]), "each": each})
+    return "\n".join([*lines, str(kept)])
+
+
+def _slug(name: str) -> str:
+    """A name of a file for a stage or a folder."""
+    return re.sub(r"[^\w.-]+", "-", name).strip("-")
+
+
+def _beside_first(graph: Graph, seeds: list[int], outcome: Outcome) -> list[str]:
+    """A line on the policy that RL began with, if its stage has played the same episodes."""
+    if not graph.finished(_FIRST):
+        return []
+    first = torch.load(graph.folder(_FIRST) / "outcomes.pt", weights_only=True)
+    if first["seeds"].tolist() != seeds:
+        return []
+    both = first["counted"] & outcome.counted
+    before, after = first["success"][both], outcome.success[both]
+    found = mcnemar(before, after)
+    gain = points_line(float(after.float().mean() - before.float().mean()))
+    return [
+        f"  beside the first policy on the same {int(both.sum())} episodes: {gain} points,"
+        f" p {found['p']:.2g} ({found['gained']} won, {found['lost']} lost)"
+    ]
 
 
 def _line(success: Tensor, counted: Tensor) -> str:
