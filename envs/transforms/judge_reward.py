@@ -72,9 +72,9 @@ class JudgeReward(Transform):
         about those that have not succeeded, and the others stay successes. One that does not is asked about
         all, as smaller batches may round otherwise.
         """
-        rows = (~self._won).nonzero().flatten()
-        if not self.judge.charges or len(rows) == len(frames):
+        if not self.judge.charges or not self._won.any():
             return ask(self.judge, frames, first, texts, *features)
+        rows = (~self._won).nonzero().flatten()
         success = torch.ones(frames.shape[:2], device=frames.device)
         out = Judgement(success, success.clone(), torch.full_like(self._run, Status.OK.value))
         if len(rows):

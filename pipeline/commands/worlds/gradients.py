@@ -148,9 +148,10 @@ def _of_recorded(
     played = episodes.unique()
     names = dict(zip(played.tolist(), tasks_of_episodes(cfg, ready.store, played), strict=True))
     for lam, mine in tqdm(found.by_lambda.items(), desc="recorded decisions", unit="lambda", leave=False):
-        _credit(ready.algorithm, lam)
-        ready.algorithm.value(ready.rollout)  # type: ignore[attr-defined]
-        decisions.revalue(ready.rollout)
+        if isinstance(ready.algorithm, PPO) and lam is not None:  # others keep the advantages that they gave
+            ready.algorithm.credit(lam)
+            ready.algorithm.value(ready.rollout)
+            decisions.revalue(ready.rollout)
         for part in range(_PARTS):
             some = order[part::_PARTS]
             data = decisions.taken(some, like)

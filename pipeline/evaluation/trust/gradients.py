@@ -20,7 +20,7 @@ from learners.rl.algorithm import Algorithm
 
 PER = 1000  # decisions, of which signal is told
 # Standard errors by which a signal must stand out before its direction is compared. The jackknife tells those
-# of products of few batches a third too large or more, so 1.5 are rather 2.
+# of products of few batches a quarter too large or more, so 1.5 are rather 2.
 _SURE = 1.5
 
 
