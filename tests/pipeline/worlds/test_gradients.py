@@ -86,6 +86,24 @@ def test_an_algorithm_without_lambda_has_one_row(tmp_path: Path) -> None:
     assert "| none (in use) |" in said(found, 3)
 
 
+class Own:
+    """Somebody's algorithm, which has a critic and no lambda."""
+
+    def __init__(self, inner: Any):
+        self.inner = inner
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("config", "credit", "value"):
+            raise AttributeError(name)
+        return getattr(self.inner, name)
+
+
+def test_somebody_elses_algorithm_keeps_the_advantages_that_it_gave(tmp_path: Path) -> None:
+    cfg, ready = begun(tmp_path)
+    found = measured(cfg, replace(ready, algorithm=Own(ready.algorithm)), 3)
+    assert list(found.by_lambda) == [None] and len(found.by_lambda[None].recorded) == 16
+
+
 def test_what_cannot_be_asked_is_told(tmp_path: Path) -> None:
     cfg = load_config(["experiment=soak"])
     with pytest.raises(ConfigError, match="3 of them at least"):
