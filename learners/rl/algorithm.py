@@ -47,9 +47,12 @@ class RLConfig:
         clip: largest gradient norm of the policy, and of the critic.
         kl_stop: mean KL to the behaviour policy at which an iteration's epochs end early.
         imagined: weight of the algorithm's loss on imagined decisions; 0 leaves them out, as a control.
-        recorded: decisions of the deployed policy in physics per iteration, learned from beside the imagined
+        recorded: decisions of deployed policies in physics per iteration, learned from beside the imagined
             ones by the same loss; 0 for none. Algorithms without a critic, and policies that are scored on
             action tokens, learn from imagined ones only.
+        recorded_rounds: rounds whose decisions those are, and whose episodes warm up the critic: so many up
+            to that of the policy that RL begins with; None for all, with what explore played. Of one round's
+            alone most of what is learned is noise, and does not hold on other episodes.
         anchor: weight of cloning what is known to have worked in physics (the newest deployed policy's true
             successes) beside the algorithm's loss; it keeps RL from wandering where only the simulator says
             it works.
@@ -84,6 +87,7 @@ class RLConfig:
     kl_stop: Positive
     imagined: NonNegative
     recorded: Natural
+    recorded_rounds: Count | None
     anchor: NonNegative
     anchor_batch: Count
     rewards_later: bool

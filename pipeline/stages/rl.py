@@ -231,10 +231,10 @@ def nothing_left(settings: RLConfig, decisions: RecordedDecisions | None) -> lis
 def _warm_up(
     cfg: Cfg, inputs: Inputs, policy: Any, algorithm: Algorithm, store: ClipStore, seed: int
 ) -> tuple[dict[str, float], TensorDict | None, RecordedDecisions | None]:
-    """Let a critic, if the algorithm has one, learn from the deployed policy's true episodes first; one that
+    """Let a critic, if the algorithm has one, learn from the deployed policies' true episodes first; one that
     begins from nothing spoils the first iterations. What it says of their decisions RL learns from, too.
     """
-    past = store.select([f"policy-{deployed_in(inputs, 'known')}"])
+    past = recorded_episodes(store, deployed_in(inputs, "known"), cfg["rl"]["recorded_rounds"])
     past = past[torch.isin(past, learning_episodes(store)) & store.arrays["labelled"][past]]
     if not hasattr(algorithm, "warm_up") or not len(past):
         return {}, None, None
@@ -248,6 +248,15 @@ def _warm_up(
     decisions = RecordedDecisions(policy, store, rollout, mode_of(cfg))
     figures = {"critic_knew": knew, "recorded_decisions": float(len(decisions))}
     return figures, rollout, decisions if len(decisions) else None
+
+
+def recorded_episodes(store: ClipStore, deployed: int, rounds: int | None) -> Tensor:
+    """Episodes that deployed policies played, int64 [N]: in the last `rounds` rounds up to that in which the
+    policy was deployed that RL begins with; in all, those after it and those of explore too, if None.
+    """
+    if rounds is None:
+        return store.select(["policy-*"])
+    return store.select([f"policy-{number}" for number in range(max(0, deployed - rounds + 1), deployed + 1)])
 
 
 @stage(reads=(*PHYSICS, *LEARNING))

@@ -184,6 +184,7 @@ WRONG: dict[type, list[Any]] = {
 FREE = ("simulator.scratch", "policy.policy", "judge.chat.body")
 NULLABLE = (
     "rl.horizon",
+    "rl.recorded_rounds",
     "task.suite",
     "finetune.weights",
     "judge.chat.key",

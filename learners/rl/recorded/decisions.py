@@ -27,11 +27,13 @@ _SAMPLES = 16
 
 
 class RecordedDecisions:
-    """Decisions that a policy took in physics with their advantages, as transitions of an iteration.
+    """Decisions that policies took in physics with their advantages, as transitions of an iteration.
 
     Likelihood ratios are to the policy that RL begins with, over all of its iterations: clipping then lets
     each decision move the policy so far and no further. Ratios to the policy of each iteration would let
-    the same bad decision push it away again and again.
+    the same bad decision push it away again and again. An older policy's decisions are taken as this one's
+    own, as far as it might well say them: from one round to the next policies change little, and what few
+    episodes tell is mostly noise, which a policy learns by heart.
 
     Args:
         policy: in training, as RL begins with it.

@@ -53,6 +53,7 @@ RL = {
         "imagined": 1.0,
         "recorded": 0,
         "anchor": 0.0,
+        "recorded_rounds": None,
         "anchor_batch": 8,
         "rewards_later": False,
     },

@@ -37,7 +37,7 @@ def test_true_decisions_are_learned_from_whatever_measures_progress(
     view = stages.rl.view("rl-1", cfg, {"number": 1})
     store = open_clips(view, [data])
     for number, row in enumerate(store.episodes):
-        row["source"] = f"policy-{1 + number // 2 % 2}"
+        row["source"] = f"policy-{number // 2 % 3}"
     torch.manual_seed(0)
     policy = build_policy(view)
     algorithm = build_algorithm(view, policy)
@@ -48,7 +48,11 @@ def test_true_decisions_are_learned_from_whatever_measures_progress(
     assert decisions is not None and figures["recorded_decisions"] == len(decisions) > 10
     assert "critic_knew" in figures and float(decisions.known["advantage"].std()) > 0.05
     played = torch.searchsorted(store.start, decisions.known["row"], right=True) - 1
-    assert {store.episodes[number]["source"] for number in played.tolist()} == {"policy-1"}
+    sources = {store.episodes[number]["source"] for number in played.tolist()}
+    assert sources == {"policy-0", "policy-1", "policy-2"}
+    for rounds, wanted in ((1, {"policy-1"}), (2, {"policy-0", "policy-1"}), (9, {"policy-0", "policy-1"})):
+        chosen = stages.recorded_episodes(store, 1, rounds)
+        assert {store.episodes[number]["source"] for number in chosen.tolist()} == wanted
     learning = rl_options(cfg, **SETTINGS)
     assert not stages.nothing_left(learning, decisions)
     (alarm,) = stages.nothing_left(
