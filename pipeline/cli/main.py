@@ -23,7 +23,7 @@ COMMANDS: dict[str, Callable[[Words], None]] = {
     command.__name__.replace("_", "-"): command
     for command in (
         *(runs.run, runs.rl, runs.stage, runs.stages, runs.evaluate),
-        *(runs.trust, runs.gradients, runs.controls, runs.study),
+        *(runs.trust, runs.gradients, runs.cross_validate, runs.controls, runs.study),
         *(
             worlds.policy_value,
             worlds.fidelity,
@@ -44,7 +44,7 @@ _STDOUT = 1  # its file descriptor
 
 
 def _help() -> str:
-    lines = [line for name in COMMANDS for line in _wrapped(_about(name), f"  {name:<13} ", " " * 16)]
+    lines = [line for name in COMMANDS for line in _wrapped(_about(name), f"  {name:<14} ", " " * 17)]
     return (
         "worldloop <command> [key=value ...]\n\n"
         + "\n".join(lines)

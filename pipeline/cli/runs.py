@@ -149,6 +149,17 @@ def gradients(words: Words) -> None:
     print(table(cfg, root, own["round"], own["batches"]))
 
 
+def cross_validate(words: Words) -> None:
+    """whether what RL learns from a round's recorded decisions holds on other episodes:
+    worldloop cross-validate round=1 [folds=5] experiment=...
+    """
+    from pipeline.commands.worlds.cross_validate import cross_validate as table
+
+    own, rest = counts_of(words, {"round": 1, "folds": 5})
+    cfg, root = prepared(rest)
+    print(table(cfg, root, own["round"], own["folds"]))
+
+
 def controls(words: Words) -> None:
     """whose gain is it: beside a finished run the loop without RL iterations, RL in physics, filtered BC"""
     cfg, root = prepared(words)

@@ -5,6 +5,7 @@ simulator errs.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -64,12 +65,25 @@ class RecordedDecisions:
         return len(self.known)
 
     @torch.no_grad()
+    def likelihood(self) -> torch.Tensor:
+        """Log-probability float32 [N] of all of them under the policy as it is now."""
+        return torch.cat(
+            [
+                self._said(some).log_prob(some[CHUNK].to(device_of(self.policy))).cpu()
+                for some in self.known.split(_AT_ONCE)
+            ]
+        )
+
+    def _said(self, some: TensorDict) -> Any:
+        return distribution(self.policy, inputs_for(self._seen(some), self.policy))
+
+    @torch.no_grad()
     def _likely(self, some: TensorDict) -> tuple[torch.Tensor, torch.Tensor]:
         """How likely the policy finds the chunks of decisions [N]: float32 [N]; and whether it might well say
         them, bool [N].
         """
         device = device_of(self.policy)
-        said = distribution(self.policy, inputs_for(self._seen(some), self.policy))
+        said = self._said(some)
         likely = said.log_prob(some[CHUNK].to(device))
         # What may be said is told by the same draws each time, so that a resumed run tells the same.
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
@@ -91,10 +105,12 @@ class RecordedDecisions:
         """Random ones, `count` at most; see taken."""
         return self.taken(torch.randperm(len(self.known), generator=generator)[:count], like)
 
-    def taken(self, which: torch.Tensor, like: TensorDict) -> TensorDict:
-        """These of them, int64 [N], with the keys of the transitions `like`, on the policy's device."""
+    def taken(self, which: torch.Tensor, like: TensorDict | None = None) -> TensorDict:
+        """These of them, int64 [N], on the policy's device; with the keys of the transitions `like` alone, if
+        those are given.
+        """
         seen = self._seen(self.known[which])
-        return seen.select(*like.keys(True, True)).to(device_of(self.policy))
+        return (seen if like is None else seen.select(*like.keys(True, True))).to(device_of(self.policy))
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,10 @@ LASTS = {
     ),
     "trust": (["trust", *SOAK, "name=known", "depth=1", "futures=300"], r"carried out: +\d"),
     "gradients": (["gradients", *SOAK, "name=known", "batches=9000"], r"imagined batches: +\d"),
+    "cross-validate": (
+        ["cross-validate", *SOAK, "name=known", "folds=2", "rounds.iterations=[90000]"],
+        r"folds: +\d",
+    ),
     "controls": (["controls", *SOAK, "name=known"], r"deploy: +\d"),
     "study": (
         [
