@@ -29,6 +29,7 @@ from pipeline.evaluation.measurement import rollout_error, speed
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.loop import check_physics
+from pipeline.markdown import markdown_table
 from pipeline.stages import collect, world
 from pipeline.stages.given import WORLD, Cfg, open_store
 from pipeline.stages.judging import stage as judging
@@ -69,9 +70,11 @@ def distil(cfg: dict[str, Any]) -> dict[str, dict[str, Any]]:
     found = {title: graph.result(name) for title, name in rows.items()}
     write_json(root / "distil.json", found)
     frames = next(iter(found.values()))["frames"]
-    print(f"| | {' | '.join(_FIGURES).format(frames=frames)} |\n|{' --- |' * (1 + len(_FIGURES))}")
-    for title, figures in found.items():
-        print(f"| {title} | {' | '.join(_cell(form, figures) for form in _FIGURES.values())} |")
+    headings = ["", *(heading.format(frames=frames) for heading in _FIGURES)]
+    cells = [
+        [title, *(_cell(form, figures) for form in _FIGURES.values())] for title, figures in found.items()
+    ]
+    print(markdown_table(headings, cells))
     print("\n".join([*(f"{title}: left out, {why}" for title, why in left.items()), *reached(found)]))
     return found
 

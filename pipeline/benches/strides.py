@@ -27,6 +27,7 @@ from pipeline.evaluation.statistics import mean
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.loop import check_physics
+from pipeline.markdown import markdown_table
 from pipeline.stages import collect, world
 from pipeline.stages.given import WORLD, Cfg, open_store
 from pipeline.stages.judging import stage as judging
@@ -51,12 +52,12 @@ def strides(cfg: dict[str, Any]) -> dict[int, dict[str, Any]]:
     graph.run(list(rows.values()))
     found = {number: graph.result(name) for number, name in rows.items()}
     write_json(root / "strides.json", found)
-    print(f"| {' | '.join(_HEADINGS)} |\n|{' --- |' * len(_HEADINGS)}")
+    lines = []
     for number, row in found.items():
         decibels = ("-" if (value := row[key]) is None else f"{value:.2f}" for key in ("psnr", "psnr_common"))
         verdicts = (verdict_text(row["verdicts"], video) for video in ("generated", "recorded"))
-        told = [f"{row['covers']:.1f} s", f"{row['seconds']:.3f}", *decibels, *verdicts]
-        print(f"| {number} | {' | '.join(told)} |")
+        lines.append([f"{number}", f"{row['covers']:.1f} s", f"{row['seconds']:.3f}", *decibels, *verdicts])
+    print(markdown_table(_HEADINGS, lines))
     return found
 
 

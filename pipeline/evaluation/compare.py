@@ -9,6 +9,7 @@ from typing import Any
 
 from envs.targets import ConfigError
 from pipeline.evaluation.statistics import percent_line, points_line, psnr_line, rate_line, rise
+from pipeline.markdown import markdown_table
 
 Result = Mapping[str, Any]
 
@@ -27,9 +28,8 @@ def compare(folders: list[Path]) -> str:
                 f"{file} is not there; a run writes it when it ends: worldloop run name={folder.name} ..."
             )
         results.append(json.loads(file.read_text()))
-    lines = [["", *(folder.name for folder in folders)], ["---"] * (1 + len(folders))]
-    lines += [[label, *(cell(result) for result in results)] for label, cell in _ROWS]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    rows = [[label, *(cell(result) for result in results)] for label, cell in _ROWS]
+    return markdown_table(["", *(folder.name for folder in folders)], rows)
 
 
 def _rate(key: str) -> Callable[[Result], str]:

@@ -8,6 +8,7 @@ from typing import Any
 from markupsafe import Markup
 
 from pipeline.evaluation.report import templates
+from pipeline.markdown import markdown_table
 from pipeline.study.columns import Column
 from pipeline.study.side_by_side import NOT_RUN, best_of, headlines
 
@@ -46,9 +47,7 @@ def markdown(table: Mapping[str, Any], columns: Columns) -> str:
     """The whole table as Markdown."""
     parts = [f"# {table['name']}"]
     for title, lines in sections_of(table, columns):
-        rows = [lines[0], ["---"] * len(lines[0]), *lines[1:]]
-        texts = [[cell.replace("|", "\\|") for cell in row] for row in rows]
-        parts.append(f"## {title}\n\n" + "\n".join(f"| {' | '.join(row)} |" for row in texts))
+        parts.append(f"## {title}\n\n{markdown_table(lines[0], lines[1:])}")
     parts += best_of(table, columns)
     if table["pooled"]:
         parts.append(OVER_SEEDS)

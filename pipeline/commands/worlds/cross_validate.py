@@ -19,10 +19,12 @@ from pipeline.evaluation.by_task import tasks_of_episodes
 from pipeline.evaluation.trust.gradients import Measured
 from pipeline.evaluation.trust.held_out import Moment, folds_of, joined, learned_without, mean_gain
 from pipeline.loop import build_loop
+from pipeline.markdown import markdown_table
 from pipeline.stages.given import deployed_in, imagined_chunks
 from pipeline.stages.rl import Imagination, begin, recorded_episodes, rl
 
 _LOOKS = (32, 16, 8, 4, 2, 1)  # parts of all steps after which is looked
+_COLUMNS = ("on what was learned from", "on episodes left out")
 _HOLDS = 0.5  # of what is learned, below which most of it is said to be noise
 
 
@@ -139,23 +141,21 @@ def plain(found: Found) -> dict[str, Any]:
 
 def tables(found: Found, folds: int) -> str:
     """Markdown, and what follows."""
-    lines = [
+    title = (
         f"Gain in return per episode [95% interval] from {found.decisions} recorded decisions alone, of which"
         f" {found.own} in {found.episodes} episodes are the policy's own; each of {folds} parts of these is"
-        " left out once",
-        "",
-        "| steps | KL, nats | on what was learned from | on episodes left out |",
-        "| --- | --- | --- | --- |",
-    ]
-    for row in found.by_steps:
-        cells = (_said(row["learned"], False), _said(row["left_out"]))
-        lines.append(f"| {row['steps']} | {row['kl']:.3f} | {' | '.join(cells)} |")
+        " left out once"
+    )
+    rows = [[f"{row['steps']}", f"{row['kl']:.3f}", *_gains(row)] for row in found.by_steps]
+    lines = [title, "", markdown_table(["steps", "KL, nats", *_COLUMNS], rows)]
     if found.by_task:
-        lines += ["", "| task, after all steps | on what was learned from | on episodes left out |"]
-        lines.append("| --- | --- | --- |")
-    for row in found.by_task:
-        lines.append(f"| {row['task']} | {_said(row['learned'], False)} | {_said(row['left_out'])} |")
+        rows = [[row["task"], *_gains(row)] for row in found.by_task]
+        lines += ["", markdown_table(["task, after all steps", *_COLUMNS], rows)]
     return "\n".join([*lines, "", *_follows(found.by_steps)])
+
+
+def _gains(row: Mapping[str, Any]) -> list[str]:
+    return [_said(row["learned"], False), _said(row["left_out"])]
 
 
 def _follows(rows: Sequence[Mapping[str, Any]]) -> list[str]:

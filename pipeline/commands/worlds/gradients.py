@@ -28,6 +28,7 @@ from pipeline.commands.worlds.subject import round_inputs
 from pipeline.evaluation.by_task import tasks_of_episodes
 from pipeline.evaluation.trust.gradients import PER, Measured, alignment, policy_gradient, signal
 from pipeline.loop import build_loop
+from pipeline.markdown import markdown_table
 from pipeline.stages.rl import Imagination, begin, rl, tasks_of_starts
 
 LAMS = (0.0, 0.5, 0.8, 0.95)  # and the one in use; the largest hardly leans on the critic
@@ -218,25 +219,20 @@ def tables(
 ) -> str:
     """Markdown, and what follows for the lambda in use."""
     each = round(sum(found.by_lambda[found.used].imagined_decisions) / batches)
+    shown = []
+    for row in lambdas:
+        lam = "none" if row["lambda"] is None else f"{row['lambda']:g}"
+        used = " (in use)" if found.used == row["lambda"] else ""
+        shown.append([lam + used, *map(_said, list(row.values())[1:])])
     lines = [
         f"Signal per {PER} decisions, and cosines of true directions [95% interval], of {batches} batches of"
         f" {each} imagined decisions",
         "",
-        f"| lambda | {' | '.join(_COLUMNS)} | recorded along themselves |",
-        "| --- | --- | --- | --- | --- |",
+        markdown_table(["lambda", *_COLUMNS, "recorded along themselves"], shown),
     ]
-    for row in lambdas:
-        lam = "none" if row["lambda"] is None else f"{row['lambda']:g}"
-        used = " (in use)" if found.used == row["lambda"] else ""
-        lines.append(f"| {lam}{used} | {' | '.join(_said(cell) for cell in list(row.values())[1:])} |")
     if tasks:
-        lines += [
-            "",
-            f"| task, with the lambda in use | {' | '.join(_COLUMNS)} |",
-            "| --- | --- | --- | --- |",
-        ]
-        for row in tasks:
-            lines.append(f"| {row['task']} | {' | '.join(_said(cell) for cell in list(row.values())[1:])} |")
+        each_task = [[row["task"], *map(_said, list(row.values())[1:])] for row in tasks]
+        lines += ["", markdown_table(["task, with the lambda in use", *_COLUMNS], each_task)]
     (mine,) = (row for row in lambdas if row["lambda"] == found.used)
     return "\n".join([*lines, "", *_follows(mine, each)])
 

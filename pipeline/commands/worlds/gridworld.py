@@ -13,6 +13,7 @@ from envs.targets import TARGET
 from pipeline.evaluation.measurement import followed
 from pipeline.evaluation.squares import square_errors
 from pipeline.graph.graph import Graph
+from pipeline.markdown import markdown_table
 from pipeline.stages import collect, world
 from pipeline.stages.given import open_store
 from pipeline.track import Tracker
@@ -83,21 +84,17 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown: error in pixels of a 256 x 256 picture, median (90th percentile), lost squares."""
     steps = list(rows[0]["errors"])
     heads = [f"after {step}" for step in steps]
-    lines = [
+    title = (
         "Distance of squares from where they truly are, in pixels of a 256 x 256 picture under true actions:"
-        " median (90th percentile), lost squares; at the end of a row, squares that are taken to stand still",
-        "",
-        f"| squares | actions as | M parameters | {' | '.join(heads)} | still |",
-        f"| --- | --- | --- |{' --- |' * (len(steps) + 1)}",
-    ]
+        " median (90th percentile), lost squares; at the end of a row, squares that are taken to stand still"
+    )
+    lines = []
     for row in rows:
         found = [row["errors"][step] for step in steps]
-        still = found[-1]["still"]
-        lines.append(
-            f"| {row['squares']} | {row['representation']} | {row['parameters'] / 1e6:.1f} |"
-            f" {' | '.join(map(_cell, found))} | {'-' if still is None else f'{still:.0f}'} |"
-        )
-    return "\n".join(lines)
+        still = "-" if found[-1]["still"] is None else f"{found[-1]['still']:.0f}"
+        what = [f"{row['squares']}", row["representation"], f"{row['parameters'] / 1e6:.1f}"]
+        lines.append([*what, *map(_cell, found), still])
+    return f"{title}\n\n" + markdown_table(["squares", "actions as", "M parameters", *heads, "still"], lines)
 
 
 def _cell(found: Mapping[str, Any]) -> str:

@@ -25,9 +25,12 @@ from envs.targets import ConfigError
 from pipeline.commands.worlds.subject import round_inputs
 from pipeline.evaluation.trust.branches import agreement, branch
 from pipeline.loop import build_loop, has_physics
+from pipeline.markdown import markdown_table
 from pipeline.stages.given import open_store
 
 _SIDE_BY_SIDE = 100  # true episodes
+
+_COLUMNS = ("imagined frames with true", "true frames with outcome", "imagined with outcome")
 
 
 def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures: int, depth: int) -> str:
@@ -84,16 +87,9 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
 
 def _table(rows: list[dict[str, list[float | None]]], moments: int, futures: int) -> str:
     """Markdown; "-" where all futures of each moment are alike."""
-    lines = [
-        f"Correlations among {futures} futures of each of {moments} moments [95% interval]",
-        "",
-        "| chunks on | imagined frames with true | true frames with outcome | imagined with outcome |",
-        "| --- | --- | --- | --- |",
-    ]
-    for number, row in enumerate(rows, 1):
-        cells = [_interval(values) for values in row.values()]
-        lines.append(f"| {number} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+    title = f"Correlations among {futures} futures of each of {moments} moments [95% interval]"
+    lines = [[f"{number}", *map(_interval, row.values())] for number, row in enumerate(rows, 1)]
+    return f"{title}\n\n{markdown_table(['chunks on', *_COLUMNS], lines)}"
 
 
 def _interval(values: list[float | None]) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 from pipeline.evaluation.media import inline
 from pipeline.evaluation.report import templates
+from pipeline.markdown import markdown_table
 
 # Columns of the table: key, heading and form. Arrows say which way is better.
 COLUMNS = (
@@ -56,16 +57,12 @@ def build_page(result: Mapping[str, Any], films: Mapping[int, Path]) -> str:
 
 def summary_text(result: Mapping[str, Any]) -> str:
     """Markdown: the table, the detector's own error, and what must be known to read them."""
-    titles = [title for _, title, _ in COLUMNS]
+    rows = [[name, *cells] for name, cells in _rows(result).items()]
     lines = [
         f"{result['simulator']} on {len(result['rows'])} held-out episodes, {result['samples']} samples of"
         " each",
         "",
-        f"| | {' | '.join(titles)} |",
-        f"| --- |{' --- |' * len(titles)}",
-    ]
-    lines += [f"| {name} | {' | '.join(cells)} |" for name, cells in _rows(result).items()]
-    lines += [
+        markdown_table(["", *(title for _, title, _ in COLUMNS)], rows),
         "",
         *(f"{name}: {text}" for name, text in _detector(result["detector"]).items()),
         *result["notes"],

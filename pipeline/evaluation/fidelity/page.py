@@ -11,6 +11,7 @@ from pipeline.evaluation.charts import Curve, line_chart
 from pipeline.evaluation.fidelity.end_effector import end_effector_text
 from pipeline.evaluation.fidelity.strides import HEADINGS, VERDICTS, common_stride, stride_cells
 from pipeline.evaluation.report import templates
+from pipeline.markdown import markdown_table
 
 # Figures of a row: key, heading and form.
 FIGURES = (
@@ -53,17 +54,16 @@ def build_page(result: Mapping[str, Any]) -> str:
 
 def summary_text(result: Mapping[str, Any]) -> str:
     """Markdown: overall figures, by source, Frechet distances, long rollouts, strides, and the grid."""
-    titles = [title for _, title, _ in FIGURES]
+    known = {"all": result["overall"], **result["groups"], **result["held"]}
     lines = [
         f"{result['simulator']} under the true actions of {result['episodes']} held-out episodes; perceptual"
         f" distance: {result['perceptual']}",
         "",
-        f"| | {' | '.join(titles)} |",
-        f"| --- |{' --- |' * len(titles)}",
+        markdown_table(
+            ["", *(title for _, title, _ in FIGURES)], [[name, *texts(row)] for name, row in known.items()]
+        ),
+        "",
     ]
-    for name, row in {"all": result["overall"], **result["groups"], **result["held"]}.items():
-        lines.append(f"| {name} | {' | '.join(texts(row))} |")
-    lines.append("")
     for one in result["frechet"]:
         lines.append(frechet_text(one))
     if result["without_picture"]:
@@ -76,9 +76,7 @@ def summary_text(result: Mapping[str, Any]) -> str:
         _grid(result["grid"]) if result["grid"] else None,
     ):
         if table:
-            lines += ["", f"| {' | '.join(table['headings'])} |", f"|{' --- |' * len(table['headings'])}"]
-            lines += [f"| {' | '.join(cells)} |" for cells in table["rows"]]
-            lines += ["", table["note"]]
+            lines += ["", markdown_table(table["headings"], table["rows"]), "", table["note"]]
     return "\n".join(lines)
 
 

@@ -13,6 +13,7 @@ from pipeline.evaluation.fidelity.page import collapse_text
 from pipeline.evaluation.report import templates
 from pipeline.evaluation.value.page import FIGURES as VALUES
 from pipeline.evaluation.value.page import figure_text, order_text
+from pipeline.markdown import markdown_table
 
 Found = Mapping[str, Any]
 MISSING = "unmeasured"
@@ -141,9 +142,9 @@ def build_page(name: str, simulator: str, weights: str, parts: list[Part]) -> st
 
 def summary_text(simulator: str, parts: list[Part]) -> str:
     """The same as Markdown."""
-    lines = [f"| {simulator} | generated | recorded | first frame held |", f"|{' --- |' * 4}"]
+    lines = []
     for part in parts:
         told = "" if part.rows else "; ".join((MISSING, part.command, *part.notes))
-        lines.append(f"| **{part.title}** | {told} | | |")
-        lines += [f"| {row.name} | {row.value} | {row.recorded} | {row.still} |" for row in part.rows]
-    return "\n".join(lines)
+        lines.append([f"**{part.title}**", told, "", ""])
+        lines += [[row.name, row.value, row.recorded, row.still] for row in part.rows]
+    return markdown_table([simulator, "generated", "recorded", "first frame held"], lines)

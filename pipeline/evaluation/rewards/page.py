@@ -10,6 +10,7 @@ from markupsafe import Markup
 from pipeline.evaluation.charts import Curve, line_chart
 from pipeline.evaluation.report import templates
 from pipeline.evaluation.rewards.figures import cell
+from pipeline.markdown import markdown_table
 
 # Figures of a reward: key, and heading.
 FIGURES = (
@@ -38,9 +39,7 @@ def table_text(result: Mapping[str, Any]) -> str:
     out = []
     for name, domain in result["domains"].items():
         headings = ["reward", "video", *(heading for _, heading in FIGURES)]
-        rows = [headings, ["---"] * len(headings), *lines_of(domain)]
-        table = "\n".join(f"| {' | '.join(row)} |" for row in rows)
-        out.append(f"{name}: {about_of(domain)}\n\n{table}")
+        out.append(f"{name}: {about_of(domain)}\n\n{markdown_table(headings, lines_of(domain))}")
     return "\n\n".join(out)
 
 

@@ -13,6 +13,7 @@ from pipeline.evaluation.report import templates
 from pipeline.evaluation.statistics import percent_line
 from pipeline.evaluation.value.agreement import ALL
 from pipeline.evaluation.value.chance import RESAMPLES
+from pipeline.markdown import markdown_table
 
 _SERIES = ("in distribution", "out of distribution")
 # Figures of an agreement: key, heading and form.
@@ -58,19 +59,17 @@ def table_text(result: Mapping[str, Any]) -> str:
     overall = {row["policy"]: row for row in result["overall"]}
     found = {(cell["policy"], cell["task"]): cell for cell in result["cells"]}
     columns = [*tasks, ALL] if len(tasks) > 1 else tasks
-    lines = [
+    title = (
         f"Values of policies in {result['simulator']} by {result['judge']}, in percent: true -> estimated,"
-        f" +- standard error over {result['repeats']} repeats",
-        "",
-        f"| policy | {' | '.join(columns)} |",
-        f"| --- |{' --- |' * len(columns)}",
-    ]
+        f" +- standard error over {result['repeats']} repeats"
+    )
+    rows = []
     for policy, whole in overall.items():
         cells = [found[policy, task] for task in tasks] + ([whole] if len(tasks) > 1 else [])
-        lines.append(f"| {policy} | {' | '.join(_cell_text(cell) for cell in cells)} |")
+        rows.append([policy, *map(_cell_text, cells)])
     said = [verdict(result), ranking(result), *chance_lines(result["agreement"])]
-    lines += ["", *said, *result["notes"], *judge_lines(result)]
-    return "\n".join(lines)
+    shown = markdown_table(["policy", *columns], rows)
+    return "\n".join([title, "", shown, "", *said, *result["notes"], *judge_lines(result)])
 
 
 def ranking(result: Mapping[str, Any]) -> str:
