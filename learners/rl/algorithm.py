@@ -51,8 +51,7 @@ class RLConfig:
             ones by the same loss; 0 for none. Algorithms without a critic, and policies that are scored on
             action tokens, learn from imagined ones only.
         recorded_rounds: rounds whose decisions those are, and whose episodes warm up the critic: so many up
-            to that of the policy that RL begins with; None for all, with what explore played. Of one round's
-            alone most of what is learned is noise, and does not hold on other episodes.
+            to that of the policy that RL begins with; None for all, with what explore played.
         anchor: weight of cloning what is known to have worked in physics (the newest deployed policy's true
             successes) beside the algorithm's loss; it keeps RL from wandering where only the simulator says
             it works.

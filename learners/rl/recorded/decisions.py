@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from actors.policies.contract import action_key, device_of, distribution, inputs_for, trained_part
 from envs.episodes.clips import ClipStore
@@ -25,6 +26,7 @@ _AT_ONCE = 256  # frames per pass
 # apart its own samples lie, and some of them may be its mode.
 _UNLIKELY = 8.0
 _SAMPLES = 16
+_AT_MODE = 0.125  # nats below the mode's likelihood; half a standard deviation
 
 
 class RecordedDecisions:
@@ -33,8 +35,7 @@ class RecordedDecisions:
     Likelihood ratios are to the policy that RL begins with, over all of its iterations: clipping then lets
     each decision move the policy so far and no further. Ratios to the policy of each iteration would let
     the same bad decision push it away again and again. An older policy's decisions are taken as this one's
-    own, as far as it might well say them: from one round to the next policies change little, and what few
-    episodes tell is mostly noise, which a policy learns by heart.
+    own, as far as it might well say them: from one round to the next policies change little.
 
     Args:
         policy: in training, as RL begins with it.
@@ -73,6 +74,21 @@ class RecordedDecisions:
                 for some in self.known.split(_AT_ONCE)
             ]
         )
+
+    @torch.no_grad()
+    def drawn(self) -> torch.Tensor:
+        """Which of them lie off the policy's mode, bool [N]. Those at it say nothing of what else would have
+        been better, and the likelihood of another policy is no ratio of densities there, for policies take
+        their mode more often than their density says.
+        """
+        parts = []
+        for some in self.known.split(_AT_ONCE):
+            said = self._said(some)
+            with set_exploration_type(ExplorationType.DETERMINISTIC):
+                mode = self.policy(inputs_for(self._seen(some), self.policy))[CHUNK]
+            likely = said.log_prob(some[CHUNK].to(mode.device))
+            parts.append((likely < said.log_prob(mode) - _AT_MODE).cpu())
+        return torch.cat(parts)
 
     def _said(self, some: TensorDict) -> Any:
         return distribution(self.policy, inputs_for(self._seen(some), self.policy))

@@ -167,8 +167,8 @@ def _follows(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     lines = [f"{100 * max(0.0, kept):.0f}% of what is learned holds on episodes that were not learned from."]
     if kept < _HOLDS:
         lines[0] += (
-            " The rest is noise that the policy learns by heart: more episodes (rounds.deploy,"
-            " rl.recorded_rounds=null) tell it from what is true."
+            " The rest is noise that the policy learns by heart; more episodes (rounds.deploy) tell it from"
+            " what is true."
         )
     best = max((row for row in rows if row["left_out"] is not None), key=lambda row: row["left_out"].value)
     if best["left_out"].value > last["left_out"].value + 2 * last["left_out"].error:

@@ -3,6 +3,7 @@
 What a policy gains over the one that RL began with is told, to first order, by decisions of the latter:
 E[(r - 1) A], with likelihood ratios r and advantages A (Kakade and Langford 2002). On decisions that were
 learned from the noise of A counts as gain, for the policy has learned it; on episodes left out it does not.
+Decisions that the policy did not draw, but took at its mode, do not count: r is no ratio of densities there.
 """
 
 from __future__ import annotations
@@ -91,13 +92,13 @@ def learned_without(
     """
     before = copy.deepcopy(algorithm.modules().state_dict())
     advantage, out = decisions.known["advantage"].squeeze(-1), []
-    known, left = (~left_out).nonzero().squeeze(-1), left_out.nonzero().squeeze(-1)
+    known = (~left_out).nonzero().squeeze(-1)
+    drawn = decisions.drawn()
+    counted = [(side & drawn).nonzero().squeeze(-1) for side in (~left_out, left_out)]
     for step in _learned(algorithm, decisions, config, known, steps):
         moved = decisions.likelihood() - decisions.known[LOG_PROB]
-        sides = [
-            gains(moved[some].exp(), advantage[some], task[some], episode[some]) for some in (known, left)
-        ]
-        out.append(Moment(step, *sides[0], *sides[1], kl=float(-moved[left].mean())))
+        sides = [gains(moved[some].exp(), advantage[some], task[some], episode[some]) for some in counted]
+        out.append(Moment(step, *sides[0], *sides[1], kl=float(-moved[counted[1]].mean())))
     algorithm.modules().load_state_dict(before)
     return out
 

@@ -44,8 +44,11 @@ def test_true_decisions_are_learned_from_whatever_measures_progress(
     manifest = {"stage": "keep", "result": {"round": 1}}
     write_manifest(tmp_path, manifest)  # the policy of round 2 got worse
     inputs = Inputs({"known": tmp_path}, {"number": 2})
-    figures, _, decisions = stages._warm_up(view, inputs, policy, algorithm, store, 0)
-    assert decisions is not None and figures["recorded_decisions"] == len(decisions) > 10
+    _, _, own = stages._warm_up(view, inputs, policy, algorithm, store, 0)
+    every = stages.rl.view("rl-1", {**cfg, "rl": {**cfg["rl"], "recorded_rounds": None}}, {"number": 1})
+    figures, _, decisions = stages._warm_up(every, inputs, policy, algorithm, store, 0)
+    assert decisions is not None and own is not None and 0 < len(own) < len(decisions)
+    assert figures["recorded_decisions"] == len(decisions) > 10
     assert "critic_knew" in figures and float(decisions.known["advantage"].std()) > 0.05
     played = torch.searchsorted(store.start, decisions.known["row"], right=True) - 1
     sources = {store.episodes[number]["source"] for number in played.tolist()}

@@ -36,7 +36,7 @@ def test_every_own_episode_is_left_out_once() -> None:
 
 @pytest.mark.parametrize("true", [True, False])
 def test_what_is_true_holds_on_other_episodes_and_noise_does_not(tmp_path: Path, true: bool) -> None:
-    _, ready = begun(tmp_path, "rl.lr=1e-3", "rl.minibatch=64")
+    _, ready = begun(tmp_path, "rl.lr=1e-3", "rl.minibatch=64", "policy.head.std=0.07")
     decisions = ready.true.decisions
     assert decisions is not None
     chunks = decisions.known[CHUNK]
@@ -59,7 +59,7 @@ def test_what_is_true_holds_on_other_episodes_and_noise_does_not(tmp_path: Path,
 
 
 def test_tables_and_what_cannot_be_asked(tmp_path: Path) -> None:
-    cfg, ready = begun(tmp_path, "rl.minibatch=64")
+    cfg, ready = begun(tmp_path, "rl.minibatch=64", "policy.head.std=0.07")
     found = measured(cfg, ready, 0, 2)
     text = tables(found, 2)
     assert (
