@@ -70,6 +70,9 @@ def test_worlds_stand_side_by_side_after_equal_time(root: Path) -> None:
     made = {path: path.stat().st_mtime_ns for path in stages}
     assert len({entry.made.graph.key("deploy-1") for entry in study.rows}) == 1  # the same data
     assert run_study(study) == text and {path: path.stat().st_mtime_ns for path in made} == made
+    unet, control = planned(root, [*WORLDS, "study.rows=[unet,without_imagined]"]).rows
+    graphs = (unet.made.graph, control.made.graph)
+    assert [graph.cfg["rl"]["imagined"] for graph in graphs] == [1.0, 0.0]  # the world is trained once
 
 
 TOKENS = (
@@ -120,6 +123,9 @@ def test_students_gain_by_the_same_rl_as_their_teacher(root: Path) -> None:
 def test_students_stand_beside_a_baseline_and_a_teacher_of_as_few_steps(root: Path) -> None:
     words = ["study=students", "simulator=dit_small"]
     rows = {entry.name: entry.made.graph for entry in planned(root, words).rows}
+    control = rows.pop("without_imagined")  # the undistilled world, out of which nothing is learned
+    assert control.cfg["rl"]["imagined"] == 0.0
+    assert control.key("simulator-1") == rows["undistilled"].key("simulator-1")
     assert list(rows) == ["teacher", "undistilled", "four", "two", "one", "trajectory"]
     assert [name for name, graph in rows.items() if "student-1" not in graph.nodes] == list(rows)[:2]
     taken = {name: graph.cfg["simulator"]["denoising"]["steps"] for name, graph in rows.items()}
