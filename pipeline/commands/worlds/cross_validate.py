@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -94,10 +95,8 @@ def measured(cfg: Mapping[str, Any], ready: Imagination, deployed: int, folds: i
     told = dict(zip(played.tolist(), tasks_of_episodes(cfg, ready.store, played), strict=True))
     tasks = sorted(set(told.values()))
     task = torch.tensor([tasks.index(told[each]) for each in episode.tolist()])
-    steps, fold = (
-        looks(steps_of(settings, imagined_chunks(cfg))),
-        folds_of(episode, own, folds, settings.seed),
-    )
+    steps = looks(steps_of(settings, imagined_chunks(cfg)))
+    fold = folds_of(episode, own, folds, settings.seed)
     parts = (ready.algorithm, decisions, settings, episode, task)
     bar = tqdm(range(folds), desc="folds", unit="fold", dynamic_ncols=True)
     moments = joined([learned_without(*parts, fold == out, steps) for out in bar])
@@ -123,7 +122,7 @@ def _row(moment: Moment, task: int | None) -> dict[str, Any]:
 
     return {
         "steps": moment.steps,
-        "kl": moment.kl,
+        "kl": moment.kl if math.isfinite(moment.kl) else None,  # nothing was drawn
         "learned": of(moment.learned, moment.learned_tasks),
         "left_out": of(moment.left_out, moment.left_out_tasks),
     }
@@ -146,7 +145,10 @@ def tables(found: Found, folds: int) -> str:
         f" {found.own} in {found.episodes} episodes are the policy's own; each of {folds} parts of these is"
         " left out once"
     )
-    rows = [[f"{row['steps']}", f"{row['kl']:.3f}", *_gains(row)] for row in found.by_steps]
+    rows = [
+        [f"{row['steps']}", "-" if row["kl"] is None else f"{row['kl']:.3f}", *_gains(row)]
+        for row in found.by_steps
+    ]
     lines = [title, "", markdown_table(["steps", "KL, nats", *_COLUMNS], rows)]
     if found.by_task:
         rows = [[row["task"], *_gains(row)] for row in found.by_task]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -66,6 +67,8 @@ def test_tables_and_what_cannot_be_asked(tmp_path: Path) -> None:
         text.count("| move the square") == 2 and "holds on episodes" in text and found.own == found.decisions
     )
     assert json.loads(json.dumps(plain(found)))["by_steps"][-1]["steps"] == found.by_steps[-1]["steps"]
+    untold = tables(replace(found, by_steps=[{**found.by_steps[0], "kl": None, "left_out": None}]), 2)
+    assert "| - |" in untold and "holds on episodes" not in untold
     with pytest.raises(ConfigError, match="fewer folds"):
         measured(cfg, ready, 0, 900)
     with pytest.raises(ConfigError, match="2 of them at least"):
