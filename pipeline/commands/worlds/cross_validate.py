@@ -141,7 +141,7 @@ def plain(found: Found) -> dict[str, Any]:
 def tables(found: Found, folds: int) -> str:
     """Markdown, and what follows."""
     title = (
-        f"Gain in return per episode [95% interval] from {found.decisions} recorded decisions alone, of which"
+        f"Gain in return per episode, by decisions that were drawn [95% interval], from {found.decisions} recorded decisions alone, of which"
         f" {found.own} in {found.episodes} episodes are the policy's own; each of {folds} parts of these is"
         " left out once"
     )
@@ -169,8 +169,8 @@ def _follows(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     lines = [f"{100 * max(0.0, kept):.0f}% of what is learned holds on episodes that were not learned from."]
     if kept < _HOLDS:
         lines[0] += (
-            " The rest is noise that the policy learns by heart; more episodes (rounds.deploy) tell it from"
-            " what is true."
+            " The rest is noise that the policy overfits; more episodes (rounds.deploy) tell it from what is"
+            " true."
         )
     best = max((row for row in rows if row["left_out"] is not None), key=lambda row: row["left_out"].value)
     if best["left_out"].value > last["left_out"].value + 2 * last["left_out"].error:
