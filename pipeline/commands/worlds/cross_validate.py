@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from envs.targets import ConfigError
 from learners.rl.algorithm import RLConfig
 from pipeline.commands.worlds.subject import round_inputs
 from pipeline.evaluation.by_task import tasks_of_episodes
-from pipeline.evaluation.trust.gradients import Measured
+from pipeline.evaluation.trust.gradients import Measured, plain_row
 from pipeline.evaluation.trust.held_out import Moment, folds_of, joined, learned_without, mean_gain
 from pipeline.loop import build_loop
 from pipeline.markdown import markdown_table
@@ -131,19 +131,16 @@ def _row(moment: Moment, task: int | None) -> dict[str, Any]:
 def plain(found: Found) -> dict[str, Any]:
     """All of it as JSON takes it."""
 
-    def row_of(row: Mapping[str, Any]) -> dict[str, Any]:
-        return {key: asdict(cell) if isinstance(cell, Measured) else cell for key, cell in row.items()}
-
-    rows = {"by_steps": [*map(row_of, found.by_steps)], "by_task": [*map(row_of, found.by_task)]}
+    rows = {"by_steps": [*map(plain_row, found.by_steps)], "by_task": [*map(plain_row, found.by_task)]}
     return {**rows, "decisions": found.decisions, "own": found.own, "episodes": found.episodes}
 
 
 def tables(found: Found, folds: int) -> str:
     """Markdown, and what follows."""
     title = (
-        f"Gain in return per episode, by decisions that were drawn [95% interval], from {found.decisions} recorded decisions alone, of which"
-        f" {found.own} in {found.episodes} episodes are the policy's own; each of {folds} parts of these is"
-        " left out once"
+        "Gain in return per episode, by decisions that were drawn [95% interval], from"
+        f" {found.decisions} recorded decisions alone, of which {found.own} in {found.episodes} episodes are"
+        f" the policy's own; each of {folds} parts of these is left out once"
     )
     rows = [
         [f"{row['steps']}", "-" if row["kl"] is None else f"{row['kl']:.3f}", *_gains(row)]
@@ -157,7 +154,11 @@ def tables(found: Found, folds: int) -> str:
 
 
 def _gains(row: Mapping[str, Any]) -> list[str]:
-    return [_said(row["learned"], False), _said(row["left_out"])]
+    learned, left_out = row["learned"], row["left_out"]
+    return [
+        "-" if learned is None else f"{learned.value:+.3f}",
+        "-" if left_out is None else left_out.interval("+.3f"),
+    ]
 
 
 def _follows(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -176,11 +177,3 @@ def _follows(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     if best["left_out"].value > last["left_out"].value + 2 * last["left_out"].error:
         lines.append(f"After {best['steps']} steps it was more: fewer rl.epochs or rounds.iterations.")
     return lines
-
-
-def _said(cell: Measured | None, interval: bool = True) -> str:
-    if cell is None:
-        return "-"
-    if not interval:
-        return f"{cell.value:+.3f}"
-    return f"{cell.value:+.3f} [{cell.value - 2 * cell.error:+.3f}, {cell.value + 2 * cell.error:+.3f}]"

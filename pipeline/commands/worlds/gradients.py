@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from learners.rl.ppo import PPO
 from learners.rl.recorded.decisions import RecordedDecisions
 from pipeline.commands.worlds.subject import round_inputs
 from pipeline.evaluation.by_task import tasks_of_episodes
-from pipeline.evaluation.trust.gradients import PER, Measured, alignment, policy_gradient, signal
+from pipeline.evaluation.trust.gradients import PER, Measured, alignment, plain_row, policy_gradient, signal
 from pipeline.loop import build_loop
 from pipeline.markdown import markdown_table
 from pipeline.stages.rl import Imagination, begin, rl, tasks_of_starts
@@ -91,7 +91,7 @@ def gradients(cfg: Mapping[str, Any], root: Path, number: int, batches: int) -> 
     ready = begin(rl.view(name, graph.cfg, graph.nodes[name].settings), inputs)
     found = measured(graph.cfg, ready, batches)
     lambdas, tasks = rows_by_lambda(found), rows_by_task(found)
-    kept = [[{key: _plain(cell) for key, cell in row.items()} for row in rows] for rows in (lambdas, tasks)]
+    kept = [[*map(plain_row, rows)] for rows in (lambdas, tasks)]
     about = {"round": number, "batches": batches, "lambda": found.used}
     write_json(root / f"gradients-{number}.json", {**about, "by_lambda": kept[0], "by_task": kept[1]})
     return tables(lambdas, tasks, found, batches)
@@ -260,10 +260,4 @@ def _follows(row: Mapping[str, Any], decisions: int) -> list[str]:
 
 
 def _said(cell: Measured | None) -> str:
-    if cell is None:
-        return "-"
-    return f"{cell.value:.3f} [{cell.value - 2 * cell.error:.3f}, {cell.value + 2 * cell.error:.3f}]"
-
-
-def _plain(cell: Any) -> Any:
-    return asdict(cell) if isinstance(cell, Measured) else cell
+    return "-" if cell is None else cell.interval()

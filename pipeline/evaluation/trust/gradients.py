@@ -9,8 +9,9 @@ cosine of the true directions, which no noise makes smaller.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -35,6 +36,16 @@ class Measured:
     def found(self) -> bool:
         """Whether it stands out of its error."""
         return self.value > _SURE * self.error
+
+    def interval(self, form: str = ".3f") -> str:
+        """The value and two standard errors to either side, as text."""
+        low, high = self.value - 2 * self.error, self.value + 2 * self.error
+        return f"{self.value:{form}} [{low:{form}}, {high:{form}}]"
+
+
+def plain_row(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row as JSON takes it, whatever in it was measured."""
+    return {key: asdict(cell) if isinstance(cell, Measured) else cell for key, cell in row.items()}
 
 
 def policy_gradient(algorithm: Algorithm, policy: nn.Module, data: TensorDict, minibatch: int) -> Tensor:
