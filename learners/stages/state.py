@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,21 +23,25 @@ from learners.stages.simulator import units
 from learners.training.fit import FitConfig, fit
 from learners.training.lora import low_rank
 
-# Clips whose features are computed once and kept: at most so many, in batches of so many, as few as still let
-# each be learned from so many times, and as many as fit into so many bytes.
-_CLIPS, _AT_ONCE, _VISITS, _KEPT = 6000, 50, 16, 2 * 2**30
+# Clips whose features are computed once and kept: as few as still let each be learned from so many times, so
+# many in one pass, and as many as fit into so many bytes.
+_VISITS, _AT_ONCE, _KEPT = 16, 50, 2 * 2**30
 # Bytes of a batch up to which the training thread picks its rows itself (.03 ms for .3 MB; see ahead.py).
 _AT_HAND = 2**20
 
 
-def clips_kept(options: FitConfig, clip_bytes: int) -> int:
-    """How many clips' features training computes once and keeps; 0 where it computes them anew at every step.
+def clips_kept(options: FitConfig, clip_bytes: int, most: int) -> int:
+    """How many clips' features training computes once and keeps, a batch of them or more; 0 where a batch
+    does not fit, and features are computed anew at every step.
 
     Args:
         clip_bytes: of a clip's features.
+        most: clips, however many a batch has.
     """
-    count = min(_CLIPS, options.steps * options.batch // _VISITS, _KEPT // max(1, clip_bytes))
-    return -(-count // _AT_ONCE) * _AT_ONCE if count >= options.part else 0
+    fitting = _KEPT // max(1, clip_bytes)
+    if fitting < options.part:
+        return 0
+    return min(fitting, most, max(options.part, options.steps * options.batch // _VISITS))
 
 
 @dataclass(frozen=True)
@@ -65,29 +68,17 @@ class StatePace:
             int(stats["features_bytes"]),
         )
 
-    def seconds(self, options: FitConfig) -> float:
-        """Of a training, features included."""
-        samples = options.steps * options.batch
-        looked_at = clips_kept(options, self.clip_bytes) or samples
-        return looked_at * self.clip_seconds + samples * self.sample_seconds
-
-    def steps(self, seconds: float, options: FitConfig) -> int:
-        """As many steps as take so many seconds, one at least."""
-
-        def cost(steps: int) -> float:
-            return self.seconds(replace(options, steps=steps))
-
-        most = int(seconds / (options.batch * self.sample_seconds))  # if features cost nothing
-        # Below _VISITS steps features may not be kept, and more steps may take less time.
-        for some in (range(_VISITS, most + 1), range(1, _VISITS)):
-            if fitting := bisect_right(some, seconds, key=cost):
-                return some[fitting - 1]
-        return 1
-
-
-def shortest_kept(options: FitConfig) -> FitConfig:
-    """`options` with steps enough that features are kept, if they fit."""
-    return replace(options, steps=max(options.steps, _VISITS))
+    def within(self, seconds: float, options: FitConfig, most: int) -> tuple[int, int]:
+        """Steps that take so many seconds, one at least, and the most clips whose features are kept: `most`,
+        or as many as half of the time is enough for, since a slow simulator would leave no time to learn in.
+        """
+        if self.clip_seconds:
+            most = max(1, min(most, int(seconds / 2 / self.clip_seconds)))
+        # with _VISITS to each clip, and no limits
+        freely = seconds / (options.batch * (self.sample_seconds + self.clip_seconds / _VISITS))
+        clips = clips_kept(replace(options, steps=max(1, int(freely))), self.clip_bytes, most)
+        left = seconds - clips * self.clip_seconds
+        return max(1, int(left / (options.batch * self.sample_seconds))), most
 
 
 def train_state(
@@ -99,6 +90,7 @@ def train_state(
     folder: Path,
     lora: int = 0,
     fresh: bool = True,
+    clips: int = 6000,
 ) -> dict[str, float]:
     """Train `decoder` in place; the simulator stays as it is.
 
@@ -111,6 +103,7 @@ def train_state(
             weights.
         fresh: whether it has not been trained before; it then takes its units from these episodes first,
             unless they came with released weights.
+        clips: most whose features are kept.
 
     Returns:
         What `fit` does, and features_seconds, what was spent before on features that are kept;
@@ -121,21 +114,21 @@ def train_state(
     """
     if fresh and not decoder.normalised:
         decoder.normalise(*units(store, episodes, store.spec.chunk))
-    clips = _Features(decoder, simulator, store, episodes, options.bf16)
+    shown = _Features(decoder, simulator, store, episodes, options.bf16)
     wanted = {name: parameter.requires_grad for name, parameter in simulator.named_parameters()}
     simulator.eval().requires_grad_(False)
     drawn = step_generator(options.seed, options.steps)
-    one = clips.sample(1, drawn)
+    one = shown.sample(1, drawn)
     began = time.perf_counter()
-    count = clips_kept(options, one["shown"].nbytes)
-    kept = _Kept(clips.many(count, drawn), options.part) if count else None
+    count = clips_kept(options, one["shown"].nbytes, clips)
+    kept = _Kept(shown.many(count, drawn), options.part) if count else None
     ahead = time.perf_counter() - began
 
     def sample(step: int, generator: torch.Generator) -> TensorDict:
-        return store.sample(episodes, options.part, clips.spec, generator)
+        return store.sample(episodes, options.part, shown.spec, generator)
 
     def loss(clip: TensorDict, generator: torch.Generator) -> tuple[Tensor, dict[str, Any]]:
-        data = clip if kept is not None else clips.of(clip, generator)
+        data = clip if kept is not None else shown.of(clip, generator)
         features = decoder.read(data["shown"])
         return decoder.loss(features, data["history"], data["future"], generator), {}
 
@@ -199,12 +192,13 @@ class _Features:
             return self.of(clip.to(device), generator).cpu()
 
     def many(self, count: int, generator: torch.Generator) -> TensorDict:
-        """`sample` of `count` clips, in whole batches."""
+        """`sample` of `count` clips."""
+        sizes = [min(_AT_ONCE, count - done) for done in range(0, count, _AT_ONCE)]
         batches = tqdm(
-            range(count // _AT_ONCE),
+            sizes,
             desc="state: features",
             unit="batch",
             dynamic_ncols=True,
             leave=False,
         )
-        return torch.cat([self.sample(_AT_ONCE, generator) for _ in batches])
+        return torch.cat([self.sample(size, generator) for size in batches])

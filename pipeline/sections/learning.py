@@ -155,6 +155,7 @@ class StateFitSection:
     """Sections state_fit.first, state_fit.refresh and finetune.state."""
 
     lora: Natural
+    clips: Count
     fit: Fit
 
 

@@ -15,7 +15,7 @@ from actors.process import prepare_process
 from envs.manifest import read_manifest
 from envs.targets import options
 from learners.stages.simulator import SimulatorFitConfig, train_simulator
-from learners.stages.state import StatePace, shortest_kept, train_state
+from learners.stages.state import StatePace, train_state
 from learners.stages.tokenizer import train_tokenizer
 from learners.training.fit import FitConfig
 from learners.training.parallel import leads
@@ -42,21 +42,32 @@ def seconds_of(cfg: Cfg, part: str, phase: str) -> dict[str, float]:
 
 
 def in_time(inputs: Inputs, part: str, fit: FitConfig) -> FitConfig:
-    """`fit` with as many steps as take the setting `seconds` at the speed that the role `pace` has measured;
-    as it is where steps count.
+    """`fit` of a tokenizer or simulator with as many steps as take the setting `seconds` at the speed that
+    the role `pace` has measured; as it is where steps count.
     """
-    if "pace" not in inputs.found:
-        return fit
-    manifest = read_manifest(inputs.folder("pace"))
-    assert manifest is not None, "a role is played by finished stages"
-    seconds, found = inputs.settings["seconds"], manifest["result"]
-    if part == "state" and "state_sample_seconds" in found:
-        cost = StatePace(**{one.name: found[f"state_{one.name}"] for one in fields(StatePace)})
-        return replace(fit, steps=cost.steps(seconds, fit))
-    speed = found.get(f"{part}_speed")
+    speed = _measured(inputs).get(f"{part}_speed")
     if speed is None:  # of what learns nothing
         return fit
-    return replace(fit, steps=max(1, round(seconds * speed / fit.batch)))
+    return replace(fit, steps=max(1, round(inputs.settings["seconds"] * speed / fit.batch)))
+
+
+def state_in_time(inputs: Inputs, fit: FitConfig, clips: int) -> tuple[FitConfig, int]:
+    """The same of a state expert, with the most clips whose features are kept."""
+    found = _measured(inputs)
+    if "state_sample_seconds" not in found:
+        return fit, clips
+    cost = StatePace(**{one.name: found[f"state_{one.name}"] for one in fields(StatePace)})
+    steps, clips = cost.within(inputs.settings["seconds"], fit, clips)
+    return replace(fit, steps=steps), clips
+
+
+def _measured(inputs: Inputs) -> dict[str, Any]:
+    """What the role `pace` has measured; {} where nobody plays it, and steps count."""
+    if "pace" not in inputs.found:
+        return {}
+    manifest = read_manifest(inputs.folder("pace"))
+    assert manifest is not None, "a role is played by finished stages"
+    return dict(manifest["result"])
 
 
 def fits_of(cfg: Cfg) -> dict[str, FitConfig]:
@@ -101,8 +112,6 @@ def pace(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         if not present[part]:
             continue
         fit = replace(fits[part], steps=cfg["equal_time"]["measured"])
-        if part == "state":
-            fit = shortest_kept(fit)
         train(fit, trial / f"{part}-warm-up")
         spent = train(fit, trial / part)
         if part == "state":

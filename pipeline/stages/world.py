@@ -31,7 +31,7 @@ from pipeline.stages.given import (
     newest_episodes,
     open_store,
 )
-from pipeline.stages.pace import in_time
+from pipeline.stages.pace import in_time, state_in_time
 
 
 @stage(reads=(*SIMULATOR, "tokenizer_fit"), place=Place.LEARNERS)
@@ -167,8 +167,10 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     model = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, model, inputs.weights("warm"))
     section = cfg["state_fit"][phase]
-    fit = in_time(inputs, "state", fit_options(cfg, section["fit"], f"state_fit.{phase}.fit"))
-    episodes, how = learning_episodes(store), {"lora": section["lora"], "fresh": phase == "first"}
+    fit = fit_options(cfg, section["fit"], f"state_fit.{phase}.fit")
+    fit, clips = state_in_time(inputs, fit, section["clips"])
+    episodes = learning_episodes(store)
+    how = {"lora": section["lora"], "fresh": phase == "first", "clips": clips}
     stats = train_state(decoder, model, store, episodes, fit, folder, **how) if learns(decoder) else {}
     save_weights(decoder, folder)
     return {**stats, "steps": fit.steps}

@@ -50,8 +50,13 @@ def test_features_are_computed_once_unless_they_are_too_large(
     monkeypatch.setattr(simulator, "features", counted)
     every, options = torch.arange(len(store)), FitConfig(steps=100, batch=32, lr=1e-3, bf16=False)
     told = train_state(decoder_of("unet_small", simulator), simulator, store, every, options, tmp_path)
-    assert told["features_clips"] == clips_kept(options, int(told["features_bytes"])) == 200
+    assert told["features_clips"] == clips_kept(options, int(told["features_bytes"]), 6000) == 200
     assert sum(shown) == 1 + 200  # one to know its size; of the 3200 clips that were learned from
+    shown.clear()
+    train_state(
+        decoder_of("unet_small", simulator), simulator, store, every, options, tmp_path / "few", clips=20
+    )
+    assert sum(shown) == 1 + 20  # fewer than a batch
     monkeypatch.setattr("learners.stages.state._KEPT", 1000)  # bytes
     shown.clear()
     options = FitConfig(steps=3, batch=32, lr=1e-3, bf16=False)
@@ -60,25 +65,40 @@ def test_features_are_computed_once_unless_they_are_too_large(
 
 
 @pytest.mark.parametrize(
-    ("sample_ms", "clip_ms", "kept"),
-    [(0.5, 1.0, True), (0.6, 5.0, True), (12.0, 330.0, True), (12.0, 0.0, False)],
+    ("sample_ms", "clip_ms", "fits"),
+    [(0.15, 4.0, True), (0.6, 5.0, True), (0.2, 405.0, True), (12.0, 330.0, True), (12.0, 0.0, False)],
 )
 @pytest.mark.parametrize("seconds", [0.001, 2.0, 54.0, 600.0])
 def test_as_many_steps_as_fit_into_the_time_are_taken(
-    sample_ms: float, clip_ms: float, kept: bool, seconds: float
+    sample_ms: float, clip_ms: float, fits: bool, seconds: float
 ) -> None:
-    """Features are computed of 6000 clips at most, so they cost many steps less than few."""
-    cost = StatePace(sample_ms / 1000, clip_ms / 1000, 10 if kept else 2**32)
+    """However slow the simulator, at least half of the time is learned in."""
+    cost = StatePace(sample_ms / 1000, clip_ms / 1000, 10 if fits else 2**32)
+    options = FitConfig(steps=20, batch=128, lr=1e-3)
+    steps, most = cost.within(seconds, options, 6000)
+
+    def taken(steps: int) -> tuple[float, float]:
+        clips = clips_kept(replace(options, steps=steps), cost.clip_bytes, most)
+        return clips * cost.clip_seconds, 128 * steps * cost.sample_seconds
+
+    assert 1 <= most <= 6000
+    features, learning = taken(steps)
+    assert features <= max(seconds / 2, cost.clip_seconds)
+    if steps > 1:
+        assert 0.8 * seconds < features + learning <= seconds
+    else:
+        assert sum(taken(2)) > seconds
+
+
+def test_a_slow_simulator_leaves_time_to_learn_in() -> None:
+    """As `tokens` on a core, whose state expert had one step of 54 s when a batch of clips was the least."""
+    options = FitConfig(steps=20, batch=128, lr=1e-3)
+    steps, clips = StatePace(2e-4, 0.405, 10_000).within(54.0, options, 6000)
+    assert steps > 500 and clips == 66
+
+
+def test_what_a_step_costs_is_as_training_tells() -> None:
     options = FitConfig(steps=20, batch=48, lr=1e-3)
-
-    def taken(steps: int) -> float:
-        looked_at = clips_kept(replace(options, steps=steps), cost.clip_bytes)
-        assert kept or not looked_at
-        return (looked_at or 48 * steps) * cost.clip_seconds + 48 * steps * cost.sample_seconds
-
-    steps = cost.steps(seconds, options)
-    assert steps == 1 or taken(steps) <= seconds
-    assert all(taken(steps + more) > seconds for more in (1, 16, 50))
     measured = {"features_clips": 100, "features_seconds": 2.0, "features_bytes": 10}
     spent = {"data_seconds": 1.0, "compute_seconds": 8.6}
     assert StatePace.of(options, {**measured, **spent}) == StatePace(0.01, 0.02, 10)
