@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -144,6 +145,15 @@ def test_the_readme_is_short() -> None:
     lines = (ROOT / "README.md").read_text().splitlines()
     assert len(lines) <= 150
     assert not [line for line in lines if len(line) > 120]
+
+
+def test_tables_of_the_documents_are_tables() -> None:
+    """A row that was wrapped is prose to whoever renders it."""
+    for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
+        for number, block in enumerate(path.read_text().split("\n\n")):
+            if block.startswith("|"):
+                columns = [len(re.findall(r"(?<!\\)\|", row)) for row in block.strip().splitlines()]
+                assert len(set(columns)) == 1, f"{named(path)}, block {number}: {columns}"
 
 
 def test_no_function_takes_ten_arguments() -> None:

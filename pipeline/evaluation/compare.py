@@ -8,7 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from envs.targets import ConfigError
-from pipeline.evaluation.statistics import percent_line, points_line, psnr_line, rate_line, rise
+from pipeline.evaluation.statistics import (
+    percent_line,
+    points_line,
+    psnr_line,
+    rate_line,
+    rise,
+    verdicts_line,
+)
 from pipeline.markdown import markdown_table
 
 Result = Mapping[str, Any]
@@ -68,10 +75,9 @@ def _error(key: str, digits: int) -> Callable[[Result], str]:
 
 
 def _verdicts(video: str) -> Callable[[Result], str]:
-    def accuracy(table: Result) -> str:
-        return "-" if table["accuracy"] is None else f"{100 * table['accuracy']:.1f}"
-
-    return lambda r: "; ".join(f"{group} {accuracy(tables[video])}" for group, tables in r["judge"].items())
+    return lambda r: "; ".join(
+        f"{group} {verdicts_line(tables[video])}" for group, tables in r["judge"].items()
+    )
 
 
 _ROWS: tuple[tuple[str, Callable[[Result], str]], ...] = (
@@ -106,8 +112,8 @@ _ROWS: tuple[tuple[str, Callable[[Result], str]], ...] = (
     ("state, spreads, median / p90", _error("state", 3)),
     ("object px", _error("object_px", 2)),
     ("object cm", _error("object_cm", 2)),
-    ("verdicts right, %, recorded video", _verdicts("recorded")),
-    ("verdicts right, %, generated video", _verdicts("generated")),
+    ("verdicts that are right, recorded video", _verdicts("recorded")),
+    ("verdicts that are right, generated video", _verdicts("generated")),
     (
         "frames/s at batch 1, 32",
         lambda r: ", ".join(f"{speed:.0f}" for speed in r["frames_per_second"].values()),

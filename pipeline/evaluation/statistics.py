@@ -97,6 +97,26 @@ def confusion(predicted: Tensor, truth: Tensor) -> dict[str, Any]:
     return {"tp": tp, "fp": fp, "fn": fn, "tn": tn, "accuracy": accuracy}
 
 
+def balanced_accuracy(table: Mapping[str, Any]) -> float | None:
+    """Mean share of successes and of failures that are told right, of a `confusion`; of the one kind that
+    there is; None of none. Who always says the same has 1/2, whatever the share of successes.
+    """
+    told = [table[right] / of for right, of in _by_truth(table) if of]
+    return sum(told) / len(told) if told else None
+
+
+def verdicts_line(table: Mapping[str, Any]) -> str:
+    """How many successes and failures of a `confusion` are told right: '6/13 successes, 31/37 failures'."""
+    kinds = zip(("successes", "failures"), _by_truth(table), strict=True)
+    return (
+        ", ".join(f"{table[right]:.0f}/{of:.0f} {kind}" for kind, (right, of) in kinds if of) or "none judged"
+    )
+
+
+def _by_truth(table: Mapping[str, Any]) -> tuple[tuple[str, float], tuple[str, float]]:
+    return ("tp", table["tp"] + table["fn"]), ("tn", table["tn"] + table["fp"])
+
+
 def mean(values: Tensor) -> float | None:
     """The mean of values [N]; None of none."""
     return float(values.mean()) if len(values) else None

@@ -12,10 +12,11 @@ from envs.ranges import Count
 from envs.targets import ConfigError, target
 from pipeline.evaluation.result import result_of
 from pipeline.evaluation.rewards.shown import check_frames
+from pipeline.evaluation.statistics import balanced_accuracy, verdicts_line
 from pipeline.stages.measured.frames import shown_frames
 from pipeline.study.columns import Cell, Cfg, Column, Measured
 from pipeline.study.methods import Made
-from pipeline.study.worlds import accuracy_text, measuring
+from pipeline.study.worlds import measuring
 
 
 class FramesShown(Column):
@@ -57,13 +58,12 @@ class FramesShown(Column):
 
     def text(self, cell: Cell) -> str:
         """See Column.text."""
-        judged = sum(cell[name] for name in ("tp", "fp", "fn", "tn"))
         lost = f", {cell['dropped']:.0f} not judged" if cell["dropped"] else ""
-        return f"{accuracy_text(cell['accuracy'], judged)}{lost} ({cell['shown']:.0f} frames)"
+        return f"{verdicts_line(cell)}{lost} ({cell['shown']:.0f} frames)"
 
     def merit(self, cell: Cell) -> float | None:
         """See Column.merit."""
-        return None if cell["accuracy"] is None else float(cell["accuracy"])
+        return balanced_accuracy(cell)
 
 
 def _label(frames: str) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 from envs.manifest import read_manifest
 from envs.targets import ConfigError
 from pipeline.evaluation.result import result_of
-from pipeline.evaluation.statistics import points_line, rate, rate_line
+from pipeline.evaluation.statistics import balanced_accuracy, points_line, rate, rate_line, verdicts_line
 from pipeline.stages import prove
 from pipeline.stages.measured.video import video_errors
 from pipeline.study.columns import ALL, Cell, Cfg, Column, Measured, Success, outcomes_of, together
@@ -145,18 +145,16 @@ class Verdicts(Column):
                 name: sum(group[video][name] for group in chosen)
                 for name in ("tp", "fp", "fn", "tn", "dropped")
             }
-            judged = sum(counts[name] for name in ("tp", "fp", "fn", "tn"))
-            right = counts["tp"] + counts["tn"]
-            cells[video] = {**counts, "judged": judged, "accuracy": right / judged if judged else None}
+            cells[video] = counts
         return Measured(cells)
 
     def text(self, cell: Cell) -> str:
         """See Column.text."""
-        return accuracy_text(cell["accuracy"], cell["judged"])
+        return verdicts_line(cell)
 
     def merit(self, cell: Cell) -> float | None:
-        """See Column.merit."""
-        return None if cell["accuracy"] is None else float(cell["accuracy"])
+        """See Column.merit. The plain share of right verdicts would praise a judge that always says no."""
+        return balanced_accuracy(cell)
 
 
 class Gap(Column):
@@ -230,11 +228,6 @@ def _gained(before: dict[tuple[str, int], bool], after: dict[tuple[str, int], bo
         pairs = [before[key] for key in same], [after[key] for key in same]
         cells[label] = {**cell, **gain_of(*pairs), "episodes": cell["episodes"]}
     return Measured(cells, after, before)
-
-
-def accuracy_text(accuracy: float | None, judged: float) -> str:
-    """The share of so many verdicts that are right, in words."""
-    return f"{100 * accuracy:.0f}% of {judged:.0f}" if judged and accuracy is not None else "nothing judged"
 
 
 def measuring(made: Made, *roles: str) -> dict[str, str | tuple[str, ...]]:

@@ -12,6 +12,7 @@ from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge
 from envs.simulators.replay import Replay
 from pipeline.evaluation.judging import Scores, judge_frames, judge_recorded, judge_table
+from pipeline.evaluation.statistics import verdicts_line
 
 
 def judged(judge: Judge, store: ClipStore, episodes: Tensor, made: Replay) -> dict[str, Tensor]:
@@ -44,12 +45,9 @@ def verdict_tables(
 
 
 def verdict_text(tables: Mapping[str, Mapping[str, Any]], video: str) -> str:
-    """How many verdicts on a video are right; "-" where there are none."""
+    """How many verdicts on a video are right (statistics.verdicts_line); "-" where there are none."""
     found = tables.get(video)
-    if found is None:
-        return "-"
-    right, count = found["tp"] + found["tn"], sum(found[name] for name in ("tp", "fp", "fn", "tn"))
-    return f"{right} of {count}"
+    return "-" if found is None else verdicts_line(found)
 
 
 def _longer(values: Tensor, frames: int) -> Tensor:

@@ -11,6 +11,7 @@ from pipeline.evaluation.fidelity.end_effector import end_effector_text
 from pipeline.evaluation.fidelity.page import FIGURES as FIDELITY
 from pipeline.evaluation.fidelity.page import collapse_text
 from pipeline.evaluation.report import templates
+from pipeline.evaluation.statistics import verdicts_line
 from pipeline.evaluation.value.page import FIGURES as VALUES
 from pipeline.evaluation.value.page import figure_text, order_text
 from pipeline.markdown import markdown_table
@@ -129,7 +130,7 @@ def _values(found: Found) -> Iterator[Row]:
         yield Row(f"{title} {_AGREE[key]}", figure_text(known, key, form) or MISSING)
     if known:
         yield Row("pairs of policies in order ↑", order_text(known["order"]))
-        yield Row("verdicts that are right ↑", f"{100 * known['micro']['accuracy']:.1f}%")
+        yield Row("verdicts that are right ↑", verdicts_line(known["micro"]))
         for side, bias in known["bias"].items():
             yield Row(f"estimated less true, {side} of distribution, points", f"{100 * bias['mean']:+.1f}")
 

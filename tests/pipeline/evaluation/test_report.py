@@ -225,8 +225,8 @@ def test_a_judge_that_judged_nothing_is_not_wrong(inputs: Inputs, tmp_path: Path
     (tmp_path / "one").mkdir()
     (tmp_path / "one/result.json").write_text(json.dumps(told))
     table = compare([tmp_path / "one"])
-    assert "| verdicts right, %, recorded video | expert 50.0 |" in table
-    assert "| verdicts right, %, generated video | expert - |" in table
+    assert "| verdicts that are right, recorded video | expert 1/4 successes, 4/6 failures |" in table
+    assert "| verdicts that are right, generated video | expert none judged |" in table
     # nor is what nobody knows of a rollout a number
     assert "| object px | expert 1.00 / 2.00; random - |" in table
     assert "| PSNR dB, first → last frames | expert 20.0 → 15.0; random - → 15.0 |" in table

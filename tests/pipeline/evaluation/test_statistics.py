@@ -7,12 +7,14 @@ import torch
 
 from pipeline.evaluation.by_task import by_task
 from pipeline.evaluation.statistics import (
+    balanced_accuracy,
     confusion,
     mcnemar,
     mean,
     over_seeds,
     quantiles,
     rate_entry,
+    verdicts_line,
     wilson,
 )
 
@@ -47,6 +49,16 @@ def test_confusion_and_rates() -> None:
     assert rate_entry(truth)["successes"] == 2
     nothing = torch.zeros(0, dtype=torch.bool)  # judged: neither right nor wrong
     assert confusion(nothing, nothing) == {"tp": 0, "fp": 0, "fn": 0, "tn": 0, "accuracy": None}
+    assert balanced_accuracy(confusion(nothing, nothing)) is None
+    assert verdicts_line(confusion(nothing, nothing)) == "none judged"
+
+
+def test_who_always_says_no_is_no_judge() -> None:
+    truth = torch.arange(50) < 13
+    never = confusion(torch.zeros(50, dtype=torch.bool), truth)
+    assert never["accuracy"] == 0.74 and balanced_accuracy(never) == 0.5
+    assert verdicts_line(never) == "0/13 successes, 37/37 failures"
+    assert verdicts_line(confusion(truth[:13], truth[:13])) == "13/13 successes"
 
 
 def test_quantiles_leave_out_what_is_not_finite() -> None:

@@ -86,7 +86,10 @@ def test_figures_of_worlds(tmp_path: Path, cfg: dict[str, Any]) -> None:
     speed, verdicts = Speed("speed"), Verdicts("verdicts")
     assert speed.text(speed.read(cfg, [measured]).cells["batch 1"]) == "10 frames/s"
     found = verdicts.read(cfg, [measured]).cells
-    assert [verdicts.text(found[label]) for label in verdicts.labels(cfg)] == ["88% of 8", "62% of 8"]
+    assert [verdicts.text(found[label]) for label in verdicts.labels(cfg)] == [
+        "3/3 successes, 4/5 failures",
+        "1/3 successes, 4/5 failures",
+    ]
     gap = Gap("gap")
     rates = {
         "true": {"successes": 2, "episodes": 8},
@@ -176,8 +179,9 @@ def test_what_cannot_be_shown_is_told() -> None:
     column = FramesShown("frames", [4, "ends"], 8)
     assert column.labels({}) == ["every 4th", "first and last"]
     none = {"tp": 0, "fp": 0, "fn": 0, "tn": 0, "accuracy": None, "dropped": 6, "shown": 2.0}
-    assert column.text(none) == "nothing judged, 6 not judged (2 frames)" and column.merit(none) is None
-    assert column.merit({**none, "tn": 6, "accuracy": 1.0}) == 1.0
+    assert column.text(none) == "none judged, 6 not judged (2 frames)" and column.merit(none) is None
+    assert column.merit({**none, "tn": 6}) == 1.0
+    assert column.merit({**none, "tn": 5, "fn": 1}) == 0.5  # a judge that always says no
 
 
 @pytest.mark.parametrize(("simulator", "shares"), [("unet_small", (0.85, 0.15)), ("dit_small", (0.65, 0.15))])
@@ -199,7 +203,11 @@ def test_a_state_expert_takes_the_steps_that_fit_with_its_features(tmp_path: Pat
     folder = finished(tmp_path, "pace", {**measured, "simulator_speed": 40.0})
     inputs, fit = Inputs({"pace": folder}, {"seconds": 200.01}), FitConfig(steps=1, batch=50, lr=1e-3)
     assert pace.in_time(inputs, "simulator", fit).steps == 160
-    assert pace.in_time(inputs, "state", fit).steps == (200 - 60) / 0.05  # 6000 clips are looked at
+    expert, clips = pace.state_in_time(inputs, fit, 6000)
+    assert (expert.steps, clips) == ((200 - 60) / 0.05, 6000)
+    assert pace.state_in_time(inputs, fit, 100)[1] == 100
+    other = Inputs({"pace": finished(tmp_path / "other", "pace", {})}, {"seconds": 200.0})
+    assert pace.state_in_time(other, fit, 6000) == (fit, 6000)  # of what learns nothing
     assert pace.in_time(inputs, "tokenizer", fit) == fit
 
 
