@@ -15,6 +15,7 @@ from envs.targets import ConfigError, nearest
 T = TypeVar("T")
 _MOST = 8  # instructions that are told apart, where they alone tell tasks apart
 _VARIOUS = "various instructions"  # in place of a task, where there are more
+START = "start"  # the source of first frames that physics has laid out by turns, with nothing after them
 
 
 def tasks_of_seeds(cfg: Mapping[str, Any], seeds: Iterable[int]) -> list[str]:
@@ -78,6 +79,18 @@ def tasks_of_episodes(cfg: Mapping[str, Any], store: ClipStore, episodes: Tensor
         told = [(row["seed"], row["instruction"]) for row, known in zip(rows, seeded, strict=True) if known]
         laid_out = iter(tasks_told(suite, names, told))
         tasks = [(known and next(laid_out)) or task for known, task in zip(seeded, tasks, strict=True)]
+    return tasks
+
+
+def tasks_of_first_frames(cfg: Mapping[str, Any], store: ClipStore) -> list[str]:
+    """The task of each of a store's first frames: as tasks_of_episodes, but of those with source START the
+    one whose turn it was. A variant of the task may say other words at a seed than the task itself.
+    """
+    tasks = tasks_of_episodes(cfg, store, torch.arange(len(store)))
+    laid_out = store.select([START]).tolist()
+    turns = tasks_of_seeds(cfg, (store.episodes[number]["seed"] for number in laid_out))
+    for number, task in zip(laid_out, turns, strict=True):
+        tasks[number] = task
     return tasks
 
 

@@ -31,7 +31,7 @@ from envs.physics.suite import task_names
 from envs.physics.worker import Track
 from envs.rng import Purpose, episode_seeds, order_generator
 from envs.targets import ConfigError
-from pipeline.evaluation.by_task import by_task, tasks_of_episodes, tasks_of_seeds
+from pipeline.evaluation.by_task import START, by_task, tasks_of_episodes, tasks_of_seeds
 from pipeline.evaluation.statistics import rate_entry
 from pipeline.graph.stage import Inputs, stage
 from pipeline.stages.given import DATASETS, PHYSICS, ROBOT, Cfg
@@ -162,7 +162,7 @@ def first_frames(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         tracks = pool.script([(seed, 0.0) for seed in seeds], cfg["task"]["chunk"])
     finally:
         pool.close()
-    LeRobotWriter(data, robot).write([Episode.from_track(track, "start", robot) for track in tracks])
+    LeRobotWriter(data, robot).write([Episode.from_track(track, START, robot) for track in tracks])
     return {
         "starts": len(open_clips(cfg, [data])),
         "dropped": len(seeds) - len(tracks),

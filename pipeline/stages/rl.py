@@ -31,7 +31,7 @@ from learners.rl.recorded.rollout import dataset_rollout
 from learners.rl.starts import Starts, weighed
 from learners.stages.imitation import Cloning
 from learners.training.parallel import leads
-from pipeline.evaluation.by_task import tasks_of_episodes
+from pipeline.evaluation.by_task import tasks_of_episodes, tasks_of_first_frames
 from pipeline.evaluation.result import result_of
 from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
@@ -205,7 +205,7 @@ def tasks_of_starts(cfg: Cfg, store: ClipStore, inside: Tensor | None, beyond: C
     every = torch.arange(len(store)) if inside is None else inside
     tasks = dict(zip(every.tolist(), tasks_of_episodes(cfg, store, every), strict=True))
     begun = every if inside is None else decision_points(store, inside)[0]
-    more = [] if beyond is None else tasks_of_episodes(cfg, beyond, torch.arange(len(beyond)))
+    more = [] if beyond is None else tasks_of_first_frames(cfg, beyond)
     return [*(tasks[number] for number in begun.tolist()), *more]
 
 

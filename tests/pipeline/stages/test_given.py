@@ -24,7 +24,13 @@ from envs.rng import Purpose, episode_seeds
 from envs.targets import ConfigError
 from learners.training.fit import TrainingDiverged, fit
 from pipeline.config import load_config
-from pipeline.evaluation.by_task import evenly, tasks_of_episodes, tasks_of_seeds, tasks_told
+from pipeline.evaluation.by_task import (
+    evenly,
+    tasks_of_episodes,
+    tasks_of_first_frames,
+    tasks_of_seeds,
+    tasks_told,
+)
 from pipeline.graph.stage import Inputs
 from pipeline.stages import pace
 from pipeline.stages.collect import collect, first_frames, scripted_jobs, split_counts
@@ -233,10 +239,14 @@ def test_too_few_demonstrations_are_told_with_what_helps(
 
 
 class Wordy(Counting):
-    """Says of each task something else at every third seed."""
+    """Says of each task something else at every third seed, after what it says first."""
+
+    def __init__(self, fault: str, tasks: tuple[str, ...] = ("count",), first: str = ""):
+        super().__init__(fault, tasks=tasks)
+        self.first = first
 
     def observe(self) -> Observation:
-        return replace(super().observe(), instruction=f"{self.task} {self.count % 3:g}")
+        return replace(super().observe(), instruction=f"{self.first}{self.task} {self.count % 3:g}")
 
 
 def test_tasks_are_those_that_physics_says_the_recorded_words_of() -> None:
@@ -246,6 +256,24 @@ def test_tasks_are_those_that_physics_says_the_recorded_words_of() -> None:
         *("uncount", "count", "recount", "uncount", None, None)
     ]
     assert tasks_told(suite, ["recount"], told[:3]) == ["uncount", "count", "recount"]
+
+
+def test_first_frames_have_the_task_whose_turn_it_was(tmp_path: Path) -> None:
+    """A variant with other scenes says other words at a seed than the task does."""
+    cfg = load_config(["experiment=soak", "launch.workers=1", "extra_starts.episodes=6"])
+    wordy = {"_target_": "tests.pipeline.stages.test_given.Wordy", "fault": ""}
+    cfg["task"] |= {"suite": {**wordy, "tasks": ["count", "recount"]}, "name": ["count", "recount"]}
+    cfg["task"] |= {
+        "variants": {"odd": {"first": "please "}},
+        "size": [4, 4],
+        "horizon": 4,
+        "mode": "absolute",
+    }
+    asked = {"variant": "odd"}
+    first_frames.run(first_frames.view("odd", cfg, asked), tmp_path, Inputs(settings=asked))
+    store = open_clips(cfg, [tmp_path / "dataset"])
+    assert tasks_of_episodes(cfg, store, torch.arange(6)) == store.instructions
+    assert tasks_of_first_frames(cfg, store) == 3 * ["count", "recount"]
 
 
 @pytest.mark.parametrize(
