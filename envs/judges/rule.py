@@ -23,7 +23,7 @@ class RuleJudge(Judge):
             ValueError: always; generated video has no rule to ask.
         """
         raise ValueError(
-            "judge=rule reads the task suite's own success and cannot judge pictures; use judge=learned for"
+            "RuleJudge reads the task suite's own success and cannot judge pictures; use judge=learned for"
             " generated video"
         )
 
