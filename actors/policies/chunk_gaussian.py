@@ -38,7 +38,7 @@ class ChunkGaussian(Distribution):
     The density is that of the knots; a chunk determines them exactly (the basis has full column rank), so
     likelihood ratios are those of the chunk. It is the density of chunks that are drawn; where the mode was
     taken instead (heads.some_drawn) its gradient with respect to the mean is zero as long as the mean stays;
-    once it moves, a mode that did well pulls it back, which holds PPO's updates close (docs/results/trust.md).
+    once it moves, a mode that did well pulls it back, which holds PPO near it (docs/results/trust.md).
     With respect to the spread it is not: every mode would tell it to shrink. So the spread learns only where
     all chunks are drawn.
 

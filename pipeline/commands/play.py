@@ -30,10 +30,15 @@ _PARTS = ("simulator", "state", "judge")
 
 
 def learned_world(cfg: Cfg, root: Path) -> dict[str, Path]:
-    """Weights of the last imagined world of a run by part: simulator, state and judge; {} if it has none."""
-    inputs = build_loop(cfg, root).inputs("evaluate-imagined")
-    weights = {part: inputs.folder(part) / "weights.safetensors" for part in _PARTS}
-    return weights if all(path.exists() for path in weights.values()) else {}
+    """Weights of the newest imagined world that a run has finished, by part: simulator, state and judge; {}
+    if it has none yet.
+    """
+    graph = build_loop(cfg, root)
+    for node in reversed(graph.nodes.values()):
+        made = {part: node.inputs[part] for part in _PARTS if isinstance(node.inputs.get(part), str)}
+        if len(made) == len(_PARTS) and all(graph.finished(str(stage)) for stage in made.values()):
+            return {part: graph.folder(str(stage)) / "weights.safetensors" for part, stage in made.items()}
+    return {}
 
 
 def build_game(cfg: Cfg, world: Mapping[str, Path], actions: Path | None = None) -> Game:

@@ -8,10 +8,34 @@ import pytest
 
 from actors.factory import build_pool
 from envs.episodes import Episode, LeRobotWriter
+from envs.manifest import write_manifest
 from envs.physics.suite import build_suite
 from envs.targets import ConfigError
-from pipeline.commands.play import build_game
+from pipeline.commands.play import build_game, learned_world
 from pipeline.config import load_config
+from pipeline.loop import build_loop
+
+
+def test_of_several_rounds_the_newest_finished_world_is_opened(tmp_path: Path) -> None:
+    cfg = load_config(["experiment=soak", "rounds.count=3"])
+    graph = build_loop(cfg, tmp_path)
+
+    def finish(*stages: str) -> None:
+        for stage in stages:
+            folder = graph.folder(stage)
+            folder.mkdir(parents=True)
+            (folder / "weights.safetensors").touch()
+            write_manifest(folder, {"stage": stage, "key": folder.name.rpartition("-")[2], "result": {}})
+
+    assert learned_world(cfg, tmp_path) == {}
+    finish("simulator-1", "state-1", "judge-1", "simulator-2", "judge-2")
+    world = learned_world(cfg, tmp_path)
+    assert world == {
+        part: graph.folder(f"{part}-1") / "weights.safetensors" for part in ("simulator", "state", "judge")
+    }
+    finish("state-2")
+    assert learned_world(cfg, tmp_path)["judge"] == graph.folder("judge-2") / "weights.safetensors"
+
 
 COUNTING = {"_target_": "tests.envs.physics.sections.Counting", "fault": ""}
 
