@@ -38,14 +38,16 @@ def untrained_world(cfg: Mapping[str, Any], root: Path) -> list[str]:
     return [f"imagined.{name}={root / name}" for name in ("simulator", "state", "judge")]
 
 
-def scripted_set(cfg: Mapping[str, Any], root: Path, count: int, noise_level: float = 0.6) -> Path:
-    """A data set of scripted episodes of the config's task, all held out."""
+def scripted_set(
+    cfg: Mapping[str, Any], root: Path, count: int, noise_level: float = 0.6, source: str = "noisy"
+) -> Path:
+    """A data set of scripted episodes of the config's task, all held out, said to be of `source`."""
     robot, pool = world_spec(cfg).embodiment, build_pool(cfg)
     try:
         tracks = pool.script([(seed, noise_level) for seed in range(count)], cfg["task"]["chunk"])
     finally:
         pool.close()
-    LeRobotWriter(root, robot).write([Episode.from_track(track, "noisy", robot) for track in tracks])
+    LeRobotWriter(root, robot).write([Episode.from_track(track, source, robot) for track in tracks])
     write_splits(root, {"train": 0, "held_out": count, "calibration": 0})
     return root
 

@@ -20,15 +20,20 @@ from actors.factory import (
 from actors.policies.safe import SafePolicyWrapper
 from envs.files import write_json
 from envs.initial_states import DecisionPoints
-from envs.rng import order_generator, seed_process
+from envs.rng import order_generator
 from envs.targets import ConfigError
 from pipeline.commands.worlds.subject import round_inputs
-from pipeline.evaluation.trust.branches import agreement, branch
+from pipeline.evaluation.trust.branches import Branching, agreement
+from pipeline.evaluation.value.estimate import task_of
+from pipeline.graph.code_version import code_of
+from pipeline.graph.graph import decisive
+from pipeline.graph.kept import Kept
+from pipeline.graph.stage import Inputs
 from pipeline.loop import build_loop, has_physics
 from pipeline.markdown import markdown_table
 from pipeline.stages.given import open_store
 
-_SIDE_BY_SIDE = 100  # true episodes
+_SIDE_BY_SIDE = 100  # futures
 
 _COLUMNS = ("imagined frames with true", "true frames with outcome", "imagined with outcome")
 
@@ -69,20 +74,34 @@ def trust(cfg: Mapping[str, Any], root: Path, number: int, moments: int, futures
             f"judge={cfg['judge']['_target_']} reads the simulator's features, and true frames, on which"
             " imagination is compared, have none; ask a run whose judge looks at pictures"
         )
+    width = at_once(cfg, min(_SIDE_BY_SIDE, len(which) * futures))
     world = build_world(
-        *(cfg, simulator, decoder, judge, points, len(which) * futures),
-        horizon=depth * int(cfg["task"]["chunk"]),
+        *(cfg, simulator, decoder, judge, points, width), horizon=depth * int(cfg["task"]["chunk"])
     )
-    physics = build_physics(cfg, at_once(cfg, min(_SIDE_BY_SIDE, len(which) * futures)), record=True)
+    physics = build_physics(cfg, width, record=True)
     policy = SafePolicyWrapper(build_policy(cfg, inputs.weights("policy")), physics.spec, physics.mode)
-    seed_process(cfg["seed"])
+    kept = Kept(root / "trust")
+    branching = Branching(world, physics, policy, judge, cfg["seed"], kept, _identity(cfg, inputs))
     try:
-        branches = branch(world, physics, policy, judge, which, futures)
+        branches = branching.branches(which, futures)
     finally:
         physics.close()
     rows, compared = agreement(branches, cfg["seed"]), len(branches.outcome)
     write_json(root / f"trust-{number}.json", {"moments": compared, "depths": rows})
-    return _table(rows, compared, futures)
+    return f"{_table(rows, compared, futures)}\n{kept.reused} parts were reused"
+
+
+def _identity(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
+    """What futures of a round depend on, beside which they are."""
+    sections = {name: decisive(name, cfg[name]) for name in ("simulator", "judge", "policy")}
+    chosen = {**sections, "suite": cfg["task"]["suite"]}
+    return {
+        # folders of stages are named by all that they hang on, code included
+        "stages": {role: [path.name for path in inputs.folders(role)] for role in inputs.found},
+        "sections": sections,
+        **task_of(cfg),
+        "code": {**code_of(Branching.__module__, chosen), **code_of(build_world.__module__, {})},
+    }
 
 
 def _table(rows: list[dict[str, list[float | None]]], moments: int, futures: int) -> str:

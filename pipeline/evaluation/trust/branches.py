@@ -8,7 +8,9 @@ what reinforcement learning learns from; rates of success and errors of pixels s
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,8 +24,9 @@ from envs.episodes.clips import ClipStore
 from envs.initial_states import DecisionPoints
 from envs.judges.base import Judge, ask
 from envs.physics.env import PhysicsEnv
-from envs.rng import resampling_generator
+from envs.rng import resampling_generator, sampling_seed, seed_process
 from envs.specs import CHUNK, LOST, PROGRESS, SUCCESS, Status, to_chunk
+from pipeline.graph.kept import Kept, Tensors
 
 _RESAMPLES = 400  # of the moments, for intervals
 
@@ -43,58 +46,82 @@ class Branches:
     outcome: Tensor
 
 
-@torch.no_grad()
-def branch(
-    world: TransformedEnv,
-    physics: PhysicsEnv,
-    policy: SafePolicyWrapper,
-    judge: Judge,
-    which: Tensor,
-    futures: int,
-) -> Branches:
-    """Imagine and carry out `futures` futures of some moments.
+@dataclass(frozen=True)
+class Branching:
+    """Where futures are imagined and carried out, as many side by side in both.
 
     Args:
-        world: imagined, of len(which) * futures slots that begin at DecisionPoints, D chunks long.
-        physics: of the episodes' own task, that records; of any number of slots.
+        world: imagined, W slots that begin at DecisionPoints, D chunks long.
+        physics: of the episodes' own task, that records; of W slots, too.
         policy: whose stochastic chunks are tried.
         judge: of the imagined world.
-        which: of the decision points, int64 [N], with at least D chunks of the task left.
+        seed: of what the policy draws.
+        kept: where what came of every W futures is kept.
+        identity: what that depends on, beside which futures they are.
     """
-    points = world.base_env.starts
-    assert isinstance(points, DecisionPoints)
-    slots = which.repeat_interleave(futures)
-    with set_exploration_type(ExplorationType.RANDOM):
-        begun, imagined, chunks = _imagine(world, policy, slots)
-        width, seen, outcomes = physics.batch_size[0], [], []
-        for part in tqdm(
-            torch.arange(len(slots)).split(width),
-            desc="carried out",
-            unit="batch",
-            dynamic_ncols=True,
-            leave=False,
-        ):
-            some = slots[part]
-            frames, outcome = carry_out(physics, policy, points, some, chunks[:, part])
-            first = points.store.frames(points.store.start[points.episode[some]])
-            texts = [points.instructions[number] for number in some.tolist()]
-            seen.append(watched(judge, frames, first, texts, begun[part]))
-            outcomes.append(outcome)
-    true, outcome = torch.cat(seen, 1), torch.cat(outcomes)
-    shape = (len(which), futures)
-    whole = outcome.reshape(shape).isfinite().all(1)
-    return Branches(
-        imagined.unflatten(-1, shape)[:, whole],
-        true.unflatten(-1, shape)[:, whole],
-        outcome.reshape(shape)[whole],
-    )
+
+    world: TransformedEnv
+    physics: PhysicsEnv
+    policy: SafePolicyWrapper
+    judge: Judge
+    seed: int
+    kept: Kept
+    identity: Mapping[str, Any]
+
+    def branches(self, which: Tensor, futures: int) -> Branches:
+        """Imagine and carry out `futures` futures of some moments.
+
+        Args:
+            which: of the decision points, int64 [N], with at least D chunks of the task left.
+        """
+        parts = which.repeat_interleave(futures).split(self.physics.batch_size[0])
+        bar = tqdm(parts, desc="carried out", unit="batch", dynamic_ncols=True, leave=False)
+        made = [self._part(number, slots) for number, slots in enumerate(bar)]
+        imagined, seen = (torch.cat([part[name] for part in made], 1) for name in ("imagined", "seen"))
+        shape = (len(which), futures)
+        outcome = torch.cat([part["outcome"] for part in made]).reshape(shape)
+        whole = outcome.isfinite().all(1)
+        return Branches(
+            imagined.unflatten(-1, shape)[:, whole], seen.unflatten(-1, shape)[:, whole], outcome[whole]
+        )
+
+    def _part(self, number: int, slots: Tensor) -> Tensors:
+        """What comes of W futures or fewer, now or at some earlier time: imagined and seen [D, w], outcome
+        [w].
+        """
+        base = self.world.base_env
+        points, drawn = base.starts, sampling_seed(self.seed, number, 0)
+        identity = {
+            **self.identity,
+            "slots": slots.tolist(),  # noise is drawn by them
+            "episodes": points.episode[slots].tolist(),
+            "frames": points.frame[slots].tolist(),
+            "chunks": base.horizon // base.chunk,
+            "width": self.physics.batch_size[0],
+            "seed": drawn,
+        }
+        return self.kept.get(f"futures-{number}", identity, lambda: self._tried(slots, drawn))
+
+    @torch.no_grad()
+    def _tried(self, slots: Tensor, seed: int) -> Tensors:
+        """See _part; by what the policy draws after this seed, whatever was drawn before."""
+        points: DecisionPoints = self.world.base_env.starts
+        seed_process(seed)
+        with set_exploration_type(ExplorationType.RANDOM):
+            begun, imagined, chunks = _imagine(self.world, self.policy, slots)
+            frames, outcome = carry_out(self.physics, self.policy, points, slots, chunks)
+        first = points.store.frames(points.store.start[points.episode[slots]])
+        texts = [points.instructions[number] for number in slots.tolist()]
+        seen = watched(self.judge, frames, first, texts, begun)
+        return {"imagined": imagined, "seen": seen, "outcome": outcome}
 
 
 def _imagine(world: EnvBase, policy: SafePolicyWrapper, slots: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Progress [W] at the moments, that [D, W] of what follows, and the chunks [D, W, K, A] that led to it; a
+    """Progress [w] at the moments, that [D, w] of what follows, and the chunks [D, w, K, A] that led to it; a
     success stays one.
     """
-    base = world.base_env
+    base, count = world.base_env, len(slots)
+    slots = _filled(slots, world.batch_size[0])
     base.schedule(slots.tolist())
     now, progress, chunks = world.reset(), [], []
     begun = now[PROGRESS].squeeze(-1).cpu()
@@ -105,7 +132,12 @@ def _imagine(world: EnvBase, policy: SafePolicyWrapper, slots: Tensor) -> tuple[
         progress.append(torch.where(won, 1.0, after["next", PROGRESS].squeeze(-1).cpu()))
         chunks.append(after[CHUNK].cpu())
         now = step_mdp(after)
-    return begun, torch.stack(progress), torch.stack(chunks)
+    return begun[:count], torch.stack(progress)[:, :count], torch.stack(chunks)[:, :count]
+
+
+def _filled(slots: Tensor, width: int) -> Tensor:
+    """Slots [w] and the last one again, up to a batch [W]."""
+    return torch.cat((slots, slots[-1:].expand(width - len(slots))))
 
 
 def carry_out(
@@ -122,7 +154,7 @@ def carry_out(
         the outcome float32 [W], NaN where physics crashed, whose frames are black.
     """
     store, count, depth = points.store, len(which), len(chunks)
-    which = torch.cat((which, which[-1:].expand(physics.batch_size[0] - count)))  # fills the batch
+    which = _filled(which, physics.batch_size[0])
     episode, moment = points.episode[which], points.frame[which]
     seeds = [int(store.episodes[number]["seed"]) for number in episode.tolist()]
     over = torch.zeros(len(which), dtype=torch.bool)

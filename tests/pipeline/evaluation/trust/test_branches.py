@@ -29,7 +29,8 @@ from envs.judges.base import Judge, Judgement, ask
 from envs.specs import PROGRESS, SUCCESS, Rewards, Status, to_chunk
 from envs.transforms.judge_reward import JudgeReward
 from pipeline.config import load_config
-from pipeline.evaluation.trust.branches import Branches, agreement, branch, carry_out, watched
+from pipeline.evaluation.trust.branches import Branches, Branching, agreement, carry_out, watched
+from pipeline.graph.kept import Kept
 from tests.worlds import scripted_set
 
 
@@ -127,11 +128,12 @@ def test_futures_are_imagined_and_carried_out(tmp_path: Path) -> None:
     simulator, judge = build_simulator(cfg).eval(), build_judge(cfg).eval()
     points = DecisionPoints(store, torch.arange(2))
     decoder = build_state_decoder(cfg, simulator)
-    world = build_world(cfg, simulator, decoder, judge, points, 6, horizon=2 * int(cfg["task"]["chunk"]))
+    world = build_world(cfg, simulator, decoder, judge, points, 4, horizon=2 * int(cfg["task"]["chunk"]))
     physics = build_physics(cfg, 4, record=True)
     try:
         actor = SafePolicyWrapper(build_policy(cfg), physics.spec, physics.mode)
-        found = branch(world, physics, actor, judge, torch.tensor([0, 3, 1]), 2)
+        branching = Branching(world, physics, actor, judge, 0, Kept(tmp_path / "trust"), {})
+        found = branching.branches(torch.tensor([0, 3, 1]), 2)
     finally:
         physics.close()
     assert found.imagined.shape == found.seen.shape == (2, 3, 2) and found.outcome.shape == (3, 2)
