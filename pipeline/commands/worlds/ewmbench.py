@@ -25,7 +25,7 @@ from pipeline.evaluation.ewmbench.features import PatchExtractor, TextExtractor
 from pipeline.evaluation.ewmbench.measure import Instruments
 from pipeline.evaluation.ewmbench.page import build_page, summary_text
 from pipeline.evaluation.ewmbench.records import Record, Records
-from pipeline.evaluation.ewmbench.result import Scoring, alike, by_task, overall
+from pipeline.evaluation.ewmbench.result import Scoring, alike, by_task, overall, scene_by_frame
 from pipeline.evaluation.ewmbench.samples import Samples, without_picture
 from pipeline.evaluation.ewmbench.semantics import Reader
 from pipeline.evaluation.fidelity.extractors import Extractor
@@ -41,9 +41,10 @@ NO_MODEL = (
     " judge=vlm_local, as docs/own_judge.md tells."
 )
 PARITY = (
-    "Strict parity: figures repeat quirks of the public code (the given first frame counts, one arm alone,"
-    " pictures' width and height both 1, nothing for a perfect match of dynamics). It averages over all"
-    " samples: compare it with the row of means. What differs still is told by docs/ewmbench.md."
+    "Strict parity: figures repeat quirks of the public code (the given first frame counts; one arm alone, by"
+    " a faulty measure of travel; pictures' width and height both 1; nothing for a perfect match of"
+    " dynamics). It averages over all samples: compare it with the row of means. What differs still is told"
+    " by docs/ewmbench.md."
 )
 ALIKE = (
     "All samples of each episode came out alike: this simulator draws nothing, so the best of them is any,"
@@ -152,7 +153,13 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
         }
         for number in chosen.episodes.tolist()
     ]
-    notes += [NO_MODEL] * (reader is None) + [PARITY] * section["strict_parity"]
+    whole = overall(rows)
+    notes += [NO_MODEL] * (reader is None)
+    if section["strict_parity"]:
+        notes.append(PARITY)
+        by_frame = whole["mean"]["scene_by_frame"] = scene_by_frame([made[row["episode"]] for row in rows])
+        if by_frame is not None:
+            notes.append(f"Scene as a mean over all frames of all samples, not over videos: {by_frame:.3f}.")
     notes += without_picture(store, chosen.episodes)
     if reader is not None and (lost := sum(not one.whole for one in _records(true, made))):
         notes.append(f"Of {lost} videos the model answered not everything; what is missing counts nowhere.")
@@ -173,7 +180,7 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
         if ruler is None
         else {"source": ruler.source, "weights": str(ruler.weights), "cameras": ruler.error(held)},
         "set": {**asdict(chosen), "episodes": chosen.episodes.tolist()},
-        "overall": overall(rows),
+        "overall": whole,
         "tasks": by_task(rows),
         "rows": rows,
         "notes": notes,

@@ -111,6 +111,16 @@ def by_task(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, 
     return {task: overall([row for row in rows if row["task"] == task]) for task in tasks}
 
 
+def scene_by_frame(made: Sequence[Sequence[Record]]) -> float | None:
+    """Scene consistency of all samples of every episode as the public code's function returns it: each frame
+    counts alike, and so a longer video more. Its table has means over videos, as `overall` has. None of no
+    video.
+    """
+    scenes = [found for some in made for record in some if (found := mean_scene(list(record.scene)))]
+    count = sum(scene.frames for scene in scenes)
+    return sum(scene.score * scene.frames for scene in scenes) / count if count else None
+
+
 def alike(made: Sequence[Sequence[Record]]) -> bool:
     """Whether all samples of every episode came out alike, as of a simulator that draws nothing."""
     return all(

@@ -11,13 +11,14 @@ from torch.nn import functional
 
 @dataclass(frozen=True)
 class Scene:
-    """Mean cosine of the patches of each frame to those of the frame before and of the first, and the mean of
-    both.
+    """Mean cosine of the patches of each frame to those of the frame before and of the first, the mean of
+    both, and how many frames were compared: all but the first.
     """
 
     previous: float
     first: float
     score: float
+    frames: int
 
 
 def scene_consistency(patches: Tensor, strict_parity: bool) -> Scene:
@@ -41,7 +42,7 @@ def scene_consistency(patches: Tensor, strict_parity: bool) -> Scene:
         return float((cosines.clamp(min=0) if strict_parity else cosines).mean())
 
     previous, first = alike(unit[1:], unit[:-1]), alike(unit[1:], unit[:1].expand_as(unit[1:]))
-    return Scene(previous, first, (previous + first) / 2)
+    return Scene(previous, first, (previous + first) / 2, len(unit) - 1)
 
 
 def diversity(embeddings: Tensor) -> float | None:
@@ -63,8 +64,9 @@ def video_embedding(features: Tensor, strict_parity: bool) -> Tensor:
 
 
 def mean_scene(rows: list[Scene]) -> Scene | None:
-    """Means over views or videos."""
+    """Means over the views of a video."""
     if not rows:
         return None
     table = torch.tensor([[row.previous, row.first, row.score] for row in rows], dtype=torch.float64)
-    return Scene(*table.mean(0).tolist())
+    previous, first, score = table.mean(0).tolist()
+    return Scene(previous, first, score, rows[0].frames)

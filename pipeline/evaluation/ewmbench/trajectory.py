@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from scipy.stats import wasserstein_distance
 
-Floats = NDArray[np.float64]
+from pipeline.evaluation.ewmbench.parity import public_travel, unfilled
+
+Floats = NDArray[np.floating[Any]]
 EPS = 1e-8
 VELOCITY, ACCELERATION = 0.007, 0.003  # weights in DYN
 CAPS = {"sa": 24.979, "ta": 50.202, "dyn": 22.519}
@@ -29,7 +32,8 @@ class Scores:
 
     Args:
         sa, ta, dyn: 0..1, more is better.
-        hsd, ndtw: distances in shares of the picture's width; None where there is no trajectory.
+        hsd, ndtw: distances in shares of the picture's width, or as strict_parity has it; None where there is
+            no trajectory.
         missing: share of the generated frames in which no gripper was found.
         lost: share of the cameras in which the generated video has no trajectory.
     """
@@ -55,7 +59,8 @@ def fill_gaps(track: Floats) -> Floats | None:
     if not seen.any() or 1 - seen.mean() > MOST_MISSING:
         return None
     at = np.arange(len(track))
-    return np.stack([np.interp(at, at[seen], track[seen, k]) for k in range(track.shape[1])], -1)
+    filled = [np.interp(at, at[seen], track[seen, k]) for k in range(track.shape[1])]
+    return np.stack(filled, -1).astype(track.dtype)
 
 
 def travel(track: Floats) -> float:
@@ -113,9 +118,10 @@ def scores(made: Floats, true: Floats, size: tuple[int, int], strict_parity: boo
 
     Every arm counts: distances are means over the arms, DYN over those that truly move.
 
-    With strict_parity all is as in the public code. Pictures' width and height both count 1. Only the arm
-    with the longest true travel counts; it is counted among the arms that have a true track, a fault where
-    one has none. What matches perfectly in its dynamics gets 0. Dynamic time warping alone is exact, where
+    With strict_parity all is as in the public code, in float32. Pictures' width and height both count 1. Only
+    the arm counts that it takes for the one with the longest true travel (parity.public_travel). That arm is
+    counted among those that have a true track, a fault where one has none: an arm may be taken whose truth is
+    mostly (-1, -1). What matches perfectly in its dynamics gets 0. Dynamic time warping alone is exact, where
     the public code approximates it.
 
     Args:
@@ -140,14 +146,18 @@ def scores(made: Floats, true: Floats, size: tuple[int, int], strict_parity: boo
         )
     height, width = size
     unit = np.array((width, height) if strict_parity else (width, width), float)
-    wanted = [fill_gaps(track / unit) for track in true.swapaxes(0, 1)]
-    found = [fill_gaps(track / unit) for track in made.swapaxes(0, 1)]
+    kind = np.float32 if strict_parity else np.float64
+    truth = [(track / unit).astype(kind) for track in true.swapaxes(0, 1)]
+    wanted = [fill_gaps(track) for track in truth]
+    found = [fill_gaps((track / unit).astype(kind)) for track in made.swapaxes(0, 1)]
     known = [arm for arm, track in enumerate(wanted) if track is not None]
     if not known:
         return None
-    travels = [travel(wanted[arm]) for arm in known]  # type: ignore[arg-type]
+    reach = public_travel if strict_parity else travel
+    travels = [reach(wanted[arm]) for arm in known]  # type: ignore[arg-type]
     if strict_parity:
         chosen = moving = [int(np.argmax(travels))]
+        wanted = [unfilled(truth[arm]) if track is None else track for arm, track in enumerate(wanted)]
     else:
         chosen = known
         moving = [arm for arm, far in zip(known, travels, strict=True) if far > STILL] or known

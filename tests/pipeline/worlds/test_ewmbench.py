@@ -145,6 +145,10 @@ def test_one_arm_that_nobody_calibrated(tmp_path: Path, tiny_data: Callable[[Emb
     for name in ("sa", "ta", "dyn", "bleu", "steps", "logic"):  # unknown is not nothing
         assert whole["generated"][name] is None and whole["recorded"].get(name) is None
     assert whole["generated"]["scene"] is not None and whole["generated"]["diversity"] == pytest.approx(0)
+    assert "scene_by_frame" not in whole["mean"] and "over videos" not in said
+    said = ewmbench(load_config([*words, "ewmbench.strict_parity=true"]), tmp_path / "run")
+    whole = json.loads(written(tmp_path / "run", "ewmbench.json").read_text())["overall"]
+    assert f"all frames of all samples, not over videos: {whole['mean']['scene_by_frame']:.3f}." in said
     with pytest.raises(ConfigError, match=r"ewmbench\.cameras=\['side'\] must be some of"):
         ewmbench(load_config([*words, "ewmbench.cameras=[side]"]), tmp_path / "run")
     with pytest.raises(ConfigError, match=r"ewmbench\.detector\.weights=.*nowhere is not there"):
