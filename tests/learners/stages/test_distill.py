@@ -104,10 +104,16 @@ def test_a_student_makes_what_the_teacher_makes(
     steps, lr, ema = PACE[name]
     options = FitConfig(steps, 1, lr, warmup=5, bf16=False, ema=ema, checkpoint_every=1000)
     train_student(teacher, method, ClipBatches(student, store, torch.arange(4), CLIPS, options), tmp_path)
-    # Of several steps DMD2 matches the mixture, not each: its critic does not know them apart.
-    made = learned(student, options) if name == "dmd2" else student.sample()
-    assert float(made.mean()) == pytest.approx(2.0, abs=0.12)
-    assert float(made.std()) == pytest.approx(0.5, abs=0.2 if name == "dmd2" else 0.1)
+    # Of several steps DMD2 matches the mixture, not each: its critic does not know them apart, and what is
+    # sampled, by the last, may lie a little beside what the first makes.
+    mixed = name == "dmd2" and count > 1
+    made = student.sample()
+    assert float(made.mean()) == pytest.approx(2.0, abs=0.2 if mixed else 0.12)
+    assert float(made.std()) == pytest.approx(0.5, abs=0.1)
+    if mixed:
+        made = learned(student, options)
+        assert float(made.mean()) == pytest.approx(2.0, abs=0.12)
+        assert float(made.std()) == pytest.approx(0.5, abs=0.1)
 
 
 def test_each_level_that_a_student_samples_at_is_learned_as_often_and_no_other(tiny_store: Stores) -> None:
