@@ -17,12 +17,18 @@ from learners.stages.simulator import ClipBatches
 from learners.training.fit import fit
 from learners.training.lora import low_rank
 
-# By the keys that say what they are, the parts of engines that offer several.
-_PARTS = {
+# Where engines hold what decides of their conditioning, by the keys that say it; each has some of it.
+_OPTIONS = {
     "simulator.actions": "actions",
+    "simulator.context": "context",
+    "simulator.horizon": "horizon",
+    "simulator.parity": "parity",
     "simulator.prediction": "prediction",
     "simulator.denoising.prediction": "diffusion.prediction",
+    "simulator.denoising.schedule": "schedule",
+    "simulator.denoising.stabilisation": "denoising.stabilisation",
 }
+_PLAIN = (bool, int, float, str)
 
 
 def train_student(
@@ -77,7 +83,7 @@ def check_pair(teacher: Simulator, student: Simulator) -> None:
         "simulator.ray_map": (teacher.spec.ray_map, student.spec.ray_map),
         "simulator.memory_frames": (teacher.memory_frames, student.memory_frames),
         "simulator._target_": (type(teacher).__name__, type(student).__name__),
-        **{key: (_about(teacher, path), _about(student, path)) for key, path in _PARTS.items()},
+        **{key: (_about(teacher, path), _about(student, path)) for key, path in _OPTIONS.items()},
     }
     odd = [f"{key}: {a!r} and {b!r}" for key, (a, b) in pairs.items() if a != b]
     if odd:
@@ -105,14 +111,18 @@ def check_pair(teacher: Simulator, student: Simulator) -> None:
         )
 
 
-def _about(world: Simulator, path: str) -> str:
-    """Class and numbers of the part of an engine at a dotted path; alike for all that have no such part."""
+def _about(world: Simulator, path: str) -> Any:
+    """What an engine holds at a dotted path: a number, or a part's class and numbers; alike for all that hold
+    nothing there.
+    """
     part: Any = world
     for name in path.split("."):
         part = getattr(part, name, None)
-    held = getattr(part, "__dict__", {})
-    numbers = {key: value for key, value in held.items() if type(value) in (int, float, str)}
-    return f"{type(part).__name__} {numbers}"
+    if type(part) in _PLAIN:
+        return part
+    held = {key: value for key, value in getattr(part, "__dict__", {}).items() if type(value) in _PLAIN}
+    held.pop("training", None)  # of modules: not what they are
+    return f"{type(part).__name__} {held}"
 
 
 def _sizes(world: Simulator) -> dict[str, tuple[int, ...]]:

@@ -220,6 +220,24 @@ def test_teacher_and_student_must_belong_together(tiny_store: Stores) -> None:
     drifting = {"prediction": {**section_of("simulator", "forcing_small")["prediction"], "drift": 0.2}}
     with pytest.raises(ValueError, match=r"simulator\.prediction: .*'drift': 0\.1.* and .*'drift': 0\.2"):
         check_pair(forcing, other_than("forcing_small", spec, drifting))
+    schedule = {"start": -2.0, "end": 3.0, "temperature": 1.0}
+    steps = section_of("simulator", "forcing_small")["denoising"]
+    for changes, said in (
+        ({"context": 2}, r"context: 4 and 2"),
+        ({"horizon": 1}, r"horizon: \d and 1"),
+        ({"denoising": {**steps, "stabilisation": 0.1}}, r"denoising\.stabilisation: 0\.015 and 0\.1"),
+        ({"denoising": {**steps, "schedule": schedule}}, r"denoising\.schedule: .*'start': -3\.0.*-2\.0"),
+    ):
+        # as many frames are remembered in training
+        like = {"window": spec.chunk + forcing.memory_frames}
+        with pytest.raises(ValueError, match=rf"conditioned differently: simulator\.{said}"):
+            check_pair(forcing, other_than("forcing_small", spec, like | changes))
+    folded = replace(spec, chunk=5)
+    with pytest.raises(ValueError, match=r"differently: simulator\.parity: .*False.* and .*True"):
+        check_pair(
+            stepwise_pair("gesim_tiny", folded)[0],
+            other_than("gesim_tiny", folded, {"parity": "released"}),
+        )
     own = section_of("simulator", "dit_small")
     denoising, codec = own["denoising"], own["codec"]
     velocity = other_than("dit_small", spec, {"denoising": {**denoising, "prediction": "velocity"}})
