@@ -78,7 +78,7 @@ def state(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     model = build_simulator(cfg, inputs.weights("simulator"))
     decoder = build_state_decoder(cfg, model)
     fit = fit_options(cfg, section["fit"], "finetune.state.fit")
-    how = {"lora": section["lora"], "clips": section["clips"]}
-    stats = train_state(decoder, model, store, learning_episodes(store), fit, folder, **how)
+    parts = (decoder, model, store, learning_episodes(store), fit, folder)
+    stats = train_state(*parts, lora=section["lora"], clips=section["clips"])
     save_weights(decoder, folder)
     return dict(stats)
