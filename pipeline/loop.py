@@ -114,8 +114,12 @@ def of_round(values: Sequence[T], number: int) -> T:
 
 
 def deployed_episodes(cfg: Cfg) -> int:
-    """Physics episodes of all deployments; the last one is of what the last round has learned."""
-    return sum(of_round(cfg["rounds"]["deploy"], n) for n in range(1, last_round(cfg) + 2))
+    """Physics episodes of all rounds: of deployments, and of trials, of which one more is of what the last
+    round has learned.
+    """
+    rounds = last_round(cfg)
+    trials = (rounds + 1) * int(cfg["rounds"]["trial"])
+    return trials + sum(of_round(cfg["rounds"]["deploy"], n) for n in range(1, rounds + 1))
 
 
 def imagined_iterations(cfg: Cfg) -> int:
@@ -132,12 +136,12 @@ def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
     starts = _extra_starts(graph, cfg) if with_rl else []
     made, known = World(), ""
     for number in range(1, last_round(cfg) + 1):
-        deployed = _deploy(graph, cfg, policy, number)
-        data = [*data, deployed]
+        data = [*data, _deploy(graph, cfg, policy, number)]
+        tried = _try(graph, policy, number)
         made = add_world(graph, cfg, data, made, number)
         inputs = {"data": data, **made.roles()}
         graph.add(f"gap-{number}", prove.gap, {**inputs, "policy": policy}, number=number)
-        policy, known = _keep(graph, policy, deployed, best, known, number)
+        policy, known = _keep(graph, policy, tried, best, known, number)
         best = policy
         if number <= cfg["rounds"]["clone"]:
             policy = graph.add(
@@ -148,7 +152,7 @@ def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
         if with_rl:
             policy = _learn(graph, cfg, data, made, policy, number, starts, known)
     last = last_round(cfg) + 1
-    policy, _ = _keep(graph, policy, _deploy(graph, cfg, policy, last), best, known, last)
+    policy, _ = _keep(graph, policy, _try(graph, policy, last), best, known, last)
     before = graph.add("evaluate-before", prove.evaluate_physics, {"policy": first})
     after = graph.add("evaluate-after", prove.evaluate_physics, {"policy": policy})
     _conclude(graph, data, made, first, policy, {"physics_before": before, "physics_after": after})
@@ -168,11 +172,15 @@ def _deploy(graph: Graph, cfg: Cfg, policy: str, number: int) -> str:
     return graph.add(f"deploy-{number}", collect.deploy, {"policy": policy}, number=number, episodes=episodes)
 
 
-def _keep(graph: Graph, policy: str, deployed: str, best: str, known: str, number: int) -> tuple[str, str]:
-    """The better of the policy just deployed and the best before, and what says how good it is."""
+def _try(graph: Graph, policy: str, number: int) -> str:
+    return graph.add(f"trial-{number}", prove.trial, {"policy": policy}, number=number)
+
+
+def _keep(graph: Graph, policy: str, tried: str, best: str, known: str, number: int) -> tuple[str, str]:
+    """The policy just tried, or the one before if it got worse, and what says how good it is."""
     if not known:
-        return policy, deployed
-    roles = {"candidate": policy, "tried": deployed, "incumbent": best, "known": known}
+        return policy, tried
+    roles = {"candidate": policy, "tried": tried, "incumbent": best, "known": known}
     kept = graph.add(f"keep-{number}", keep.keep, roles)
     return kept, kept
 

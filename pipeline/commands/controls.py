@@ -95,7 +95,7 @@ def control_rows(cfg: Cfg, root: Path, loop: Graph) -> list[Row]:
     the run's note says why there is no loop without imagined decisions, where there is none.
     """
     explored = ("explore",) if "explore" in loop.nodes else ()
-    deploys = (*explored, *(f"deploy-{n}" for n in range(1, last_round(cfg) + 2)))
+    deploys = (*explored, *(f"deploy-{n}" for n in range(1, last_round(cfg) + 1)))
     learned = {equal: _rl_in_physics(loop, cfg, equal) for equal in EQUAL}
     note = privileged_note(cfg)
     loop.add("filtered-bc", only_here.filtered_bc, {"data": ["collect", *deploys]})

@@ -16,6 +16,7 @@ from envs.files import write_json
 from envs.rng import Purpose, episode_seeds
 from envs.targets import ConfigError
 from pipeline.evaluation.by_task import by_task, tasks_of_episodes, tasks_of_seeds, unseen_first, variant_of
+from pipeline.evaluation.result import OUTCOMES
 from pipeline.evaluation.statistics import mcnemar, points_line, rate_entry, rate_line
 from pipeline.graph.graph import Graph
 from pipeline.loop import build_loop
@@ -85,7 +86,7 @@ def _beside_first(graph: Graph, seeds: list[int], outcome: Outcome) -> list[str]
     """A line on the policy that RL began with, if its stage has played the same episodes."""
     if not graph.finished(_FIRST):
         return []
-    first = torch.load(graph.folder(_FIRST) / "outcomes.pt", weights_only=True)
+    first = torch.load(graph.folder(_FIRST) / OUTCOMES, weights_only=True)
     if first["seeds"].tolist() != seeds:
         return []
     both = first["counted"] & outcome.counted

@@ -17,6 +17,7 @@ from pipeline.evaluation.verdict import IMAGINED, verdict
 from pipeline.graph.stage import Inputs
 
 _ENTRY = ("successes", "episodes", "low", "high")
+OUTCOMES = "outcomes.pt"  # success on each seed, of the stages that try a policy in physics
 
 
 def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
@@ -31,19 +32,17 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         paired (McNemar), None without physics; imagined_before, imagined_after; judge, rollout,
         frames_per_second (see the measure stage); tasks (the same rates by task, {} if there is one);
         scenes (the same rates of each task in each scene that occurs, [] if there is one); exploration (see
-        the explore stage; None without it); rounds (gaps); worth (see its stage), by round; episodes used
-        and held out; seconds per stage; training (see `_training`); what the judge has cost
-        (stages/judging/cost.py), {} if it is free; alarms.
+        the explore stage; None without it); rounds (gaps); trials (see `_trials`); worth (see its stage), by
+        round; episodes used and held out; seconds per stage; training (see `_training`); what the judge has
+        cost (stages/judging/cost.py), {} if it is free; alarms.
     """
     finished = manifests(inputs)
     imagined, measured = (result_of(inputs.folder(role)) for role in ("imagined", "measured"))
     learned = [entry for name, entry in finished.items() if name.startswith("rl-")]
-    # The last deployment tells which policy to keep, and nothing learns from it.
-    last = f"deploy-{cfg['rounds']['count'] + 1}"
     gathered = [
         entry["result"]
         for name, entry in finished.items()
-        if name.split("-")[0] in ("collect", "explore", "deploy", "recordings") and name != last
+        if name.split("-")[0] in ("collect", "explore", "deploy", "recordings")
     ]
     result: dict[str, Any] = {
         "name": cfg["name"],
@@ -62,6 +61,7 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
         "scenes": _scenes(cfg, inputs, imagined),
         "exploration": finished["explore"]["result"] if "explore" in finished else None,
         "rounds": [entry["result"] for name, entry in finished.items() if name.startswith("gap-")],
+        "trials": _trials(finished),
         "worth": [entry["result"] for name, entry in finished.items() if name.startswith("worth-")],
         "episodes_used": sum(entry["episodes"] - entry.get("held_out", 0) for entry in gathered),
         "episodes_held_out": sum(entry.get("held_out", 0) for entry in gathered),
@@ -73,6 +73,19 @@ def build_result(cfg: Mapping[str, Any], inputs: Inputs) -> dict[str, Any]:
     }
     result["verdict"] = verdict(result)
     return result
+
+
+def _trials(finished: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """What came of each round's trial, with what the stage `keep` found: whether its policy was kept, and how
+    many episodes were gained and lost against the best trial before; None in the first.
+    """
+    rows = []
+    for name, entry in finished.items():
+        if name.startswith("trial-"):
+            found = finished.get(f"keep-{name.removeprefix('trial-')}", {}).get("result", {})
+            compared = {key: found.get(key) for key in ("kept", "gained", "lost")}
+            rows.append({**entry["result"], **compared})
+    return rows
 
 
 def manifests(inputs: Inputs) -> dict[str, dict[str, Any]]:
@@ -92,7 +105,7 @@ def outcomes(*folders: Path) -> tuple[list[int], list[torch.Tensor]]:
     """The evaluation seeds that all of these stages evaluate_physics could count, and success bool [N] on
     them in each.
     """
-    kept = [torch.load(folder / "outcomes.pt", weights_only=True) for folder in folders]
+    kept = [torch.load(folder / OUTCOMES, weights_only=True) for folder in folders]
     counted = torch.stack([one["counted"] for one in kept]).all(0)
     return kept[0]["seeds"][counted].tolist(), [one["success"][counted] for one in kept]
 

@@ -97,6 +97,7 @@ class RoundsSection:
 
     count: Count
     deploy: Annotated[tuple[Count, ...], MinLen(1)]
+    trial: Count
     splits: Mapping[Literal["held_out", "calibration"], Share]
     iterations: Annotated[tuple[Count, ...], MinLen(1)]
     clone: Natural

@@ -44,5 +44,6 @@ def test_the_loop_without_rl_shares_what_comes_before(tmp_path: Path) -> None:
     cfg = load_config(["experiment=smoke"])
     loop, without = build_loop(cfg, tmp_path), build_loop(cfg, tmp_path, with_rl=False)
     shared = {name for name in without.nodes if without.key(name) == loop.key(name)}
-    assert {"collect", "imitation", "deploy-1", "simulator-1", "clone-1", "evaluate-before"} <= shared
-    assert "rl-1" not in without.nodes and not {"deploy-2", "evaluate-after"} & shared
+    once = {"collect", "imitation", "deploy-1", "trial-1", "simulator-1", "clone-1", "evaluate-before"}
+    assert once <= shared
+    assert "rl-1" not in without.nodes and not {"deploy-2", "trial-2", "evaluate-after"} & shared

@@ -20,7 +20,7 @@ from tests.commands import worldloop
 
 FEWER = (
     *("collect.episodes={train: 16, held_out: 8, calibration: 6}", "imitation.demos=4"),
-    *("explore.episodes=4", "rounds.deploy=[8,8]"),
+    *("explore.episodes=4", "rounds.deploy=[8]", "rounds.trial=4"),
     *("evaluate.episodes=10", "evaluate.envs=10", "evaluate.imagined=8", "measure.starts=8"),
 )
 LEARNED = ("imitation", "simulator-1", "state-1", "judge-1", "clone-1", "rl-1")
@@ -45,7 +45,7 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     table = worldloop(tmp_path, "compare", str(run), str(run)).output
     assert "| algorithm; seed | PPO; 0 | PPO; 0 |" in table
     again = worldloop(tmp_path, "run", *words)
-    assert again.output.count("is finished, reused") == 27
+    assert again.output.count("is finished, reused") == 29
     one = worldloop(tmp_path, "controls", *words, "controls.only=[filtered_bc]")
     assert one.status == 0, one.output[-3000:]
     assert set(json.loads((run / "controls.json").read_text())) == {"before", "loop", "filtered BC"}

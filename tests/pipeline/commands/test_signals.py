@@ -63,7 +63,7 @@ LASTS = {
         ["cross-validate", *SOAK, "name=known", "folds=2", "rounds.iterations=[90000]"],
         r"folds: +\d",
     ),
-    "controls": (["controls", *SOAK, "name=known"], r"deploy: +\d"),
+    "controls": (["controls", *SOAK, "name=known"], r"physics: +\d"),
     "study": (
         [
             "study",

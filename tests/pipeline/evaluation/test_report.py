@@ -74,6 +74,10 @@ def result(**changes: Any) -> dict[str, Any]:
                 "replayed": table,
             }
         ],
+        "trials": [
+            {"round": 1, **entry(40), "tasks": {}, "kept": None, "gained": None, "lost": None},
+            {"round": 2, **entry(31), "tasks": {"grasp": entry(3)}, "kept": False, "gained": 9, "lost": 18},
+        ],
         "worth": [
             {
                 "round": 1,

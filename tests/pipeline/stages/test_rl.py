@@ -87,7 +87,7 @@ def test_goals_that_hosts_imagine_are_counted(
 def test_in_physics_it_plays_as_many_episodes_as_are_deployed_and_not_whole_iterations(
     tmp_path: Path,
 ) -> None:
-    words = ("experiment=soak", "track=disabled", "explore.levels=[]", "rounds.deploy=[5]", "algorithm=ppo")
+    words = ("experiment=soak", "track=disabled", "explore.levels=[]", "rounds.trial=3", "algorithm=ppo")
     cfg = load_config([*words, "rl.imagined=0"])  # which is about imagination alone
     graph = build_loop(cfg, tmp_path)
     name = add_rl_in_physics(graph, cfg, "episodes")

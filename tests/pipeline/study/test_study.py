@@ -70,7 +70,7 @@ def assert_each_shared_stage_ran_once(root: Path) -> None:
     once = ("collect", "imitation", "deploy-1", "simulator-1", "clone-1", "evaluate-before", "rl-1")
     assert {name: folders[name] for name in once} == dict.fromkeys(once, 1)
     # with RL and without, of one policy each; a policy that was kept is evaluated as the first row's
-    assert folders["deploy-2"] == folders["evaluate-after"] == 2
+    assert folders["trial-2"] == folders["evaluate-after"] == 2
 
 
 def assert_cells_are_what_the_evaluations_left(words: tuple[str, ...], table: dict[str, Any]) -> None:
