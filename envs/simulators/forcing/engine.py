@@ -85,7 +85,8 @@ class ForcingSimulator(Blockwise):
         if horizon > spec.chunk:
             raise ValueError(
                 f"simulator.horizon={horizon} must be at most task.chunk={spec.chunk}: a block is generated"
-                " under its actions, and a chunk has no more of them; lower it, or leave it null"
+                " under its actions, and a chunk has no more; lower it or leave it null; fidelity.grid"
+                f" tries it as {{simulator.horizon: [{horizon}], task.chunk: [{horizon}]}}"
             )
         super().__init__(spec, window - spec.chunk, window - spec.chunk)
         trunk = options(Trunk, net, "simulator.net")

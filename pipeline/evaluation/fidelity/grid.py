@@ -9,6 +9,9 @@ from typing import Any
 from envs.targets import ConfigError, nearest
 
 Settings = Mapping[str, Any]
+# Frames generated at a call: nobody acts in a grid, and weights of a world of single frames do not depend on
+# it. Weights that do are refused as they are loaded.
+_CHUNK = "task.chunk"
 
 
 def combinations(grid: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
@@ -21,15 +24,15 @@ def with_settings(cfg: Mapping[str, Any], settings: Settings) -> dict[str, Any]:
     """A config with the values at dotted keys replaced.
 
     Raises:
-        ConfigError: for a key that the config does not have, or of a section other than simulator, whose
-            weights alone stay what they are.
+        ConfigError: for a key that the config does not have, or other than task.chunk and those of the
+            section simulator, whose weights alone stay what they are.
     """
     out = dict(cfg)
     for key, value in settings.items():
-        if not key.startswith("simulator."):
+        if not key.startswith("simulator.") and key != _CHUNK:
             raise ConfigError(
-                f"fidelity.grid.{key}: only options of the simulator can be tried on one set of weights,"
-                " as in fidelity.grid={simulator.<option>: [...]}"
+                f"fidelity.grid.{key}: only options of the simulator, and task.chunk, can be tried on one set"
+                " of weights, as in fidelity.grid={simulator.<option>: [...]}"
             )
         section, parts = out, key.split(".")
         for part in parts[:-1]:

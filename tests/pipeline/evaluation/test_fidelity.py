@@ -382,6 +382,6 @@ def test_options_at_inference_in_all_combinations() -> None:
         with pytest.raises(ConfigError, match="did you mean"):
             with_settings(cfg, {key: 1})
     with pytest.raises(ConfigError, match="options of the simulator"):
-        with_settings(cfg, {"task.chunk": 1})
+        with_settings(cfg, {"task.horizon": 1})
     assert optimum([{"mse": 0.2}, {"mse": 0.1}, {"mse": None}], "mse") == 1
     assert optimum([{"mse": None}], "mse") is None

@@ -37,7 +37,8 @@ def test_fidelity_with_masks_from_physics(tmp_path: Path) -> None:
     data = scripted_set(cfg, tmp_path / "set", 3)
     words = [*soak, *untrained_world(cfg, tmp_path), f"imagined.data=[{data}]"]
     words += ["fidelity.long={frames: 30, episodes: 1, noise_level: 1.0}", "fidelity.strides=[1,2]"]
-    tried = load_config([*words, "fidelity.grid={simulator.context: [1, 4], simulator.horizon: [4]}"])
+    grid = "{simulator.context: [1, 4], simulator.horizon: [9], task.chunk: [9]}"  # more than a chunk
+    tried = load_config([*words, f"fidelity.grid={grid}"])
     said = fidelity(tried, tmp_path / "run")
     result = json.loads(written(tmp_path / "run", "fidelity.json").read_text())
     assert result["masks"] == {"source": "physics", "episodes": 3}
@@ -50,8 +51,7 @@ def test_fidelity_with_masks_from_physics(tmp_path: Path) -> None:
     assert len(result["frechet"]) == 2 and "no learned weights" in result["frechet"][0]["extractor"]
     assert result["long"]["frames"] == 32 and len(result["long"]["by_frame"]["mse"]) == 32
     assert [row["settings"] for row in result["grid"]["rows"]] == [
-        {"simulator.context": 1, "simulator.horizon": 4},
-        {"simulator.context": 4, "simulator.horizon": 4},
+        {"simulator.context": context, "simulator.horizon": 9, "task.chunk": 9} for context in (1, 4)
     ]
     one, two = result["strides"]
     assert (one["stride"], two["stride"], two["covers"]) == (1, 2, 2 * one["covers"]) and one["seconds"] > 0
