@@ -2,7 +2,7 @@
 
 Beside a finished run stand, on the same evaluation seeds:
 
-- the loop without its RL iterations: deploy, refresh the world, clone what worked, as many physics episodes;
+- the loop without its RL iterations: deploy, refresh the world, clone what worked;
 - the loop whose RL learns from the true decisions alone (rl.imagined=0): the rest is as it was; left out
   where RL learns from no true ones;
 - RL in physics with as many episodes as the loop deployed;
@@ -30,7 +30,7 @@ from pipeline.graph.graph import Graph
 from pipeline.loop import build_loop, has_physics, last_round
 from pipeline.stages import controls as only_here
 from pipeline.stages import prove, rl
-from pipeline.study.methods import EQUAL, Equal, add_rl_in_physics, privileged_note
+from pipeline.study.methods import EQUAL, Equal, Made, add_rl_in_physics, privileged_note
 from pipeline.track import Tracker
 
 Cfg = Mapping[str, Any]
@@ -45,7 +45,6 @@ class Row:
         title: what it is.
         graph: the graph that holds its stages.
         node: the evaluation in physics that it shows.
-        learned: stages that spent physics episodes, by their results' "episodes".
         note: what must be known to compare it with the others; "" for nothing.
     """
 
@@ -53,7 +52,6 @@ class Row:
     title: str
     graph: Graph
     node: str
-    learned: tuple[str, ...]
     note: str = ""
 
 
@@ -103,23 +101,16 @@ def control_rows(cfg: Cfg, root: Path, loop: Graph) -> list[Row]:
     without = build_loop(cfg, root, with_rl=False)
     why_not = _nothing_recorded(loop, cfg)
     blind = build_loop({**cfg, "rl": {**cfg["rl"], "imagined": 0.0}}, root)
-    unimagined = Row("without_imagined", "loop without imagined decisions", blind, "evaluate-after", deploys)
+    unimagined = Row("without_imagined", "loop without imagined decisions", blind, "evaluate-after")
     return [
-        Row("", "loop", loop, "evaluate-after", deploys, why_not),
-        Row("without_rl", "loop without RL iterations", without, "evaluate-after", deploys),
+        Row("", "loop", loop, "evaluate-after", why_not),
+        Row("without_rl", "loop without RL iterations", without, "evaluate-after"),
         *([] if why_not else [unimagined]),
         *(
-            Row(
-                f"rl_equal_{equal}",
-                f"RL in physics, equal {equal}",
-                loop,
-                f"evaluate-{name}",
-                (*explored, name),
-                note,
-            )
+            Row(f"rl_equal_{equal}", f"RL in physics, equal {equal}", loop, f"evaluate-{name}", note)
             for equal, name in learned.items()
         ),
-        Row("filtered_bc", "filtered BC", loop, "evaluate-filtered-bc", deploys),
+        Row("filtered_bc", "filtered BC", loop, "evaluate-filtered-bc"),
     ]
 
 
@@ -136,7 +127,7 @@ def control_table(loop: Graph, rows: list[Row]) -> dict[str, Any]:
             **entry,
             "gain": None if gain is None else 100 * gain,
             "paired": mcnemar(*outcomes(before, after)[1]),
-            "physics_episodes": sum(row.graph.result(name)["episodes"] for name in row.learned),
+            "physics_episodes": Made(row.graph, row.node).physics_episodes().get("own", 0),
             **({"note": row.note} if row.note else {}),
         }
     return table

@@ -18,6 +18,7 @@ from actors.world_config import world_spec
 from envs.episodes import Episode, LeRobotWriter
 from envs.rng import seed_process
 from pipeline.graph.artefact import save_weights
+from pipeline.graph.stage import WEIGHTS
 
 
 def demo_recipe(cfg: Mapping[str, Any], folder: Path, episodes: int, starts: int = 16) -> Recipe:
@@ -46,7 +47,7 @@ def demo_recipe(cfg: Mapping[str, Any], folder: Path, episodes: int, starts: int
             (folder / name).mkdir(parents=True, exist_ok=True)
             save_weights(module, folder / name)
         (folder / "done").touch()
-    paths = [str((folder / name / "weights.safetensors").resolve()) for name in parts]
+    paths = [str((folder / name / WEIGHTS).resolve()) for name in parts]
     return Recipe(
         cfg,
         episodes,

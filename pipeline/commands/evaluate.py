@@ -19,6 +19,7 @@ from pipeline.evaluation.by_task import by_task, tasks_of_episodes, tasks_of_see
 from pipeline.evaluation.result import OUTCOMES
 from pipeline.evaluation.statistics import mcnemar, points_line, rate_entry, rate_line
 from pipeline.graph.graph import Graph
+from pipeline.graph.stage import WEIGHTS
 from pipeline.loop import build_loop
 from pipeline.stages.given import load_world, open_store
 
@@ -53,7 +54,7 @@ def evaluate_policy(
     if variant and world != "physics":
         raise ConfigError(f"variant={variant} is known in physics alone; leave world={world} out")
     folder = graph.folder(weights) if weights in graph.nodes else Path(weights)
-    actor = build_policy(cfg, folder / "weights.safetensors" if weights else None)
+    actor = build_policy(cfg, folder / WEIGHTS if weights else None)
     env, seeds, tasks = _physics(cfg, changes) if world == "physics" else _imagined(cfg, graph)
     try:
         outcome = evaluate(env, actor, seeds, label=world)

@@ -23,6 +23,7 @@ from envs.physics.suite import Observation, TaskSuite, build_suite, task_names, 
 from envs.targets import ConfigError
 from pipeline.acting import acting
 from pipeline.evaluation.by_task import tasks_told
+from pipeline.graph.stage import WEIGHTS
 from pipeline.loop import build_loop, has_physics
 
 Cfg = Mapping[str, Any]
@@ -37,7 +38,7 @@ def learned_world(cfg: Cfg, root: Path) -> dict[str, Path]:
     for node in reversed(graph.nodes.values()):
         made = {part: node.inputs[part] for part in _PARTS if isinstance(node.inputs.get(part), str)}
         if len(made) == len(_PARTS) and all(graph.finished(str(stage)) for stage in made.values()):
-            return {part: graph.folder(str(stage)) / "weights.safetensors" for part, stage in made.items()}
+            return {part: graph.folder(str(stage)) / WEIGHTS for part, stage in made.items()}
     return {}
 
 

@@ -14,6 +14,7 @@ from envs.embodiment import ActionKind
 from envs.simulators.remote.engine import RemoteSimulator
 from envs.targets import ConfigError, target
 from pipeline.commands.finetune import build_finetune
+from pipeline.graph.stage import WEIGHTS
 from pipeline.loop import build_loop
 
 
@@ -36,7 +37,7 @@ def build_session_host(cfg: Mapping[str, Any], root: Path, config: ServeConfig) 
         inputs = graph.inputs("evaluate-imagined")
         folders = inputs.folder("simulator"), inputs.folder("state")
     cfg = graph.cfg  # of the data's robot, if it is a fine-tuned one, and of the world that is acted in
-    weights, states = (folder / "weights.safetensors" for folder in folders)
+    weights, states = (folder / WEIGHTS for folder in folders)
     released = cfg["simulator"].get("checkpoint") and not cfg["finetune"]["data"]
     if not weights.exists() and not released:
         raise ConfigError(

@@ -12,6 +12,7 @@ from typing import Any
 from pipeline.graph.view import ConfigView
 
 Result = Mapping[str, Any]
+WEIGHTS = "weights.safetensors"  # of a stage that has trained something
 
 
 class Place(Enum):
@@ -51,7 +52,7 @@ class Inputs:
 
     def weights(self, role: str) -> Path | None:
         """The weights that the stage of a role left, None if nobody plays it."""
-        return self.folder(role) / "weights.safetensors" if role in self.found else None
+        return self.folder(role) / WEIGHTS if role in self.found else None
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,9 @@ from envs.files import atomic
 from pipeline.evaluation.by_task import by_task, tasks_of_seeds
 from pipeline.evaluation.result import OUTCOMES, outcomes
 from pipeline.evaluation.statistics import mcnemar, rate_entry, rate_line
-from pipeline.graph.stage import Inputs, stage
+from pipeline.graph.stage import WEIGHTS, Inputs, stage
 from pipeline.stages.given import Cfg, deployed_in
 
-_WEIGHTS = "weights.safetensors"
 # By how many standard errors of the paired difference the newer policy must have succeeded less often. Trials
 # are short and RL mostly gains: whoever takes the better count goes back to the older policy by chance too
 # often.
@@ -45,8 +44,8 @@ def keep(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """
     seeds, (before, after) = outcomes(inputs.folder("known"), inputs.folder("tried"))
     kept = not got_worse(before, after)
-    with atomic(folder / _WEIGHTS) as part:
-        shutil.copyfile(inputs.folder("candidate" if kept else "incumbent") / _WEIGHTS, part)
+    with atomic(folder / WEIGHTS) as part:
+        shutil.copyfile(inputs.folder("candidate" if kept else "incumbent") / WEIGHTS, part)
     best = "tried" if after.sum() > before.sum() else "known"
     with atomic(folder / OUTCOMES) as part:
         shutil.copyfile(inputs.folder(best) / OUTCOMES, part)

@@ -13,6 +13,7 @@ from envs.targets import TARGET
 from pipeline.evaluation.measurement import followed
 from pipeline.evaluation.squares import square_errors
 from pipeline.graph.graph import Graph
+from pipeline.graph.stage import WEIGHTS
 from pipeline.markdown import markdown_table
 from pipeline.stages import collect, world
 from pipeline.stages.given import open_store
@@ -69,7 +70,7 @@ def _measured(cfg: Mapping[str, Any], root: Path, tracker: Tracker | None) -> di
     inputs = graph.inputs(name)
     store = open_store(cfg, inputs)
     held = followed(store, store.split("held_out"))
-    simulator = build_simulator(cfg, graph.folder(name) / "weights.safetensors")
+    simulator = build_simulator(cfg, graph.folder(name) / WEIGHTS)
     made = replay(simulator, store, held, bf16=cfg["simulator"]["bf16"])
     steps = tuple(step for step in STEPS if step <= made.valid.shape[1])
     return {

@@ -20,6 +20,7 @@ from envs.targets import ConfigError, target
 from pipeline.evaluation.judging import cost_text, facts_text, labelled
 from pipeline.evaluation.measurement import followed
 from pipeline.evaluation.rewards.shown import ALL, check_frames, shown_table
+from pipeline.graph.stage import WEIGHTS
 from pipeline.loop import build_loop, has_physics, last_round
 from pipeline.stages.given import datasets, learns
 
@@ -149,7 +150,7 @@ def _judge(cfg: Mapping[str, Any], root: Path) -> Judge:
     """The judge as the run's last round left it; one without weights may do without a run."""
     graph, name = build_loop(cfg, root), f"judge-{last_round(cfg)}"
     if (graph.folder(name) / "manifest.json").exists():
-        return build_judge(cfg, graph.folder(name) / "weights.safetensors").eval()
+        return build_judge(cfg, graph.folder(name) / WEIGHTS).eval()
     judge = build_judge(cfg)
     if learns(judge):
         raise ConfigError(

@@ -16,13 +16,14 @@ from torch import Tensor
 
 from envs.files import write_json, write_text
 from envs.targets import ConfigError
-from pipeline.commands.worlds.subject import WEIGHTS, Subject, weights_at
+from pipeline.commands.worlds.subject import Subject, weights_at
 from pipeline.evaluation.value.agreement import ALL, Cell, agreement, overall
 from pipeline.evaluation.value.candidates import Candidate, action_spread, candidates
 from pipeline.evaluation.value.estimate import Comparison, starts_of, task_of
 from pipeline.evaluation.value.page import build_page, table_text
 from pipeline.graph.code_version import code_of, json_digest
 from pipeline.graph.kept import Kept
+from pipeline.graph.stage import WEIGHTS
 from pipeline.loop import has_physics
 from pipeline.stages import imitation, rl
 from pipeline.stages.given import mode_of

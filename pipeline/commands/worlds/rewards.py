@@ -30,6 +30,7 @@ from pipeline.evaluation.rewards.figures import BY_PHYSICS, Truth, by_rule, chos
 from pipeline.evaluation.rewards.page import build_page, table_text
 from pipeline.graph.graph import Graph
 from pipeline.graph.kept import Kept
+from pipeline.graph.stage import WEIGHTS
 from pipeline.loop import build_loop
 from pipeline.stages.given import datasets, open_store
 from pipeline.stages.variant import variant_episodes
@@ -114,7 +115,7 @@ def _judges(cfg: Cfg, root: Path, plan: Plan, tracker: Tracker | None) -> Iterat
         mine = {**other, "judge": {**other["judge"], "rewards": worth}}
         graph = build_loop(mine, root)
         graph.run(JUDGE, tracker)
-        yield name, build_judge(graph.cfg, graph.folder(JUDGE) / "weights.safetensors").eval()
+        yield name, build_judge(graph.cfg, graph.folder(JUDGE) / WEIGHTS).eval()
 
 
 class Domain(NamedTuple):

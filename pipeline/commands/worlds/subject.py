@@ -21,13 +21,12 @@ from pipeline.evaluation.measurement import followed
 from pipeline.evaluation.result import result_of
 from pipeline.graph.code_version import code_of, json_digest
 from pipeline.graph.graph import Graph, decisive
-from pipeline.graph.stage import Inputs
+from pipeline.graph.stage import WEIGHTS, Inputs
 from pipeline.loop import build_loop, has_physics
 from pipeline.outside import KINEMATICS, files_at, fingerprint, judge_files
 from pipeline.stages.given import datasets, learns
 
 Cfg = Mapping[str, Any]
-WEIGHTS = "weights.safetensors"
 
 
 @dataclass
