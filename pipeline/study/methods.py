@@ -111,8 +111,8 @@ class Loop(Method):
     Args:
         rl: false leaves the iterations of RL out of every round: what is deployed is what was cloned, from as
             many physics episodes.
-        kept: the better of the last policy and the best before, as a last deployment says; false takes what
-            the last round's RL left, and deploys it no more.
+        kept: the last policy, or the one before if a last trial says that it got worse; false takes what
+            the last round's RL left, and tries it no more.
 
     Raises:
         ConfigError: for what RL left, without RL.
