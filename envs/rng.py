@@ -28,10 +28,10 @@ class Purpose(IntEnum):
 
     COLLECT = 0
     DEPLOY = 4_000_000
-    TRIAL = 5_000_000  # of the policy of each round, which decides whether it is kept
     PRACTICE = 6_000_000  # RL in physics
     STARTS = 8_000_000  # first frames, from which only imagination goes on
     EVALUATE = 9_000_000
+    TRIAL = 9_500_000  # of each round's policy, which decide whether it is kept
 
 
 def episode_seeds(seed: int, purpose: Purpose, count: int, offset: int = 0) -> list[int]:

@@ -15,10 +15,11 @@ from envs.episodes.formats.lerobot_columns import SUCCESS
 from envs.episodes.formats.lerobot_files import read_info
 from envs.targets import ConfigError, target
 from pipeline.acting import acting
+from pipeline.choice import Choice
 from pipeline.graph.graph import Graph
 from pipeline.graph.workers import learners_of
 from pipeline.outside import CHECKPOINT, KINEMATICS, STATE_CHECKPOINT, files_at, fingerprint, judge_files
-from pipeline.stages import collect, imitation, keep, pace, prove, rl, show, world
+from pipeline.stages import collect, imitation, pace, prove, rl, show, world
 from pipeline.stages.given import imagined_chunks
 from pipeline.stages.judging import stage as judging
 from pipeline.stages.measured import explore
@@ -132,17 +133,18 @@ def imagined_iterations(cfg: Cfg) -> int:
 def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
     data: list[str] = [graph.add("collect", collect.collect)]
     first = add_imitation(graph, cfg, data)
-    policy = best = _explore(graph, cfg, first, data)
+    policy = _explore(graph, cfg, first, data)
     starts = _extra_starts(graph, cfg) if with_rl else []
-    made, known = World(), ""
+    made, choice = World(), Choice()
     for number in range(1, last_round(cfg) + 1):
-        data = [*data, _deploy(graph, cfg, policy, number)]
-        tried = _try(graph, policy, number)
+        deployed = _deploy(graph, cfg, policy, number)
+        data = [*data, deployed]
         made = add_world(graph, cfg, data, made, number)
         inputs = {"data": data, **made.roles()}
         graph.add(f"gap-{number}", prove.gap, {**inputs, "policy": policy}, number=number)
-        policy, known = _keep(graph, policy, tried, best, known, number)
-        best = policy
+        choice = choice.or_better(graph, policy, number)
+        policy = choice.policy
+        known = choice.stage if choice.compared else deployed
         if number <= cfg["rounds"]["clone"]:
             policy = graph.add(
                 f"clone-{number}",
@@ -152,7 +154,7 @@ def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
         if with_rl:
             policy = _learn(graph, cfg, data, made, policy, number, starts, known)
     last = last_round(cfg) + 1
-    policy, _ = _keep(graph, policy, _try(graph, policy, last), best, known, last)
+    policy = choice.or_better(graph, policy, last).policy
     before = graph.add("evaluate-before", prove.evaluate_physics, {"policy": first})
     after = graph.add("evaluate-after", prove.evaluate_physics, {"policy": policy})
     _conclude(graph, data, made, first, policy, {"physics_before": before, "physics_after": after})
@@ -170,19 +172,6 @@ def _explore(graph: Graph, cfg: Cfg, policy: str, data: list[str]) -> str:
 def _deploy(graph: Graph, cfg: Cfg, policy: str, number: int) -> str:
     episodes = of_round(cfg["rounds"]["deploy"], number)
     return graph.add(f"deploy-{number}", collect.deploy, {"policy": policy}, number=number, episodes=episodes)
-
-
-def _try(graph: Graph, policy: str, number: int) -> str:
-    return graph.add(f"trial-{number}", prove.trial, {"policy": policy}, number=number)
-
-
-def _keep(graph: Graph, policy: str, tried: str, best: str, known: str, number: int) -> tuple[str, str]:
-    """The policy just tried, or the one before if it got worse, and what says how good it is."""
-    if not known:
-        return policy, tried
-    roles = {"candidate": policy, "tried": tried, "incumbent": best, "known": known}
-    kept = graph.add(f"keep-{number}", keep.keep, roles)
-    return kept, kept
 
 
 def _extra_starts(graph: Graph, cfg: Cfg) -> list[str]:

@@ -27,9 +27,6 @@ from envs.targets import ConfigError
 log = logging.getLogger(__name__)
 RETRIES = 3  # replacements of a process that may die in a row at one request
 PATIENCE = 600.0  # s for a sign of life: a frame, or an episode's layout, of a slow suite on a busy machine
-# Workers draw no windows; without this MuJoCo imports a library that does, which starts a child to look for
-# its driver, and that tells a traceback if the worker dies meanwhile.
-_BACKEND = {"MUJOCO_GL": "egl"}
 Request = tuple[str, tuple[Any, ...]]  # a method of Worker and its arguments
 
 
@@ -169,7 +166,7 @@ class WorkerProcess:
             [sys.executable, "-m", "envs.physics.worker", str(theirs.fileno())],
             pass_fds=[theirs.fileno()],
             start_new_session=True,  # a terminal's Ctrl-C is for the owner, whose end closes the pipe
-            env={**_BACKEND, **os.environ, "PYTHONPATH": os.pathsep.join(p or os.getcwd() for p in sys.path)},
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)},
         )
         theirs.close()
         self._fresh, self._said = True, None

@@ -12,6 +12,8 @@ from pathlib import Path
 
 from pipeline.chaos.life import MARK
 
+_PHYSICS = "envs.physics.worker"
+
 
 def belonging(mark: str, session: int) -> list[str]:
     """Living processes of a session or with a mark, with the beginning of their command lines."""
@@ -53,10 +55,13 @@ def kill_worker(mark: str, session: int, chance: random.Random) -> bool:
     workers = [
         line
         for line in belonging(mark, session)
-        if "envs.physics.worker" in line or ("ray::" in line and "Agent" not in line)
+        if _PHYSICS in line or ("ray::" in line and "Agent" not in line)
     ]
     if not workers:
         return False
+    worker = chance.choice(workers)
     with suppress(ProcessLookupError):  # it ended while we chose
-        os.kill(int(chance.choice(workers).split()[0]), signal.SIGKILL)
+        # Physics leads a session of its own. A library of MuJoCo's asks a child for the version of another
+        # one; outliving who asked, it would tell a traceback that is nobody's.
+        (os.killpg if _PHYSICS in worker else os.kill)(int(worker.split()[0]), signal.SIGKILL)
     return True

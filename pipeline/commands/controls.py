@@ -5,7 +5,7 @@ Beside a finished run stand, on the same evaluation seeds:
 - the loop without its RL iterations: deploy, refresh the world, clone what worked;
 - the loop whose RL learns from the true decisions alone (rl.imagined=0): the rest is as it was; left out
   where RL learns from no true ones;
-- RL in physics with as many episodes as the loop deployed;
+- RL in physics with as many episodes as the loop deployed and tried;
 - RL in physics with as many environment steps as the loop imagined;
 - filtered BC on everything that the loop recorded.
 

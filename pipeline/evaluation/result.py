@@ -8,6 +8,8 @@ from typing import Any
 
 import torch
 
+from actors.rollouts.evaluate import Outcome
+from envs.files import write_atomically
 from envs.manifest import read_manifest
 from envs.physics.suite import task_names
 from envs.targets import target
@@ -101,9 +103,20 @@ def result_of(folder: Path) -> dict[str, Any]:
     return dict(manifest["result"])
 
 
+def write_outcomes(folder: Path, outcome: Outcome) -> None:
+    """Keep what came of each seed beside what a stage returns; see `outcomes`."""
+    kept = {
+        "success": outcome.success,
+        "counted": outcome.counted,
+        "progress": outcome.progress,
+        "seeds": torch.tensor(outcome.seeds),
+    }
+    write_atomically(folder / OUTCOMES, lambda path: torch.save(kept, path))
+
+
 def outcomes(*folders: Path) -> tuple[list[int], list[torch.Tensor]]:
-    """The evaluation seeds that all of these stages evaluate_physics could count, and success bool [N] on
-    them in each.
+    """The seeds that all of these stages, which tried policies on the same ones, could count, and success
+    bool [N] on them in each.
     """
     kept = [torch.load(folder / OUTCOMES, weights_only=True) for folder in folders]
     counted = torch.stack([one["counted"] for one in kept]).all(0)

@@ -118,8 +118,9 @@ def demonstrations(cfg: Cfg, store: ClipStore) -> Tensor:
 
 
 def deployed_in(inputs: Inputs, role: str) -> int:
-    """The round in which a policy was deployed, by the role of what says how good it is, that deployment or a
-    comparison that it stood; 0 if nobody plays it. Where a newer policy got worse that is no newer round.
+    """The round in which a policy was deployed, by the role of that deployment, or of what says how good it
+    is: its trial, or a comparison that it stood; 0 if nobody plays it. Where a newer policy got worse that is
+    no newer round.
     """
     if role not in inputs.found:
         return 0

@@ -22,7 +22,7 @@ from actors.factory import (
 from actors.process import prepare_process
 from actors.rollouts.evaluate import evaluate
 from envs.episodes.filming import side_by_side, write_film
-from envs.files import write_atomically, write_text
+from envs.files import write_text
 from envs.rng import Purpose, episode_seeds
 from envs.simulators.replay import replay
 from pipeline.evaluation import measurement
@@ -37,7 +37,7 @@ from pipeline.evaluation.by_task import (
 from pipeline.evaluation.disagreement import compared
 from pipeline.evaluation.judging import episode_success, judge_both, judge_frames, judge_table
 from pipeline.evaluation.media import REST, paired_frames
-from pipeline.evaluation.result import OUTCOMES
+from pipeline.evaluation.result import write_outcomes
 from pipeline.evaluation.statistics import mean, rate, rate_entry
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import PHYSICS, WORLD, Cfg, load_world, open_store
@@ -103,7 +103,7 @@ def too_kind(result: Mapping[str, Any]) -> list[str]:
 @stage(reads=(*PHYSICS, "evaluate"), place=Place.EVALUATOR)
 def evaluate_physics(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     """Deterministic success in physics on the evaluation seeds."""
-    return _true_success(cfg, folder, inputs, _evaluated(cfg))
+    return _true_success(cfg, folder, inputs, {})
 
 
 @stage(reads=(*PHYSICS, "evaluate", "task.variants.{variant}"), place=Place.EVALUATOR)
@@ -112,45 +112,22 @@ def evaluate_variant(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
     Settings: variant, its name in task.variants.
     """
-    changes = cfg["task"]["variants"][inputs.settings["variant"]]
-    return _true_success(cfg, folder, inputs, _evaluated(cfg), changes)
+    return _true_success(cfg, folder, inputs, cfg["task"]["variants"][inputs.settings["variant"]])
 
 
-@stage(reads=(*PHYSICS, "evaluate.envs", "rounds.trial"), place=Place.EVALUATOR)
-def trial(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """Deterministic success in physics of the policy of a round, from the same rounds.trial starts in all
-    rounds. By it the stage `keep` chooses; nobody learns from it, and no evaluation begins there.
-
-    Settings: number of the round.
-    """
-    seeds = episode_seeds(cfg["seed"], Purpose.TRIAL, cfg["rounds"]["trial"])
-    found = _true_success(cfg, folder, inputs, seeds)
-    return {"round": inputs.settings["number"], **found, "physics_episodes": {"own": len(seeds)}}
-
-
-def _evaluated(cfg: Cfg) -> list[int]:
-    return episode_seeds(cfg["seed"], Purpose.EVALUATE, cfg["evaluate"]["episodes"])
-
-
-def _true_success(
-    cfg: Cfg, folder: Path, inputs: Inputs, seeds: list[int], changes: Mapping[str, Any] | None = None
-) -> dict[str, Any]:
+def _true_success(cfg: Cfg, folder: Path, inputs: Inputs, changes: Mapping[str, Any]) -> dict[str, Any]:
     """Deterministic success in physics, the suite's options changed; outcomes.pt has that of each seed."""
+    section = cfg["evaluate"]
     prepare_process(cfg["seed"], cfg["threads"])
     policy = build_policy(cfg, inputs.weights("policy"))
-    env = build_physics(cfg, at_once(cfg, min(cfg["evaluate"]["envs"], len(seeds))), changes=changes)
+    env = build_physics(cfg, at_once(cfg, section["envs"]), changes=changes)
     began = time.perf_counter()
     try:
+        seeds = episode_seeds(cfg["seed"], Purpose.EVALUATE, section["episodes"])
         outcome = evaluate(env, policy, seeds, label="physics")
     finally:
         env.close()
-    kept = {
-        "success": outcome.success,
-        "counted": outcome.counted,
-        "progress": outcome.progress,
-        "seeds": torch.tensor(seeds),
-    }
-    write_atomically(folder / OUTCOMES, lambda path: torch.save(kept, path))
+    write_outcomes(folder, outcome)
     entry = _counted(outcome.success, outcome.counted)
     return {
         "rate": rate(entry),

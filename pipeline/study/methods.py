@@ -109,8 +109,8 @@ class Loop(Method):
     """The loop's last policy.
 
     Args:
-        rl: false leaves the iterations of RL out of every round: what is deployed is what was cloned, from as
-            many physics episodes.
+        rl: false leaves the iterations of RL out of every round: what is deployed is what was cloned.
+
         kept: the last policy, or the one before if a last trial says that it got worse; false takes what
             the last round's RL left, and tries it no more.
 
@@ -134,7 +134,8 @@ class RLInPhysics(Method):
     """The same algorithm from the same first policy, in physics instead of imagination.
 
     Args:
-        equal: it takes as many "episodes" as the loop deploys, or as many environment "steps" as it imagines.
+        equal: it takes as many "episodes" as the loop deploys and tries, or as many environment "steps" as it
+            imagines.
     """
 
     def __init__(self, equal: Equal):

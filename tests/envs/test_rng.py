@@ -82,4 +82,5 @@ def test_episode_seeds_of_every_purpose() -> None:
         36_000_005,
         38_000_005,
         9_000_005,
+        39_500_005,
     ]

@@ -56,6 +56,11 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     assert set(rows) > {"before", "loop", "loop without imagined decisions", "filtered BC"}
     note = "rewarded by the suite's true progress and success, which are privileged, not by a judge"
     noted = {title for title, row in rows.items() if note in row.get("note", "")}
+    explored = json.loads(next(run.glob("stages/explore-*/manifest.json")).read_text())["result"]["episodes"]
+    spent = {title: row["physics_episodes"] - explored for title, row in rows.items()}
+    # deployments of 8, trials of 4; without RL nothing learns from the second, nor is there more to try
+    assert spent["loop"] == 2 * 8 + 3 * 4 and spent["loop without RL iterations"] == 8 + 2 * 4
+    assert spent["filtered BC"] >= 2 * 8
     assert noted == {"RL in physics, equal episodes", "RL in physics, equal steps"}
     assert "equal steps" in (run / "report.html").read_text() and controls.output.count(note) == 2
     later = json.loads((run / "wandb.json").read_text())["rows"]

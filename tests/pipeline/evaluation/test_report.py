@@ -272,6 +272,16 @@ def test_the_page_shows_how_widely_the_policy_explores_by_task(inputs: Inputs) -
     assert page.count("18/100") == 2  # of the mode and of the level
 
 
+def test_the_page_shows_which_policy_was_kept(inputs: Inputs) -> None:
+    page = build_report({}, inputs, {**result(), "verdict": "gain"})
+    table = page.split("Which policy was kept")[1].split("</table>")[0]
+    rows = [re.findall(r"<td>(.*?)</td>", row, re.DOTALL) for row in table.split("<tr")[2:]]
+    assert rows[0] == ["round 1", "40/100 = 40.0%", "10.0, 90.0", "-", "-", "-"]
+    assert rows[1] == ["after the last", "31/100 = 31.0%", "10.0, 90.0", "9", "18", "no"]
+    assert "grasp" in rows[2][0] and rows[2][1].startswith("3/100")
+    assert "Which policy was kept" not in build_report({}, inputs, {**result(trials=[]), "verdict": "gain"})
+
+
 def test_the_page_shows_controls_and_runs_without_physics(inputs: Inputs) -> None:
     row = {**entry(50), "gain": 10.0, "paired": {"gained": 12, "lost": 2, "p": 0.01}, "physics_episodes": 16}
     controls = {"before": {**entry(40), "paired": None, "physics_episodes": 0}, "filtered BC": row}

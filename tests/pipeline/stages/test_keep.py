@@ -42,10 +42,10 @@ def tried(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("before", "after", "worse"),
     [
-        (won(0, 40), won(2, 40), True),  # two lost and none gained: more than the square root of two
-        (won(0, 40), won(1, 40), False),
-        (won(0, 40), won(20, 57), False),  # 20 lost, 17 gained; chance alone takes six
-        (won(0, 40), won(20, 50), True),
+        (won(0, 40), won(5, 40), True),  # five lost and none gained: more than twice the root of five
+        (won(0, 40), won(4, 40), False),
+        (won(0, 40), won(20, 50), False),  # 20 lost, 10 gained; by two standard errors chance takes eleven
+        (won(0, 40), won(20, 47), True),
         (won(0, 40), won(20, 80), False),
         (won(0, 0), won(0, 0), False),
         (won(0, 100), won(0, 100), False),
@@ -57,7 +57,7 @@ def test_only_what_chance_does_not_explain_is_worse(before: Tensor, after: Tenso
 
 def test_the_stage_hands_on_the_policy_and_the_best_trial(tmp_path: Path) -> None:
     graph = Graph(load_config(["task.name=[push,pull]", "task=tabletop"]), tmp_path)
-    rounds = {1: (0, 60), 2: (4, 63), 3: (10, 63), 4: (0, 70)}
+    rounds = {1: (0, 60), 2: (8, 64), 3: (14, 64), 4: (0, 70)}
     names = {
         number: graph.add(f"trial-{number}", tried, first=first, last=last, round=number, uncounted=0)
         for number, (first, last) in rounds.items()
@@ -66,14 +66,14 @@ def test_the_stage_hands_on_the_policy_and_the_best_trial(tmp_path: Path) -> Non
     for number in (2, 3, 4):
         one = names[number]
         best = known = graph.add(
-            f"keep-{number}", keep, {"candidate": one, "tried": one, "incumbent": best, "known": known}
+            f"keep-{number}", keep, {"candidate": one, "tried": one, "incumbent": best, "best": known}
         )
     found = {name: row["result"] for name, row in graph.run().items() if name.startswith("keep")}
     folder = {number: graph.folder(f"keep-{number}") for number in (2, 3, 4)}
     assert [one["kept"] for one in found.values()] == [True, False, True]
-    assert (found["keep-2"]["gained"], found["keep-2"]["lost"]) == (3, 4)
-    # against round 2, which was kept, round 3 lost 6 of 59; against the best, of round 1, 10 and gained 3
-    assert (found["keep-3"]["gained"], found["keep-3"]["lost"]) == (3, 10)
+    assert (found["keep-2"]["gained"], found["keep-2"]["lost"]) == (4, 8)
+    # against the best, of round 1; round 2, which was kept, had lost some, too
+    assert (found["keep-3"]["gained"], found["keep-3"]["lost"]) == (4, 14)
     weights = [(folder[number] / "weights.safetensors").read_text() for number in (2, 3, 4)]
     assert weights == ["round 2", "round 2", "round 4"]
     # whose episodes RL goes on with, and what the next one is held against
@@ -100,7 +100,7 @@ def test_a_task_that_pays_for_the_others_is_told(tmp_path: Path) -> None:
 
     graph = Graph(load_config(["task.name=[push,pull]", "task=tabletop"]), tmp_path)
     old, new = (graph.add(f"trial-{turn}", by_turns, turn=turn) for turn in (0, 1))
-    graph.add("keep-2", keep, {"candidate": new, "tried": new, "incumbent": old, "known": old})
+    graph.add("keep-2", keep, {"candidate": new, "tried": new, "incumbent": old, "best": old})
     found = graph.run()["keep-2"]["result"]
     assert found["kept"]
     (alarm,) = found["alarms"]
@@ -111,7 +111,7 @@ def test_episodes_that_do_not_count_on_either_side_say_nothing(tmp_path: Path) -
     graph = Graph(load_config(["experiment=soak"]), tmp_path)
     old = graph.add("old", tried, first=0, last=40, round=1, uncounted=0)
     new = graph.add("new", tried, first=40, last=41, round=2, uncounted=40)
-    graph.add("keep-2", keep, {"candidate": new, "tried": new, "incumbent": old, "known": old})
+    graph.add("keep-2", keep, {"candidate": new, "tried": new, "incumbent": old, "best": old})
     found = graph.run()["keep-2"]["result"]
     assert found["kept"] and found["best"]["episodes"] == 60 and found["lost"] == 0
 
@@ -121,15 +121,15 @@ def test_trials_begin_alike_in_every_round_and_where_nothing_learns(tmp_path: Pa
     cfg = load_config(["experiment=soak", "track=disabled", "explore.levels=[]"])
     graph = build_loop(cfg, tmp_path)
     made = graph.run("trial-1")["trial-1"]["result"]
-    again = build_loop({**cfg, "evaluate": {**cfg["evaluate"], "envs": 1}}, tmp_path / "again")
-    again.run("trial-1")
-    one, other = (torch.load(g.folder("trial-1") / OUTCOMES, weights_only=True) for g in (graph, again))
-    assert all(torch.equal(one[name], other[name]) for name in one)
+    one = torch.load(graph.folder("trial-1") / OUTCOMES, weights_only=True)
     asked = episode_seeds(cfg["seed"], Purpose.TRIAL, cfg["rounds"]["trial"])
     assert one["seeds"].tolist() == asked and made["physics_episodes"] == {"own": len(asked)}
-    taken = {seed for purpose in Purpose if purpose is not Purpose.TRIAL for seed in _seeds(cfg, purpose)}
-    assert not taken & set(asked)
+    # nothing else of RL in this run hangs on them but the choice
+    assert graph.nodes["rl-1"].inputs["known"] == "deploy-1" and "trial-1" not in graph.needs("rl-1")
 
 
-def _seeds(cfg: Any, purpose: Purpose) -> list[int]:
-    return episode_seeds(cfg["seed"], purpose, 500, offset=100_000 if purpose is Purpose.DEPLOY else 0)
+def test_a_policy_that_nothing_has_changed_is_not_tried_again(tmp_path: Path) -> None:
+    cfg = load_config(["experiment=smoke", "rounds.count=3", "rounds.clone=0"])
+    graph = build_loop(cfg, tmp_path, with_rl=False)
+    assert [name for name in graph.nodes if name.startswith(("trial", "keep"))] == ["trial-1"]
+    assert graph.nodes["evaluate-after"].inputs["policy"] == "explore"
