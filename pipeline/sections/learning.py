@@ -93,9 +93,11 @@ class WorthSection:
 
 @dataclass(frozen=True)
 class RoundsSection:
-    """Section rounds."""
+    """Section rounds. Those of an experiment have 20 * 100,000 episode seeds for their deployments; `explore`
+    has the first (envs/rng.py).
+    """
 
-    count: Count
+    count: Annotated[Count, Lt(20)]
     deploy: Annotated[tuple[Count, ...], MinLen(1)]
     trial: Count
     splits: Mapping[Literal["held_out", "calibration"], Share]

@@ -34,6 +34,7 @@ from pipeline.loop import build_loop
         (["task.mode=sideways"], r"task\.mode"),
         (["collect.mix.expert=0.9"], r"collect\.mix"),
         (["rounds.deploy=[]"], r"rounds\.deploy"),
+        (["rounds.count=20"], r"rounds\.count=20 should be less than 20"),
         (["rounds.splits.held_out=0.9"], r"rounds\.splits"),
         (["rl.shards=3"], r"rl\.shards"),
         (["+foo=1"], r"foo is not a key"),
