@@ -1,9 +1,8 @@
 """Stages that let physics decide: each round's policy is tried, and left behind if it got worse.
 
-RL believes its simulator, and learns to succeed under its exploration. A policy that has learned to exploit
-the one or the other may look ever better, in imagination and in its deployments, while what it does by its
-mode, which is what people use, gets worse. So the modes are tried, from the same starts; after a loss the
-next round goes on from the policy before, in a simulator that has seen the exploit.
+RL believes its simulator, and its policies explore in it as in their deployments. One may look ever better
+there while what it does by its mode, which is what people use, gets worse. So the modes are tried, from the
+same starts; after a loss the next round goes on from the policy before, in a simulator that has seen more.
 """
 
 from __future__ import annotations
