@@ -129,7 +129,10 @@ def changed(before: dict[str, str], after: dict[str, str]) -> set[str]:
 @pytest.mark.parametrize(
     ("key", "same"),
     [
-        ("simulator.checkpoint", {"collect", "imitation", "explore", "deploy-1", "evaluate-before"}),
+        (
+            "simulator.checkpoint",
+            {"collect", "imitation", "explore", "deploy-1", "trial-1", "evaluate-before"},
+        ),
         ("simulator.kinematics.model", {"collect"}),
     ],
 )
