@@ -117,14 +117,14 @@ def test_episodes_that_do_not_count_on_either_side_say_nothing(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_trials_begin_alike_in_every_round_and_where_nothing_learns(tmp_path: Path) -> None:
+def test_trials_have_starts_of_their_own_and_the_first_rl_does_not_wait_for_them(tmp_path: Path) -> None:
     cfg = load_config(["experiment=soak", "track=disabled", "explore.levels=[]"])
     graph = build_loop(cfg, tmp_path)
     made = graph.run("trial-1")["trial-1"]["result"]
     one = torch.load(graph.folder("trial-1") / OUTCOMES, weights_only=True)
     asked = episode_seeds(cfg["seed"], Purpose.TRIAL, cfg["rounds"]["trial"])
     assert one["seeds"].tolist() == asked and made["physics_episodes"] == {"own": len(asked)}
-    # nothing else of RL in this run hangs on them but the choice
+    # what they decide is the choice alone
     assert graph.nodes["rl-1"].inputs["known"] == "deploy-1" and "trial-1" not in graph.needs("rl-1")
 
 
