@@ -163,7 +163,7 @@ def _domain(
     """The entry of rewards.json for some episodes, which `made` replays."""
     _, store, episodes, _ = domain
     truth, bf16 = truth_of(store, episodes), cfg["simulator"]["bf16"]
-    rows, curves = {}, {}
+    rows, curves = {}, dict[str, dict[str, Tensor]](progress={}, success={})
     for name, judge in judges.items():
         if name == RULE:
             videos = {"recorded": by_rule(truth)}
@@ -172,9 +172,10 @@ def _domain(
             videos = {video: _cut(scores, truth) for video, scores in views._asdict().items()}
         found = {video: figures(judge, scores, truth, cfg["seed"]) for video, scores in videos.items()}
         rows[name] = {"facts": judge.facts(), "figures": found}
-        curves[name] = videos["recorded"].progress
+        curves["progress"][name] = videos["recorded"].progress
+        curves["success"][name] = videos["recorded"].success
     if RULE not in judges:
-        curves = {"true": truth.progress, **curves}
+        curves["progress"] = {"true": truth.progress, **curves["progress"]}
     return {
         "episodes": len(episodes),
         "successes": int(truth.success.sum()),
@@ -185,7 +186,10 @@ def _domain(
                 "outcome": outcome,
                 "seed": store.episodes[int(episodes[n])]["seed"],
                 "instruction": store.instructions[int(episodes[n])],
-                "curves": {name: curve(values, truth, n) for name, values in curves.items()},
+                "curves": {
+                    part: {name: curve(values, truth, n) for name, values in some.items()}
+                    for part, some in curves.items()
+                },
             }
             for outcome, numbers in chosen(truth, drawn).items()
             for n in numbers

@@ -60,10 +60,11 @@ def lines_of(domain: Mapping[str, Any]) -> Iterator[list[str]]:
 
 
 def _charts(domain: Mapping[str, Any]) -> list[Markup]:
-    """The rewards' progress along each drawn episode, as it was recorded."""
+    """The rewards' progress, and their belief in success, along each drawn episode, as it was recorded."""
     out = []
     for drawn in domain["drawn"]:
-        curves = [Curve(name, list(range(1, len(y) + 1)), y) for name, y in drawn["curves"].items()]
         title = f"{drawn['outcome']}: {drawn['instruction']}, seed {drawn['seed']}"
-        out.append(line_chart(curves, title, "frame", "progress"))
+        for part, rewards in drawn["curves"].items():
+            curves = [Curve(name, list(range(1, len(y) + 1)), y) for name, y in rewards.items()]
+            out.append(line_chart(curves, title, "frame", part))
     return out

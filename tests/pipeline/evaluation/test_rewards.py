@@ -129,7 +129,9 @@ def test_the_command_compares_judges_on_recordings(tmp_path: Path) -> None:
     assert set(seen["rewards"]) == {"proxy", "embedding"}
     for row in seen["rewards"].values():
         assert set(row["figures"]) == {"recorded", "generated"}
-    assert {"true", "proxy", "embedding"} == set(seen["drawn"][0]["curves"])
+    drawn = seen["drawn"][0]["curves"]
+    assert {"true", "proxy", "embedding"} == set(drawn["progress"])
+    assert {"proxy", "embedding"} == set(drawn["success"])
     assert (
         "<svg" in (tmp_path / "smoke/rewards.html").read_text() and "| embedding | generated |" in out.output
     )
