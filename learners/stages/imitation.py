@@ -21,6 +21,7 @@ from actors.policies.contract import (
 from envs.episodes.clips import ClipStore
 from envs.specs import (
     IMAGE,
+    INSTRUCTION_UTF8,
     STATE,
     ActionMode,
     at_rest,
@@ -30,6 +31,7 @@ from envs.targets import ConfigError
 from learners.stages.observed import observe
 from learners.stages.pictures import augmented
 from learners.stages.simulator import last_rows
+from learners.stages.words import reworded
 from learners.training.fit import FitConfig, fit
 from learners.training.parallel import Trainee
 
@@ -106,8 +108,8 @@ class Cloning:
         return out
 
     def disturbed(self, observed: TensorDict, generator: torch.Generator) -> tuple[TensorDict, Tensor]:
-        """Observations [N] whose pictures and states are disturbed a little, for robustness; and by how much
-        things in pictures have moved, float32 [N, 2], (u, v) as shares of width and height.
+        """Observations [N] whose pictures, states and words are disturbed a little, for robustness; and by
+        how much things in pictures have moved, float32 [N, 2], (u, v) as shares of width and height.
         """
         out, moved = observed.copy(), torch.zeros(len(observed), 2)
         if IMAGE in out.keys(True, True):
@@ -115,10 +117,11 @@ class Cloning:
         state = out[STATE]
         noise = torch.randn(state.shape, generator=generator) * self.state_noise
         out[STATE] = state + noise.to(state.device)
+        out[INSTRUCTION_UTF8] = reworded(out[INSTRUCTION_UTF8], generator)
         return out, moved
 
     def loss(self, data: TensorDict, generator: torch.Generator) -> Tensor:
-        """Imitation loss of a batch of `sample`; pictures and states are disturbed a little."""
+        """Imitation loss of a batch of `sample`; pictures, states and words are disturbed a little."""
         observed, _ = self.disturbed(data["observed"], generator)
         total = imitation_loss(self.policy, with_text(observed, self.policy), data["target"])
         if "generated" not in data.keys():
