@@ -1,8 +1,8 @@
 """Instructions as policies learn from them: with words between that mean nothing.
 
 A policy learns from few different texts, so that any other word moves its encoded instruction to where it
-has never been. What is learned under such noise hangs less on the words around those that decide, and on where
-they stand. No word is left out: that was tried, and cost success where words alone tell tasks apart
+has never been. What is learned under such noise hangs less on the words around those that decide, and on
+where they stand. No word is left out: that was tried, and cost success where words alone tell tasks apart
 (docs/results/tabletop.md).
 """
 
