@@ -112,12 +112,14 @@ class Cloning:
         how much things in pictures have moved, float32 [N, 2], (u, v) as shares of width and height.
         """
         out, moved = observed.copy(), torch.zeros(len(observed), 2)
-        if IMAGE in out.keys(True, True):
+        perceived = IMAGE in out.keys(True, True)  # else features are there, and nobody reads the words again
+        if perceived:
             out[IMAGE], moved = augmented(out[IMAGE], generator)
         state = out[STATE]
         noise = torch.randn(state.shape, generator=generator) * self.state_noise
         out[STATE] = state + noise.to(state.device)
-        out[INSTRUCTION_UTF8] = reworded(out[INSTRUCTION_UTF8], generator)
+        if perceived:
+            out[INSTRUCTION_UTF8] = reworded(out[INSTRUCTION_UTF8], generator)
         return out, moved
 
     def loss(self, data: TensorDict, generator: torch.Generator) -> Tensor:

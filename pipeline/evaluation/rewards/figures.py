@@ -136,7 +136,7 @@ def _interval(rows: Any, value: Callable[[Any], Any], seed: int) -> list[float] 
 
 
 def curve(values: Tensor, truth: Truth, number: int) -> list[float]:
-    """Progress [N, T] of one episode, frame by frame, as it is written down."""
+    """Values [N, T] of one episode, frame by frame, as they are written down."""
     return [round(value, 3) for value in values[number][truth.valid[number]].tolist()]
 
 
