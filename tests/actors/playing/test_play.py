@@ -36,9 +36,9 @@ from tests.embodiments import (
     recorded_cameras,
     world_spec,
 )
-from tests.envs.physics.sections import Scriptless
 from tests.envs.simulators.test_engines import build_engine
 from tests.envs.test_world import Fixed
+from tests.suites.counting import Scriptless
 
 ACTIONS = np.array([[0.5, 0.0], [0.5, 0.0], [0.0, -1.0]])
 

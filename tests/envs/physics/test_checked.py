@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from envs.embodiment import Camera
 from envs.episodes import Episode, LeRobotWriter
 from envs.episodes.episode import EpisodeError
 from envs.physics.checked import observation
 from envs.physics.pool import PoolError, TaskPool
-from envs.physics.suite import Array, Observation, SuiteError
+from envs.physics.suite import SuiteError
 from envs.targets import ConfigError
-from tests.envs.physics.sections import Counting
+from tests.suites.counting import Saying, TwoCameras
 
-COUNTING = {"_target_": "tests.envs.physics.sections.Counting", "fault": ""}
+SUITES = "tests.suites.counting"
+COUNTING = {"_target_": f"{SUITES}.Counting", "fault": ""}
 
 
 def test_pictures_that_are_not_those_of_the_embodiment_are_refused_before_they_are_recorded() -> None:
@@ -30,35 +28,6 @@ def test_pictures_that_are_not_those_of_the_embodiment_are_refused_before_they_a
             ask(pool)
         assert not pool.lost
         pool.close()
-
-
-class TwoCameras(Counting):
-    """Counts; of its cameras the first is calibrated, and `tells` names what it says of them: "" what is
-    due, or a mistake.
-    """
-
-    def __init__(self, tells: str):
-        super().__init__("")
-        eyes = (Camera("eye", (4, 4), calibrated=True), Camera("other", (4, 4)))
-        self.embodiment, self.tells = replace(self.embodiment, cameras=eyes), tells
-
-    def render(self) -> Any:
-        return np.repeat(super().render(), 2, 0)
-
-    def observe(self) -> Observation:
-        seen = super().observe()
-        seen.intrinsic, seen.c2w = (np.stack([np.eye(n), np.full((n, n), np.nan)]) for n in (3, 4))
-        if self.tells == "nothing":
-            seen.c2w = seen.intrinsic = None
-        elif self.tells == "no poses":
-            seen.c2w = None
-        elif self.tells == "one camera":
-            seen.intrinsic = seen.intrinsic[:1]
-        elif self.tells == "nan":
-            seen.c2w[0, 1, 2] = np.nan
-        elif self.tells == "zeros":
-            seen.c2w[1] = 0.0
-        return seen
 
 
 @pytest.mark.parametrize(
@@ -77,7 +46,7 @@ class TwoCameras(Counting):
 def test_calibration_that_is_not_what_the_embodiment_says_is_refused_at_the_start(
     tells: str, said: str
 ) -> None:
-    suite = {"_target_": f"{__name__}.TwoCameras", "tells": tells}
+    suite = {"_target_": f"{SUITES}.TwoCameras", "tells": tells}
     for ask in (lambda pool: pool.script([(0, 0.0)], 1), lambda pool: pool.reset({0: 0}, False)):
         pool = TaskPool(suite, "count", 1, 8, 1)
         with pytest.raises(ConfigError, match=rf"task\.suite: TwoCameras\.observe {said}"):
@@ -87,7 +56,7 @@ def test_calibration_that_is_not_what_the_embodiment_says_is_refused_at_the_star
 
 
 def test_cameras_that_are_not_calibrated_are_nan_among_others() -> None:
-    pool = TaskPool({"_target_": f"{__name__}.TwoCameras", "tells": ""}, "count", 1, 8, 1)
+    pool = TaskPool({"_target_": f"{SUITES}.TwoCameras", "tells": ""}, "count", 1, 8, 1)
     (track,) = pool.script([(0, 0.0)], 1)
     assert pool.reset({0: 0}, False)[0]["c2w"].shape == (2, 4, 4)
     pool.close()
@@ -95,53 +64,8 @@ def test_cameras_that_are_not_calibrated_are_nan_among_others() -> None:
     assert episode.c2w is not None and np.isnan(episode.c2w[:, 1]).all() and len(episode) == 9
 
 
-SAID: dict[str, dict[str, Any]] = {
-    "lists": {"state": [3], "command": [0.0], "success": np.bool_(False), "progress": np.float32(0.25)},
-    "arrays": {"success": np.zeros(1, bool), "progress": np.full(1, 0.25), "command": np.zeros(1, int)},
-    "no state": {"state": None},
-    "long state": {"state": np.zeros(2)},
-    "words for numbers": {"command": ["left"]},
-    "no words": {"instruction": None},
-    "much progress": {"progress": 7.5},
-    "less than none": {"progress": -0.1},
-    "many progresses": {"progress": np.zeros(2)},
-    "unknown progress": {"progress": np.nan},
-    "infinite": {"state": np.array([np.inf])},
-    "numbers for success": {"success": 0.0},
-    "no arms": {"poses": np.zeros((1, 7))},
-}
-
-
-class Saying(Counting):
-    """Counts, and says of itself what SAID has under `what` from its frame `since`, and in no more than
-    `frames` of them.
-    """
-
-    def __init__(self, what: str, since: int = 0, frames: int = 99):
-        super().__init__("")
-        self.what, self.since, self.frames = what, since, frames
-        self.reset("count", 0)
-
-    def reset(self, task: str, seed: int) -> None:
-        super().reset(task, seed)
-        self.tick = 0
-
-    def step(self, action: Array) -> None:
-        super().step(action)
-        self.tick += 1
-
-    def observe(self) -> Observation:
-        now = self.since <= self.tick < self.since + self.frames
-        said = {"won": {"success": True}, "more things": {}, **SAID}[self.what] if now else {}
-        return replace(super().observe(), **said)
-
-    def privileged(self) -> dict[str, Array]:
-        many = self.what == "more things" and self.tick >= self.since
-        return {"object_poses": np.zeros((1 + many, 3))}
-
-
 def saying(what: str, **how: int) -> TaskPool:
-    return TaskPool({"_target_": f"{__name__}.Saying", "what": what, **how}, "count", 1, 8, 1)
+    return TaskPool({"_target_": f"{SUITES}.Saying", "what": what, **how}, "count", 1, 8, 1)
 
 
 @pytest.mark.parametrize(
@@ -173,17 +97,6 @@ def test_what_can_be_brought_to_the_contract_is(what: str) -> None:
     assert seen.state.shape == seen.command.shape == (1,) and seen.command.dtype == np.float64
 
 
-class Done(Counting):
-    """Counts; what seeds from 5 to 7 lay out is done before anybody acts."""
-
-    def observe(self) -> Observation:
-        return replace(super().observe(), success=self.count >= 5)
-
-    def reset(self, task: str, seed: int) -> None:
-        super().reset(task, seed)
-        self.count = float(seed if 5 <= seed < 8 else -20)
-
-
 def test_episodes_that_begin_with_their_task_done_are_dropped_and_counted(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -192,7 +105,7 @@ def test_episodes_that_begin_with_their_task_done_are_dropped_and_counted(
         lambda pool, *seeds: [seeds[slot] for slot in pool.reset(dict(enumerate(seeds)), True)],
     ):
         caplog.clear()
-        with closing(TaskPool({"_target_": f"{__name__}.Done", "fault": ""}, "count", 3, 8, 1)) as pool:
+        with closing(TaskPool({"_target_": f"{SUITES}.Done", "fault": ""}, "count", 3, 8, 1)) as pool:
             assert ask(pool, 4, 5, 8) == [4, 8] and pool.lost == [5]
             assert "Done.observe gives success=True at the start of an episode" in caplog.text
             assert "seed 5; it is dropped" in caplog.text

@@ -21,11 +21,12 @@ from envs.physics.suite import build_suite
 from envs.physics.worker import Worker, WorkerSpec
 from envs.specs import CHUNK, LOST, STATE, ActionMode, Rewards, WorldSpec
 from envs.targets import ConfigError
-from tests.envs.physics.sections import Counting, task_section
+from tests.envs.physics.sections import task_section
+from tests.suites.counting import Counting
 
 pytestmark = pytest.mark.slow
 
-SUITES = "tests.envs.physics.sections"
+SUITES = "tests.suites.counting"
 COUNTING = {"_target_": f"{SUITES}.Counting", "fault": ""}
 
 
@@ -226,7 +227,7 @@ def test_what_cannot_be_built_is_a_config_error(workers: int) -> None:
 
 
 def test_a_task_without_an_expert_is_told_at_once_and_its_random_actions_play() -> None:
-    suite = {"_target_": "tests.envs.physics.sections.Scriptless", "fault": ""}
+    suite = {"_target_": "tests.suites.counting.Scriptless", "fault": ""}
     pool = TaskPool(suite, "count", 2, 8, 2)
     mine = pool.processes()
     said = r"Scriptless\.expert has no behaviour of noise level 0\.5 for task 'count' .*nobody has written it"

@@ -41,7 +41,7 @@ def test_episodes_that_crash_physics_are_said_to_be_dropped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cfg = load_config([*SMALL, f"runs={tmp_path}"])
-    suite = {"_target_": "tests.envs.physics.sections.OddSeed", "fault": "", "tasks": ["count", "recount"]}
+    suite = {"_target_": "tests.suites.counting.OddSeed", "fault": "", "tasks": ["count", "recount"]}
     cfg["task"] |= {"suite": suite, "name": ["count", "recount"], "size": [4, 4], "horizon": 4}
     cfg["task"]["variants"], cfg["launch"]["workers"] = {}, 2
     with pytest.raises(

@@ -37,7 +37,7 @@ def test_of_several_rounds_the_newest_finished_world_is_opened(tmp_path: Path) -
     assert learned_world(cfg, tmp_path)["judge"] == graph.folder("judge-2") / "weights.safetensors"
 
 
-COUNTING = {"_target_": "tests.envs.physics.sections.Counting", "fault": ""}
+COUNTING = {"_target_": "tests.suites.counting.Counting", "fault": ""}
 
 
 def test_recordings_are_played_in_the_tasks_that_their_run_played(tmp_path: Path) -> None:

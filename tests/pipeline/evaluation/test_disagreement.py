@@ -18,8 +18,8 @@ from pipeline.evaluation.disagreement import compared, curves, worst
 from pipeline.evaluation.judging import judge_both, judge_frames, judge_recorded
 from pipeline.evaluation.statistics import rate_entry
 from tests.embodiments import ARM_DELTAS, world_spec
-from tests.envs.physics.sections import Counting
 from tests.moving_square import SIZE
+from tests.suites.counting import Counting
 
 FRAMES = 6
 NOBODY: Simulator = None  # type: ignore[assignment]  # no judge here reads its features

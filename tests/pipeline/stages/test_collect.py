@@ -18,7 +18,7 @@ from envs.targets import ConfigError
 from pipeline.config import load_config
 from pipeline.loop import build_loop
 from pipeline.stages.collect import run_recorded
-from tests.envs.physics.sections import Counting
+from tests.suites.counting import Counting
 
 
 def test_an_expert_that_fails_is_an_alarm_with_videos(tmp_path: Path) -> None:

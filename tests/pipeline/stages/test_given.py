@@ -44,8 +44,8 @@ from pipeline.stages.given import (
 )
 from pipeline.stages.variant import variant_episodes
 from tests.embodiments import ARM_DELTAS, world_spec
-from tests.envs.physics.sections import Counting
 from tests.moving_square import moving_square
+from tests.suites.counting import Counting
 
 
 def test_splits_add_up_and_none_is_empty() -> None:
@@ -91,7 +91,7 @@ def test_a_shard_that_is_spoiled_before_the_stage_ends_is_found(tmp_path: Path) 
 
 def test_an_episode_that_crashes_physics_is_left_out_of_its_split(tmp_path: Path) -> None:
     cfg = load_config(["experiment=soak", "launch.workers=2"])
-    cfg["task"] |= {"suite": {"_target_": "tests.envs.physics.sections.Counting", "fault": "exit"}}
+    cfg["task"] |= {"suite": {"_target_": "tests.suites.counting.Counting", "fault": "exit"}}
     cfg["task"] |= {"name": "count", "size": [4, 4], "horizon": 4, "mode": "absolute"}
     cfg["collect"] |= {
         "shard": 2,
@@ -120,7 +120,7 @@ def test_starts_that_crash_physics_are_dropped_and_counted(
     stage: Any, settings: dict[str, Any], made: str, tmp_path: Path
 ) -> None:
     cfg = load_config(["experiment=soak", "launch.workers=2", "extra_starts.episodes=3"])
-    suite = {"_target_": "tests.envs.physics.sections.Startless", "fault": ""}
+    suite = {"_target_": "tests.suites.counting.Startless", "fault": ""}
     cfg["task"] |= {"suite": suite, "variants": {"odd": {}}}
     cfg["task"] |= {"name": "count", "size": [4, 4], "horizon": 4, "mode": "absolute"}
     asked = {"variant": "odd", **settings}
@@ -131,7 +131,7 @@ def test_starts_that_crash_physics_are_dropped_and_counted(
 
 def test_starts_and_random_episodes_need_no_expert(tmp_path: Path) -> None:
     cfg = load_config(["experiment=soak", "launch.workers=1", "extra_starts.episodes=3"])
-    suite = {"_target_": "tests.envs.physics.sections.Scriptless", "fault": ""}
+    suite = {"_target_": "tests.suites.counting.Scriptless", "fault": ""}
     cfg["task"] |= {"suite": suite, "variants": {"odd": {}}}
     cfg["task"] |= {"name": "count", "size": [4, 4], "horizon": 4, "mode": "absolute"}
     asked = {"variant": "odd"}
@@ -204,7 +204,7 @@ def test_recordings_that_stand_task_by_task_are_shared_out_evenly(tmp_path: Path
     assert evenly(cfg, store, everything[:0], 3).tolist() == []
     for order in ("aaaaaaaaa", "abcabcabcabc"):  # the first ones are that already
         assert demonstrations(*told(order)).tolist() == list(range(7))
-    suite = {"_target_": "tests.envs.physics.sections.Counting", "fault": "", "tasks": ["do b", "do a"]}
+    suite = {"_target_": "tests.suites.counting.Counting", "fault": "", "tasks": ["do b", "do a"]}
     physics = {**cfg, "task": {**cfg["task"], "suite": suite, "name": "do b"}}
     assert tasks_of_episodes(physics, store, everything) == [f"do {word}" for word in "aaaaaaaabbbbc"]
 
