@@ -27,6 +27,7 @@ from envs.targets import ConfigError
 log = logging.getLogger(__name__)
 RETRIES = 3  # replacements of a process that may die in a row at one request
 PATIENCE = 600.0  # s for a sign of life: a frame, or an episode's layout, of a slow suite on a busy machine
+_RAISED = "raised an error:"
 Request = tuple[str, tuple[Any, ...]]  # a method of Worker and its arguments
 
 
@@ -109,16 +110,19 @@ class WorkerProcess:
     def _insist(self, request: Request, seed: int | None = None, slot: int | None = None) -> Any:
         """What a request gives that is about one episode, or none; None if physics crashes in it anew."""
         self.send(request[0], *request[1])
-        reached = False
-        for _ in range(RETRIES):
+        reached, times = False, 1
+        while times <= RETRIES:
             try:
                 return self._attempt()
             except _Died as died:
-                reached = not self._fresh
+                reached, before = not self._fresh, self._trouble
                 self._replace(died)
+            times += 1
+            if reached and seed is not None and self._trouble == before and before.startswith(_RAISED):
+                break  # word for word, in a new process and with no episode beside it: it always will
         if not reached or seed is None:
-            raise PoolError(f"{1 + RETRIES} times in a row physics worker {self.index} {self._trouble}")
-        log.warning("physics failed %d times in the episode of seed %d; it is dropped", 1 + RETRIES, seed)
+            raise PoolError(f"{times} times in a row physics worker {self.index} {self._trouble}")
+        log.warning("physics failed %d times in the episode of seed %d; it is dropped", times, seed)
         self.lost.append(seed)
         if slot is not None:
             self._episodes.pop(slot, None)
@@ -213,7 +217,7 @@ class WorkerProcess:
         if status == "broken":
             raise PoolError(f"physics worker {self.index} cannot start:\n{value}")
         if status == "error":
-            raise _Died(f"raised an error:\n{value}")
+            raise _Died(f"{_RAISED}\n{value}")
         return value
 
 
