@@ -47,14 +47,17 @@ class Controls:
 
     Args:
         robot: whose actions; numbers that belong to no arm are one more group, as an arm is.
+        travel: how far each number usually goes, float [A]: the standard deviation of absolute commands, or
+            of deltas that of themselves. A held key moves a number so far in a second, or so far an action.
+            None: by metres and radians, which recordings of a robot that says degrees do not know.
 
     Attributes:
         arms: names of the groups.
         channels: every number of the action that a person can move, in order.
     """
 
-    def __init__(self, robot: Embodiment):
-        self.robot = robot
+    def __init__(self, robot: Embodiment, travel: NDArray[Any] | None = None):
+        self.robot, self._travel = robot, travel
         self.arms = [arm.name for arm in robot.arms]
         self.channels: list[Channel] = []
         rest = set(range(robot.action_dim))
@@ -76,9 +79,11 @@ class Controls:
         for place, number in enumerate(numbers):
             raises, lowers = _KEYS[place] if place < len(_KEYS) else ("", "")
             name = self.robot.action_names[number]
-            self.channels.append(Channel(name, number, arm, self._rate(place), raises, lowers))
+            self.channels.append(Channel(name, number, arm, self._rate(place, number), raises, lowers))
 
-    def _rate(self, place: int) -> float:
+    def _rate(self, place: int, number: int) -> float:
+        if self._travel is not None and self._travel[number] > 0:
+            return float(self._travel[number])
         if self.robot.delta:
             return 1.0
         if self.robot.action_kind is ActionKind.END_EFFECTOR:

@@ -59,6 +59,7 @@ class Game:
         imagination: None where no world was learned.
         starts: of imagination, from what physics shows; None takes those that imagination has.
         recorded: what can be played.
+        travel: see Controls.
 
     Raises:
         ValueError: if there is neither physics nor imagination.
@@ -72,12 +73,13 @@ class Game:
         imagination: ImaginedSide | None,
         starts: Starts | None = None,
         recorded: Sequence[Recorded] = (),
+        travel: NDArray[Any] | None = None,
     ):
         if suite is None and imagination is None:
             raise ValueError("a game needs physics or imagination")
         self.robot, self.tasks, self.suite, self.imagination = robot, tuple(tasks), suite, imagination
         self.starts, self.recorded = starts, tuple(recorded)
-        self.controls = Controls(robot)
+        self.controls = Controls(robot, travel)
         self.task, self.seed, self.steps, self.driven_by = self.tasks[0], 0, 0, "keys"
         self.seen: Observation | None = None
         self.dreamt: Imagined | None = None

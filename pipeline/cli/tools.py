@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -44,6 +45,7 @@ def play(words: Words) -> None:
     from actors.playing.app import play as run_game
     from actors.serving.app import listening
     from actors.serving.sessions import ServeConfig
+    from envs.simulators.remote.protocol import TOKEN
     from envs.targets import options
     from pipeline.commands.play import build_game, learned_world
     from pipeline.config import load_config
@@ -61,6 +63,8 @@ def play(words: Words) -> None:
     with listening(config) as server:
         sides = " and ".join([*["physics"] * bool(cfg["task"]["suite"]), *["imagination"] * bool(world)])
         where = f"http://{config.host}:{server.getsockname()[1]}"
+        if os.environ.get(TOKEN):
+            where += f"/#token=<what ${TOKEN} says>"
         greeting = f"{sides} of {cfg['task']['name']}: open {where} in a browser, end with Ctrl-C"
         run_game(lambda: build_game(cfg, world, Path(chosen[-1]) if chosen else None), server, greeting)
 

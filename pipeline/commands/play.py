@@ -22,6 +22,7 @@ from envs.physics.checked import observation, rendered
 from envs.physics.suite import Observation, TaskSuite, build_suite, task_names, task_of
 from envs.targets import ConfigError
 from pipeline.acting import acting
+from pipeline.commands.worlds.sweep import usual_travel
 from pipeline.evaluation.by_task import tasks_told
 from pipeline.graph.stage import WEIGHTS
 from pipeline.loop import build_loop, has_physics
@@ -63,8 +64,9 @@ def build_game(cfg: Cfg, world: Mapping[str, Path], actions: Path | None = None)
     suite = build_suite(cfg["task"]["suite"]) if has_physics(cfg) else None
     recorded = _recorded(actions, robot, names, suite) if actions is not None else []
     if suite is None:
-        starts = InitialStates.of(open_clips(cfg, cfg["task"]["data"]))
-        return Game(robot, names, None, _imagination(cfg, world, starts), None, recorded)
+        store = open_clips(cfg, cfg["task"]["data"])
+        imagination = _imagination(cfg, world, InitialStates.of(store))
+        return Game(robot, names, None, imagination, None, recorded, usual_travel(store, cfg).numpy())
     tasks = tuple(dict.fromkeys((*names, *suite.tasks)))
     if not world:
         return Game(robot, tasks, suite, None, None, recorded)

@@ -108,6 +108,15 @@ def test_keys_move_what_their_names_say() -> None:
     assert driven[0] == 1.0 and base.action(driven, {}).tolist() == [0.0, *[0.3] * 15]
 
 
+def test_keys_go_as_far_as_recordings_do_whatever_the_units() -> None:
+    degrees = Controls(BIMANUAL_JOINTS, np.full(16, 40.0))
+    assert degrees.action(np.zeros(16), {6: -1.0}, 2.0)[6] == pytest.approx(-80 / 30)
+    assert degrees.action(np.zeros(16), {15: 1.0})[15] == pytest.approx(120 / 0.5 / 30)  # a gripper's range
+    metres = Controls(ARM_DELTAS, np.array([0.01, 0.02, 0.0, 0.5]))
+    pushed = metres.action(metres.start(np.zeros(4)), {0: 1.0, 1: -1.0, 2: 1.0})
+    assert pushed[:3].tolist() == pytest.approx([0.01, -0.02, 1.0])  # the last never moved in recordings
+
+
 def test_a_person_the_expert_and_a_recording_drive_physics() -> None:
     played = game()
     first = played.reset(7)
