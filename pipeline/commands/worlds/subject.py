@@ -23,10 +23,12 @@ from pipeline.graph.code_version import code_of, json_digest
 from pipeline.graph.graph import Graph, decisive
 from pipeline.graph.stage import WEIGHTS, Inputs
 from pipeline.loop import build_loop, has_physics
-from pipeline.outside import KINEMATICS, files_at, fingerprint, judge_files
+from pipeline.outside import CHECKPOINT, KINEMATICS, STATE_CHECKPOINT, files_at, fingerprint, judge_files
 from pipeline.stages.given import datasets, learns
 
 Cfg = Mapping[str, Any]
+
+_RELEASED = {"simulator": CHECKPOINT, "state": STATE_CHECKPOINT}  # keys of the config, by role
 
 
 @dataclass
@@ -36,7 +38,8 @@ class Subject:
     Args:
         cfg: the resolved config.
         graph: of the run.
-        weights: files of simulator, state and judge, by role.
+        weights: files of simulator, state and judge, by role; of released ones what the config names.
+        released: those of simulator and state that are released as they are, which no stage has trained.
         data: data sets.
         student: function evaluations of a chunk, if the simulator is a few-step student; else 0.
         pages: folder of what is measured of it.
@@ -45,13 +48,14 @@ class Subject:
     cfg: Cfg
     graph: Graph
     weights: Mapping[str, Path]
+    released: frozenset[str]
     data: list[Path]
     student: int
     pages: Path
 
     @classmethod
     def of(cls, cfg: Cfg, root: Path) -> Subject:
-        """That of a run; nothing is loaded yet.
+        """That of a run, or a released one where the run has trained none; nothing is loaded yet.
 
         Raises:
             ConfigError: if what is named is not there.
@@ -64,9 +68,11 @@ class Subject:
             else inputs.folder(role) / WEIGHTS
             for role in ("simulator", "state", "judge")
         }
+        released = released_in(cfg, weights)
+        weights |= released
         named = section["simulator"]
         made_as = stage_of(weights["simulator"]) if named else ""
-        student = 0 if made_as == "simulator" else cfg["distill"]["steps"]
+        student = 0 if made_as == "simulator" or released else cfg["distill"]["steps"]
         learned = result_of(weights["simulator"].parent)["evaluations"] if made_as == "student" else student
         if student != learned:
             raise ConfigError(
@@ -87,7 +93,8 @@ class Subject:
                 f"{missing[0]} is no LeRobot data set (yet); run the stages that record, or name data sets by"
                 " imagined.data=[folder]"
             )
-        return cls(cfg, graph, weights, data, student, pages_of(root, graph, section))
+        pages = pages_of(root, graph, section)
+        return cls(cfg, graph, weights, frozenset(released), data, student, pages)
 
     def store(self) -> ClipStore:
         """Its data sets."""
@@ -112,13 +119,26 @@ class Subject:
 
     def simulator(self, cfg: Cfg | None = None) -> Simulator:
         """The simulator, of another config than the subject's own if that is given."""
-        return _with_weights(build_simulator(cfg or self.cfg), self.weights["simulator"]).eval()
+        return self._with_weights(build_simulator(cfg or self.cfg), "simulator").eval()
 
     def decoder(self, simulator: Simulator) -> StateDecoder:
-        """The state expert on that simulator."""
-        decoder = _with_weights(build_state_decoder(self.cfg, simulator), self.weights["state"]).eval()
+        """The state expert on that simulator.
+
+        Raises:
+            ConfigError: if it is to be a released one, and the checkpoint has none, as of GE-Sim 1.
+        """
+        decoder = self._with_weights(build_state_decoder(self.cfg, simulator), "state").eval()
+        if "state" in self.released and not decoder.normalised:
+            raise ConfigError(
+                f"{STATE_CHECKPOINT}={self.weights['state']} holds no state expert; train one by `worldloop"
+                " finetune`, and name it by imagined.state=<folder>"
+            )
         decoder.attach(simulator)
         return decoder
+
+    def _with_weights(self, part: Any, role: str) -> Any:
+        """A part with its weights; a released one has its own."""
+        return part if role in self.released else _with_weights(part, self.weights[role])
 
     def generated(self, module: str) -> dict[str, Any]:
         """What videos that its simulator generates of recorded episodes depend on, beside which episodes and
@@ -157,7 +177,7 @@ class Subject:
             "simulator": f"{engine}, a student of {self.student} evaluations" if self.student else engine,
             "judge": str(self.cfg["judge"]["_target_"]).rpartition(".")[2],
             "weights": {role: str(path) for role, path in self.weights.items()},
-            "marks": {role: mark_of(path) for role, path in self.weights.items()},
+            "marks": {role: self.mark(role) for role in self.weights},
             "options": json_digest(self.cfg["simulator"]),
         }
 
@@ -169,9 +189,15 @@ class Subject:
         read = sorted({sections[role] for role in roles})
         return {
             "sections": {name: decisive(name, self.cfg[name]) for name in read},
-            "weights": {role: mark_of(self.weights[role]) for role in roles},
+            "weights": {role: self.mark(role) for role in roles},
             **(judge_files(self.cfg) if "judge" in roles else {}),
         }
+
+    def mark(self, role: str) -> str:
+        """What tells its weights from others: of released ones all files of the checkpoint."""
+        if role in self.released:
+            return json_digest(files_at(self.cfg, _RELEASED[role]))
+        return mark_of(self.weights[role])
 
 
 def round_inputs(graph: Graph, root: Path, number: int, stage: str) -> Inputs:
@@ -204,6 +230,20 @@ def pages_of(root: Path, graph: Graph, section: Mapping[str, Any]) -> Path:
     path = weights_at(graph, name, "imagined.simulator")
     place = path.parent.name if path.name == WEIGHTS else path.stem
     return root / "simulators" / (name if name in graph.nodes else f"{place}-{mark_of(path)[:8]}")
+
+
+def released_in(cfg: Cfg, weights: Mapping[str, Path]) -> dict[str, Path]:
+    """The checkpoints, by role, that are looked at as they are: that of the simulator where neither
+    imagined.simulator nor a stage of the run has weights of one, and on it that of the state expert, unless
+    imagined.state names another. With finetune.data, tuned weights are meant.
+    """
+    section, named = cfg["simulator"], cfg["imagined"]
+    if not section.get("checkpoint") or cfg["finetune"]["data"] or weights["simulator"].is_file():
+        return {}
+    found = {"simulator": section["checkpoint"]}
+    if not named["state"]:
+        found["state"] = section["state_expert"].get("checkpoint")
+    return {role: Path(path) for role, path in found.items() if path}
 
 
 def stage_of(weights: Path) -> str:
