@@ -81,8 +81,9 @@ def stages(words: Words) -> None:
 def evaluate(words: Words) -> None:
     """success of a policy: worldloop evaluate policy=<stage|folder> [world=physics|imagined]
     [variant=<one of task.variants>] experiment=...; one that needs no weights is a choice of
-    configs/policy: policy=openpi policy.url=ws://... Or all figures of a simulator and its page: worldloop
-    evaluate simulator=<stage|folder> experiment=..., which is fidelity, ewmbench and summary in turn
+    configs/policy: policy=openpi policy.url=ws://... Or, without policy=, all figures of a simulator and its
+    page: worldloop evaluate simulator=<stage|folder> experiment=..., which is fidelity, ewmbench and summary
+    in turn; a choice of configs/simulator is the run's last, or a released one
     """
     from pipeline.config import offered
 
@@ -97,16 +98,24 @@ def evaluate(words: Words) -> None:
             own["weights"] = value
         else:
             rest.append(word)
-    if simulator and len(rest) < len(words) - 1:
+    said = {word.partition("=")[0]: word.partition("=")[2] for word in words}
+    if "policy" not in said and "simulator" not in said:
         raise ConfigError(
-            f"simulator={simulator} is measured by itself: leave out policy=, world= and variant=;"
-            " `worldloop policy-value` says what it makes of policies, by imagined.simulator"
+            "say what to evaluate: policy=<stage|folder>, such as policy=imitation, or policy=<a choice of"
+            " configs/policy> as it is built; or simulator=<stage|folder>, such as simulator=simulator-1, or"
+            " simulator=<a choice of configs/simulator>, the run's last or a released one"
+        )
+    measured = simulator or "policy" not in said
+    if measured and said.keys() & {"policy", "world", "variant"}:
+        raise ConfigError(
+            f"simulator={simulator or said['simulator']} is measured by itself: leave out policy=, world= and"
+            " variant=; `worldloop policy-value` says what it makes of policies, by imagined.simulator"
         )
     cfg, root = prepared(rest)
     for group, name in (("simulator", simulator), ("policy", own["weights"])):
         if name:
             _check_named(group, name, cfg, root, rest)
-    if simulator:
+    if measured:
         from pipeline.cli.worlds import evaluate_simulator
 
         return evaluate_simulator(simulator, rest)

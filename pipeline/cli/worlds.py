@@ -61,10 +61,10 @@ def evaluate_simulator(name: str, words: Words) -> None:
     """All that is measured of a simulator without policies, and its page.
 
     Args:
-        name: a stage of the run or a folder with weights, as imagined.simulator.
+        name: a stage of the run or a folder with weights, as imagined.simulator; "" is the run's last.
         words: what else was said.
     """
-    words = [*words, f"imagined.simulator={name}"]
+    words = [*words, f"imagined.simulator={name}"] if name else words
     for measure in (fidelity, ewmbench, summary):
         measure(words)
 

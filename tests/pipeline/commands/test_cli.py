@@ -128,7 +128,19 @@ def test_mistakes_name_the_fix() -> None:
             ("evaluate", "policy=imitaton", "experiment=smoke"),
             "choice of configs/policy; did you mean imitation",
         ),
-        (("evaluate", "variant=swapped", "experiment=smoke"), "variant=swapped: this task has no variants"),
+        (
+            ("evaluate", "policy=chunk_gaussian", "variant=swapped", "experiment=smoke"),
+            "variant=swapped: this task has no variants",
+        ),
+        (("evaluate", "world=imagined", "experiment=smoke"), "say what to evaluate: policy=<stage|folder>"),
+        (
+            ("evaluate", "simulator=dit_small", "variant=swapped", "experiment=smoke"),
+            "simulator=dit_small is measured by itself: leave out policy=, world= and variant=",
+        ),
+        (
+            ("evaluate", "simulator=dit_small", "experiment=smoke", "name=never-run"),
+            "is no LeRobot data set (yet); run the stages that record",
+        ),
         (("run", "policy=openpi", "experiment=smoke"), "OpenPIPolicy cannot learn"),
         (("stage", "rl-1", "policy=openpi", "experiment=smoke"), "OpenPIPolicy cannot learn"),
         (("study", "policy=openpi", "experiment=smoke", "study.minutes=0"), "OpenPIPolicy cannot learn"),

@@ -15,6 +15,7 @@ from envs.simulators.gesim.checkpoint import load_released, load_state_network
 from envs.simulators.gesim.engine import GESimulator
 from envs.simulators.gesim.state_expert import GESimStateExpert
 from envs.targets import ConfigError
+from pipeline.cli.runs import evaluate
 from pipeline.commands.worlds.fidelity import fidelity
 from pipeline.commands.worlds.subject import Subject
 from pipeline.config import load_config
@@ -44,7 +45,9 @@ def words(tmp_path: Path) -> list[str]:
     ]
 
 
-def test_a_released_world_is_measured_and_known_by_its_files(tmp_path: Path, words: list[str]) -> None:
+def test_a_released_world_is_measured_and_known_by_its_files(
+    tmp_path: Path, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     cfg, root, checkpoint = load_config(words), tmp_path / "runs/smoke", tmp_path / "released"
     subject = Subject.of(cfg, root)
     simulator = subject.simulator()
@@ -67,7 +70,9 @@ def test_a_released_world_is_measured_and_known_by_its_files(tmp_path: Path, wor
     tensors = load_file(checkpoint / "model.safetensors")
     changed = {name: 2 * value if "proj_out" in name else value for name, value in tensors.items()}
     save_file(changed, checkpoint / "model.safetensors")
-    assert "\n0 parts were reused" in fidelity(cfg, root)
+    evaluate(words)  # without policy=, simulator=gesim is what is evaluated
+    said = capsys.readouterr().out
+    assert "\n0 parts were reused" in said and "ewmbench.html" in said and "summary.html" in said
     second = json.loads((root / "fidelity.json").read_text())
     assert all(first["marks"][role] != second["marks"][role] for role in ("simulator", "state"))
     assert first["overall"]["psnr"] != second["overall"]["psnr"]
