@@ -68,6 +68,11 @@ class Simulator(Repeated):
         tensor = next(iter((*self.parameters(), *self.buffers())), None)
         return torch.device("cpu") if tensor is None else tensor.device
 
+    @property
+    def free_places(self) -> int | None:
+        """How many more sessions it can hold now; None where nothing limits them, as here."""
+        return None
+
     # -- what an engine gives
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """Generate the frames of one chunk.

@@ -60,7 +60,8 @@ def replay(
     draw: int = 0,
     most: int | None = None,
 ) -> Replay:
-    """Generate the given episodes from their first frames on, to the end of the longest.
+    """Generate the given episodes from their first frames on, to the end of the longest. So many at once as
+    the simulator has places for; their sessions have ended when it returns.
 
     Args:
         alone: chunks after which it goes on from true frames again; None for never.
@@ -77,10 +78,11 @@ def replay(
     steps = -(-(int(store.length[episodes].max()) - 1) // (chunk * stride))
     steps = steps if most is None else min(steps, most)
     simulator.eval()
-    parts = []
-    for ids in episodes.split(side_by_side(store, 1 + steps * chunk)):
+    free, parts = simulator.free_places, []
+    together = SIDE_BY_SIDE if free is None else min(SIDE_BY_SIDE, free)
+    for ids in episodes.split(side_by_side(store, 1 + steps * chunk, together)):
         start, last = store.start[ids], store.length[ids][:, None] - 1
-        first = store.first(ids)
+        first, every = store.first(ids), torch.ones(len(ids), dtype=torch.bool)
         # Whoever asks the same simulator twice for the same draw gets the same noise.
         seeds = (ids + draw * len(store)).to(device)
         state = simulator.reset(first.to(device), seeds, capacity=1 + steps * chunk, stride=stride)
@@ -91,6 +93,7 @@ def replay(
                 past = store.at(ids[:, None].expand(-1, len(known)), known)
                 before = start[:, None] + torch.minimum(known, last)
                 past["command"] = store.commands(before, start, stride)
+                simulator.release(state, every)
                 length, room = torch.full_like(ids, len(known)), len(known) + chunk * alone
                 state = simulator.resume(past.to(device), length.to(device), seeds, room, stride)
             ahead = stride * (step * chunk + torch.arange(1, chunk + 1)[None])
@@ -106,6 +109,7 @@ def replay(
                 states = decoder.follow(state, chunk, features)
             shown = pooled(features)[:, None].cpu()
             made.append((frames.cpu(), rows, (ahead <= last), states.cpu(), shown))
+        simulator.release(state, every)
         parts.append(Replay(*(torch.cat(values, 1) for values in zip(*made, strict=True))))
     return Replay(*(torch.cat(values) for values in zip(*parts, strict=True)))
 

@@ -24,15 +24,18 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from actors.serving.sessions import SessionHost
+from envs.embodiment import Embodiment
+from envs.episodes.clips import ClipStore
 from envs.simulators import memory
 from envs.simulators.base import Simulator
 from envs.simulators.dit.engine import DiTSimulator
 from envs.simulators.remote.engine import GivenStates, RemoteError, RemoteSimulator
 from envs.simulators.remote.protocol import decode_frame, encode_frame
+from envs.simulators.replay import replay
 from envs.simulators.state_experts.base import StateDecoder
 from envs.specs import WorldSpec
 from tests.actors.serving import Running, serve_config, tiny_expert, tiny_world
-from tests.embodiments import ARM_DELTAS, BIMANUAL_JOINTS, world_spec
+from tests.embodiments import ARM_DELTAS, BIMANUAL_JOINTS, BIMANUAL_POSES, world_spec
 from tests.envs.simulators.clips import blocks, clip, first_of, future_of
 
 CONNECTION: dict[str, Any] = {"connect_s": 10.0, "deadline_s": 60.0, "retries": 1, "user": "test"}
@@ -158,6 +161,20 @@ def test_more_rows_than_places_and_many_urls(server: Running, near: DiTSimulator
         second.stop()
     with pytest.raises(ValueError, match=r"simulator\.urls"):
         remote(of=near)
+
+
+def test_a_replay_takes_no_more_places_than_there_are_and_leaves_them_free(
+    server: Running, tiny_store: Callable[[Embodiment], ClipStore]
+) -> None:
+    store = tiny_store(BIMANUAL_POSES)
+    far = RemoteSimulator(store.spec, 3, (server.url,), CONNECTION)
+    assert far.free_places == 3
+    for opened in (5, 10):  # five episodes in three places, and again
+        made = replay(far, store, torch.arange(5), GivenStates(far), bf16=False, most=1)
+        assert made.frames.shape[:2] == (5, store.spec.chunk)
+        assert server.host.opened == opened and server.host.sessions == {}
+    far.reset(store.first(torch.tensor([0])), torch.tensor([0]))
+    assert far.free_places == 2
 
 
 def test_a_reset_that_fails_leaves_nothing_behind(server: Running, near: DiTSimulator) -> None:

@@ -75,6 +75,15 @@ class RemoteSimulator(Simulator):
         self._pool = ThreadPoolExecutor(_PARALLEL)
         self._end = weakref.finalize(self, _close_all, self._connections)
 
+    @property
+    def free_places(self) -> int:
+        """See Simulator.free_places; as many as servers say that they hold, less the sessions that are open.
+
+        Raises:
+            RemoteError: if a server does not answer.
+        """
+        return len(self._free()[1])
+
     def resume(
         self, past: TensorDict, length: Tensor, seed: Tensor, capacity: int = 1, stride: int = 1
     ) -> TensorDict:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -86,6 +87,27 @@ def test_true_frames_stand_with_commands_of_the_same_stride_as_generated_ones(ti
         replay(simulator, store, torch.tensor([3, 1]), bf16=False, alone=alone, stride=2)
         told.append(simulator.told[1])
     assert torch.equal(*told)
+
+
+class Counting(Listening):
+    """Counts the sessions that are open, and how many ever were at once."""
+
+    open = most = 0
+
+    def resume(self, past: TensorDict, length: torch.Tensor, *more: Any) -> TensorDict:
+        self.open += len(past)
+        self.most = max(self.most, self.open)
+        return super().resume(past, length, *more)
+
+    def release(self, state: TensorDict, mask: torch.Tensor) -> None:
+        self.open -= int(mask.sum())
+
+
+def test_sessions_end_before_others_go_on_from_true_frames(tiny_store: Stores) -> None:
+    store = tiny_store(ARM_DELTAS)
+    simulator = Counting(store.spec)
+    replay(simulator, store, torch.tensor([3, 1]), bf16=False, alone=1)
+    assert (simulator.open, simulator.most) == (0, 2)
 
 
 def test_the_robot_is_where_it_was_recorded_unless_its_states_are_decoded(tiny_store: Stores) -> None:
