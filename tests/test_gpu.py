@@ -18,6 +18,7 @@ from envs.episodes.clips import ClipStore
 from learners.stages.distill.stage import train_student
 from learners.stages.simulator import ClipBatches, SimulatorFitConfig
 from learners.training.fit import FitConfig
+from pipeline.evaluation.fidelity.extractors import Inception
 from tests.actors.serving import Running, Stranger, serve_config, tiny_expert, tiny_world
 from tests.embodiments import ARM_JOINTS
 from tests.learners.models import stepwise_pair
@@ -73,6 +74,26 @@ def test_a_student_of_few_steps(
     batches = ClipBatches(student, store, torch.arange(4), clips, options)
     train_student(teacher, section(f"distiller/{method}"), batches, tmp_path)
     assert any(not torch.equal(value, begun[name]) for name, value in student.state_dict().items())
+
+
+class Coloured(torch.nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = torch.nn.Linear(3, 2048)
+
+    def forward(self, x: torch.Tensor, return_features: bool = False) -> torch.Tensor:
+        return self.layer(x.mean([2, 3]))  # type: ignore[no-any-return]
+
+
+def test_extractors_compute_there_and_features_come_back(tmp_path: Path) -> None:
+    torch.jit.script(Coloured()).save(str(tmp_path / "inception.pt"))
+    extractor = Inception(str(tmp_path / "inception.pt"))
+    pictures = torch.arange(3 * 3 * 64).reshape(3, 3, 8, 8).to(torch.uint8)
+    near = extractor(pictures)
+    extractor.compute_on(torch.device("cuda"))
+    far = extractor(pictures)
+    assert next(extractor._network.parameters()).is_cuda and not far.is_cuda
+    assert torch.allclose(far, near, rtol=1e-3, atol=0.1)
 
 
 def test_serve() -> None:

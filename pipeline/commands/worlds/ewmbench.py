@@ -13,6 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from actors.factory import build_judge
+from actors.process import device_of
 from envs.embodiment import EmbodimentError
 from envs.episodes.clips import ClipStore
 from envs.files import write_json, write_text
@@ -97,6 +98,8 @@ def ewmbench(cfg: Mapping[str, Any], root: Path) -> str:
     section = cfg["ewmbench"]
     # what cannot work is told before anything is measured
     extractors, subject = Extractors.of(section), Subject.of(cfg, root)
+    for looking in (extractors.patches, extractors.frames):
+        looking.compute_on(device_of(cfg))
     cfg = subject.cfg
     reader = reader_of(cfg)
     notes: list[str] = []

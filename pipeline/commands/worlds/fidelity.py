@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from actors.process import device_of
 from envs.episodes.clips import ClipStore
 from envs.files import write_json, write_text
 from envs.targets import ConfigError, build
@@ -52,6 +53,8 @@ def fidelity(cfg: Cfg, root: Path) -> str:
     tried = {} if section["grid"] is None else section["grid"]
     settled = [with_settings(cfg, settings) for settings in combinations(tried)] if tried else []
     extractors = build_extractors(section)
+    for extractor in extractors:
+        extractor.compute_on(device_of(cfg))
     for other in settled:  # options that change what the weights are of are refused here
         subject.simulator(other)
     store = subject.store()

@@ -40,9 +40,12 @@ class PatchExtractor(ABC):
 
     name: str
 
+    def compute_on(self, device: torch.device) -> None:
+        """Compute there from now on, instead of on the CPU; what has no network stays where it is."""
+
     @abstractmethod
     def __call__(self, pictures: Tensor) -> Tensor:
-        """Features float32 [N, P, D] of pictures uint8 [N, 3, H, W]."""
+        """Features float32 [N, P, D] of pictures uint8 [N, 3, H, W], both on the CPU."""
 
 
 class PyramidPatches(PatchExtractor):
@@ -82,6 +85,12 @@ class DinoPatches(PatchExtractor):
         # the class token and registers stand before the patches
         self._before = 1 + int(getattr(config, "num_register_tokens", 0))
         self.name = f"{config.model_type} patches at {side} ({fingerprint(path)})"
+        self._mean, self._spread = _colours([0.485, 0.456, 0.406]), _colours([0.229, 0.224, 0.225])
+
+    def compute_on(self, device: torch.device) -> None:
+        """See PatchExtractor.compute_on."""
+        self._network = self._network.to(device)
+        self._mean, self._spread = self._mean.to(device), self._spread.to(device)
 
     @torch.no_grad()
     def __call__(self, pictures: Tensor) -> Tensor:
@@ -89,13 +98,12 @@ class DinoPatches(PatchExtractor):
         height, width = pictures.shape[-2:]
         scale = self._side / min(height, width)
         size = [max(1, round(n * scale / self._patch)) * self._patch for n in (height, width)]
-        mean, spread = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
         out = []
         for some in pictures.split(_AT_ONCE):
-            seen = _resized(some.float() / 255, size)
-            seen = (seen - mean[:, None, None]) / spread[:, None, None]
-            out.append(self._network(pixel_values=seen).last_hidden_state[:, self._before :])
-        return torch.cat(out).float()
+            seen = _resized(some.to(self._mean.device).float() / 255, size)
+            seen = (seen - self._mean) / self._spread
+            out.append(self._network(pixel_values=seen).last_hidden_state[:, self._before :].float().cpu())
+        return torch.cat(out)
 
 
 class ClipFrames(Extractor):
@@ -111,16 +119,21 @@ class ClipFrames(Extractor):
         self._network, config = pretrained(path, ("clip",), "CLIP")
         self._side = int(config.vision_config.image_size)
         self.name = f"CLIP pictures ({fingerprint(path)})"
+        self._mean, self._spread = _colours([0.4815, 0.4578, 0.4082]), _colours([0.2686, 0.2613, 0.2758])
+
+    def compute_on(self, device: torch.device) -> None:
+        """See Extractor.compute_on."""
+        self._network = self._network.to(device)
+        self._mean, self._spread = self._mean.to(device), self._spread.to(device)
 
     @torch.no_grad()
     def __call__(self, pictures: Tensor) -> Tensor:
         """Features float32 [N, D]."""
-        mean = torch.tensor([0.4815, 0.4578, 0.4082])[:, None, None]
-        spread = torch.tensor([0.2686, 0.2613, 0.2758])[:, None, None]
         out = []
         for some in pictures.split(_AT_ONCE):
-            seen = (_resized(some.float() / 255, [self._side, self._side]) - mean) / spread
-            out.append(_embedding(self._network.get_image_features(pixel_values=seen)))
+            seen = _resized(some.to(self._mean.device).float() / 255, [self._side, self._side])
+            seen = (seen - self._mean) / self._spread
+            out.append(_embedding(self._network.get_image_features(pixel_values=seen)).cpu())
         return torch.cat(out)
 
 
@@ -246,6 +259,11 @@ def words_of(text: str) -> list[str]:
 def _grams(text: str) -> Counter[str]:
     words = words_of(text)
     return Counter([*words, *(f"{a} {b}" for a, b in pairwise(words))])
+
+
+def _colours(values: list[float]) -> Tensor:
+    """One number a colour, float32 [3, 1, 1]."""
+    return torch.tensor(values)[:, None, None]
 
 
 def _resized(pictures: Tensor, size: list[int]) -> Tensor:

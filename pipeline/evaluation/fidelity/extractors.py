@@ -33,9 +33,12 @@ class Extractor(ABC):
     clips: bool
     shortest: int = 1
 
+    def compute_on(self, device: torch.device) -> None:
+        """Compute there from now on, instead of on the CPU; what has no network stays where it is."""
+
     @abstractmethod
     def __call__(self, pictures: Tensor) -> Tensor:
-        """Features float32 [N, D]."""
+        """Features float32 [N, D], on the CPU as the pictures are."""
 
 
 class PyramidFrames(Extractor):
@@ -105,6 +108,15 @@ class _TorchScript(Extractor):
                 f" {self.title} are {(self.probe[0], self.width)}"
             )
         self.name = f"{self.title} ({hashlib.sha256(path.read_bytes()).hexdigest()[:8]})"
+        self._device = torch.device("cpu")
+
+    def compute_on(self, device: torch.device) -> None:
+        """See Extractor.compute_on."""
+        self._network, self._device = self._network.to(device), device
+
+    def _features(self, some: Tensor) -> Tensor:
+        """What the network says of pictures as it takes them, float32 [N, width] on the CPU."""
+        return self._network(some.to(self._device).float(), **self.options).float().cpu()  # type: ignore[no-any-return]
 
 
 class Inception(_TorchScript):
@@ -117,8 +129,7 @@ class Inception(_TorchScript):
     @torch.no_grad()
     def __call__(self, pictures: Tensor) -> Tensor:
         """Features float32 [N, 2048]; the network resizes by itself."""
-        parts = [self._network(some.float(), **self.options) for some in pictures.split(32)]
-        return torch.cat(parts).float()
+        return torch.cat([self._features(some) for some in pictures.split(32)])
 
 
 class I3D(_TorchScript):
@@ -131,5 +142,4 @@ class I3D(_TorchScript):
     @torch.no_grad()
     def __call__(self, pictures: Tensor) -> Tensor:
         """Features float32 [N, 400] of clips of 10 frames or more."""
-        parts = [self._network(some.float().transpose(1, 2), **self.options) for some in pictures.split(4)]
-        return torch.cat(parts).float()
+        return torch.cat([self._features(some.transpose(1, 2)) for some in pictures.split(4)])

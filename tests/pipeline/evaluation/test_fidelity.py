@@ -36,6 +36,7 @@ from pipeline.evaluation.fidelity.strides import by_stride, stride_cells
 from pipeline.evaluation.judging import thinned
 from tests.embodiments import BIMANUAL_POSES, world_spec
 from tests.moving_square import SIZE, moving_square, picture
+from tests.second_device import DEVICE, second_device
 
 
 class Drawing(Simulator):
@@ -191,6 +192,26 @@ class Strict(nn.Module):
 def scripted(path: Path, network: nn.Module) -> str:
     torch.jit.script(network).save(str(path))
     return str(path)
+
+
+class Elsewhere(nn.Module):
+    """Takes nothing that lies in main memory."""
+
+    def forward(self, x: Tensor, return_features: bool = False) -> Tensor:
+        assert x.numel() == 2 * 3 * 64 * 64 or not x.is_cpu, "still in main memory"
+        return x.mean([1, 2, 3])[:, None].expand(len(x), 2048)
+
+
+def test_networks_compute_where_they_are_told_and_features_come_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pictures = torch.full((3, 3, 32, 32), 7, dtype=torch.uint8)
+    extractor = Inception(scripted(tmp_path / "elsewhere.pt", Elsewhere()))
+    with pytest.raises(torch.jit.Error, match="still in main memory"):
+        extractor(pictures)
+    with second_device(monkeypatch):
+        extractor.compute_on(DEVICE)
+        assert torch.equal(extractor(pictures), torch.full((3, 2048), 7.0))
 
 
 def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:

@@ -44,6 +44,7 @@ from tests.arms import two_arms
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES, world_spec
 from tests.moving_square import SIZE, moving_square
 from tests.pipeline.evaluation.test_fidelity import Drawing
+from tests.second_device import DEVICE, second_device
 
 SECTION = {
     "width": 8,
@@ -195,7 +196,9 @@ def test_rays_meet_where_they_came_from() -> None:
     assert torch.allclose(off, points, atol=1e-5)
 
 
-def test_extractors_refuse_weights_of_another_architecture(tmp_path: Path) -> None:
+def test_extractors_refuse_weights_of_another_architecture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("transformers", reason="pip install -c constraints.txt 'worldloop[vlm]'")
     from transformers import CLIPConfig, CLIPModel, Dinov2Config, Dinov2Model
 
@@ -215,6 +218,12 @@ def test_extractors_refuse_weights_of_another_architecture(tmp_path: Path) -> No
     assert patches(pictures).shape == (3, 2 * 3, 16) and patches.name.startswith("dinov2 patches at 28 (")
     frames = ClipFrames(str(tmp_path / "clip"))
     assert frames(pictures).shape == (3, 8) and not torch.equal(*frames(pictures)[:2])
+    near = [extractor(pictures) for extractor in (patches, frames)]
+    with second_device(monkeypatch):  # where launch.device says
+        for extractor, features in zip((patches, frames), near, strict=True):
+            extractor.compute_on(DEVICE)
+            assert {part.device for part in extractor._network.parameters()} == {DEVICE}
+            assert torch.allclose(extractor(pictures), features, atol=1e-5)
     with pytest.raises(ConfigError, match="of another architecture: clip, and DINOv2 is one of"):
         DinoPatches(str(tmp_path / "clip"))
     with pytest.raises(ConfigError, match="of another architecture: dinov2, and CLIP"):
