@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from annotated_types import MinLen
@@ -58,13 +58,17 @@ def train_simulator(
     newest: Tensor | None = None,
     fresh: bool = True,
     look: Callable[[int], None] | None = None,
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """Train `simulator` in place on the given episodes of a store.
 
     Args:
         newest: episodes that `recent_fraction` speaks of.
         fresh: whether it has not been trained before; it then takes its units from these episodes first.
         look: as in `fit`.
+
+    Returns:
+        What `fit` does, and if its loss takes something from the weights (Simulator.lost_in_training), that
+        as the alarm, which is also printed before anything is learned.
 
     Raises:
         EpisodeError: if no recorded picture follows another, so that there is nothing to continue.
@@ -83,11 +87,13 @@ def train_simulator(
         order = torch.randperm(len(episodes), generator=step_generator(options.seed, options.steps))
         simulator.fit_camera_statistics(store.frames(store.start[episodes[order[:_FIRST_FRAMES]]]))
 
-    if simulator.lost_in_training and leads():
-        tqdm.write(f"simulator: {simulator.lost_in_training}")
+    lost = simulator.lost_in_training
+    if lost and leads():
+        tqdm.write(f"simulator: {lost}")
     batch = ClipBatches(simulator, store, episodes, config, options, newest)
     with low_rank(simulator, config.lora):
-        return fit("simulator", simulator, batch, simulator.loss, options, folder, look=look)
+        stats = fit("simulator", simulator, batch, simulator.loss, options, folder, look=look)
+    return {**stats, **({"alarm": lost} if lost else {})}
 
 
 @dataclass(frozen=True)

@@ -176,7 +176,7 @@ def _scenes(cfg: Mapping[str, Any], inputs: Inputs, imagined: Mapping[str, Any])
 
 def _alarms(finished: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """What stages were alarmed by, each with the stage's name: RL that goes nowhere, tokenizers that keep
-    little.
+    little, simulators whose few steps training takes out.
     """
     out = []
     for name, entry in finished.items():

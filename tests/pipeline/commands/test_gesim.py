@@ -86,7 +86,9 @@ def test_finetune_a_checkpoint_distil_it_again_and_serve_what_came_of_it(
     done = graph.run()
     assert set(done) == {"simulator", "student", "state"}
     said, alarm = capsys.readouterr().out, done["student"]["result"]["alarm"]
-    assert "these weights sample in 4 distilled steps, and flow matching takes that out" in said
+    lost = done["simulator"]["result"]["alarm"]
+    assert "these weights sample in 4 distilled steps, and flow matching takes that out" in lost
+    assert lost in said
     assert alarm in said and "lacks [2, 3, 4] of finetune.simulator.strides" in alarm
     rows = [json.loads(line) for line in (graph.folder("student") / "metrics.jsonl").open()]
     assert "distill/critic" in rows[0] and "distill/matching" in rows[1]
