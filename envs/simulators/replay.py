@@ -14,6 +14,7 @@ from envs.simulators import memory
 from envs.simulators.base import Simulator
 from envs.simulators.features import pooled
 from envs.simulators.state_experts.base import StateDecoder
+from envs.targets import ConfigError
 
 SIDE_BY_SIDE = 32  # episodes at most
 _ROOM = 2**32  # bytes of pictures that they may hold, all of it on the simulator's device
@@ -65,15 +66,22 @@ def replay(
 
     Args:
         alone: chunks after which it goes on from true frames again; None for never.
-        decoder: decodes the robot's states along the way, as in imagination; without one they are the
-            recorded ones, so that the simulator alone is to blame for what differs.
+        decoder: decodes the robot's states along the way, as in imagination, at stride 1; without one they
+            are the recorded ones, so that the simulator alone is to blame for what differs.
         stride: recorded frames from one generated frame to the next; T is then so many times smaller.
         draw: number of the sample; each draws noise of its own.
         most: chunks to generate at most; None for whole episodes.
 
     Raises:
+        ConfigError: if a state expert is to decode at another stride than it has learned.
         EpisodeError: if an episode has no picture at its first frame.
     """
+    if decoder is not None and stride != 1:
+        raise ConfigError(
+            f"simulator.state_expert: {type(decoder).__name__} has learned states of every frame (state_fit"
+            f" and finetune.state know no strides), and stride={stride} is asked for; replay at stride 1, or"
+            " without a decoder, so that states are the recorded ones, as fidelity.strides does"
+        )
     device, chunk = simulator.device, simulator.spec.chunk
     steps = -(-(int(store.length[episodes].max()) - 1) // (chunk * stride))
     steps = steps if most is None else min(steps, most)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import pytest
 import torch
 from tensordict import TensorDict
 
@@ -14,9 +15,10 @@ from envs.simulators import memory
 from envs.simulators.base import Simulator
 from envs.simulators.replay import future_of, replay
 from envs.specs import WorldSpec
+from envs.targets import ConfigError
 from learners.stages.generated import generated_frames
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_POSES
-from tests.learners.models import simulator_of
+from tests.learners.models import decoder_of, simulator_of
 
 Stores = Callable[[Embodiment], ClipStore]
 
@@ -87,6 +89,17 @@ def test_true_frames_stand_with_commands_of_the_same_stride_as_generated_ones(ti
         replay(simulator, store, torch.tensor([3, 1]), bf16=False, alone=alone, stride=2)
         told.append(simulator.told[1])
     assert torch.equal(*told)
+
+
+def test_states_are_decoded_at_the_stride_that_their_expert_has_learned(tiny_store: Stores) -> None:
+    store = tiny_store(BIMANUAL_POSES)
+    simulator, some = simulator_of("unet_small", store.spec), torch.tensor([1])
+    expert = decoder_of("unet_small", simulator)
+    assert torch.isfinite(replay(simulator, store, some, expert, bf16=False, most=1).states).all()
+    with pytest.raises(
+        ConfigError, match=r"simulator\.state_expert: StateHead .*stride=2 .*without a decoder"
+    ):
+        replay(simulator, store, some, expert, bf16=False, stride=2, most=1)
 
 
 class Counting(Listening):
