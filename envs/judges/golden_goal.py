@@ -101,12 +101,12 @@ class GoldenGoalJudge(GoalJudge):
             some = rows[begin : begin + _AT_ONCE]
             # From the content alone: whoever asks about the same episode gets the same goal.
             seeds = torch.tensor([int.from_bytes(keys[row][:5], "big") for row in some])
-            golden = self.text_world.imagine(first[some], [instruction[row] for row in some], seeds)
-            ends = golden.frames[torch.arange(len(some)), golden.goal.cpu()]
-            for row, end, finished in zip(some, ends, golden.finished.tolist(), strict=True):
-                found[keys[row]] = (end.clone(), finished)
+            texts = [instruction[row] for row in some]
+            ends, finished = self.text_world.imagine_goals(first[some], texts, seeds)
+            for row, end, ended in zip(some, ends, finished.tolist(), strict=True):
+                found[keys[row]] = (end.clone(), ended)
                 self.imagined += 1
-                self.unfinished += not finished
+                self.unfinished += not ended
         for key, goal in found.items():
             self._known[key] = goal
             self._known.move_to_end(key)

@@ -12,6 +12,7 @@ from torch import Tensor
 from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge, MissingFeatures, ask
 from envs.judges.labels import progress_to_success, success_labels
+from envs.simulators.replay import side_by_side
 from envs.specs import Status
 from envs.targets import ConfigError
 from learners.stages.pictures import augment
@@ -182,7 +183,7 @@ def train_judge(
 
 @torch.no_grad()
 def judge_recordings(
-    judge: Judge, store: ClipStore, episodes: Tensor, features: Tensor | None = None, batch: int = 32
+    judge: Judge, store: ClipStore, episodes: Tensor, features: Tensor | None = None
 ) -> Tensor:
     """Success probabilities of recorded episodes, frame by frame, float32 [N, T]; 0 where they are over or of
     which there is no picture, NaN throughout those that the judge could not judge.
@@ -192,12 +193,12 @@ def judge_recordings(
     """
     rows, valid = store.whole(episodes)
     valid = valid & store.arrays["present"][rows]
-    first = store.frames(store.start[episodes])
     parts = []
-    for some in torch.arange(len(episodes)).split(batch):
+    for some in torch.arange(len(episodes)).split(side_by_side(store, 1 + rows.shape[1])):
+        first = store.frames(store.start[episodes[some]])
         texts = [store.instructions[number] for number in episodes[some].tolist()]
         seen = () if features is None else (features[some],)
-        judgement = ask(judge, store.frames(rows[some]), first[some], texts, *seen)
+        judgement = ask(judge, store.frames(rows[some]), first, texts, *seen)
         known = (judgement.status == Status.OK.value).unsqueeze(-1)
         parts.append(torch.where(known, valid[some] * judgement.success.float(), torch.nan))
     return torch.cat(parts)

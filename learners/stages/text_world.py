@@ -12,6 +12,7 @@ from torch import Tensor
 
 from envs.episodes.clips import ClipStore
 from envs.ranges import Count
+from envs.simulators.replay import side_by_side
 from envs.simulators.tokens.text_world import TextWorld
 from envs.targets import ConfigError
 from learners.stages.threshold import as_likely_as_not
@@ -113,9 +114,7 @@ def longest_of(store: ClipStore, episodes: Tensor, stride: Count) -> int:
     return max(1, -(-5 * slowest // (4 * stride)))
 
 
-def calibrate_ending(
-    world: TextWorld, store: ClipStore, episodes: Tensor, stride: Count, batch: int = 32
-) -> bool:
+def calibrate_ending(world: TextWorld, store: ClipStore, episodes: Tensor, stride: Count) -> bool:
     """Set the threshold by which golden trajectories end where a frame is as likely done as not, on recorded
     video of successes and failures that it has not learned from, of which it is too sure.
 
@@ -137,7 +136,7 @@ def calibrate_ending(
     if not known.any():
         return False
     predicted = []
-    for some in torch.arange(len(episodes)).split(batch):
+    for some in torch.arange(len(episodes)).split(side_by_side(store, 1 + rows.shape[1])):
         first = store.start[episodes[some]][:, None]
         frames = store.frames(torch.cat((first, rows[some]), 1))
         texts = [store.instructions[number] for number in episodes[some].tolist()]

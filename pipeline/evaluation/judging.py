@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -13,9 +13,11 @@ from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge, ask
 from envs.simulators.base import Simulator
 from envs.simulators.features import features_of_episodes
-from envs.simulators.replay import Replay
+from envs.simulators.replay import Replay, side_by_side
 from envs.specs import Status
 from pipeline.evaluation.statistics import confusion
+
+_AT_ONCE = 16  # episodes judged in one pass, at most
 
 
 class Scores(NamedTuple):
@@ -55,7 +57,6 @@ def thinned(judge: Judge, every: int) -> Iterator[Judge]:
         judge.hold = hold
 
 
-@torch.no_grad()
 def judge_frames(
     judge: Judge,
     frames: Tensor,
@@ -63,7 +64,6 @@ def judge_frames(
     store: ClipStore,
     episodes: Tensor,
     features: Tensor | None = None,
-    batch: int = 16,
 ) -> Scores:
     """What the judge says of frames uint8 [N, T, V, 3, H, W] of these episodes. Past an episode's end it is
     shown the last frame again, so that what did not happen decides nothing.
@@ -72,18 +72,11 @@ def judge_frames(
         valid: bool [N, T], frames that exist, the first ones.
         features: float32 [N, C, D] of their chunks, see Judge.score; used by a judge that reads them.
     """
-    device, scores = judge.threshold.device, []
-    if judge.reads_features and features is not None:
-        features = until_end(features, valid[:, :: store.spec.chunk])
-    for begin in range(0, len(episodes), batch):
-        some = slice(begin, begin + batch)
-        first = store.frames(store.start[episodes[some]])
-        texts = [store.instructions[n] for n in episodes[some].tolist()]
-        seen = (features[some].to(device),) if judge.reads_features and features is not None else ()
-        shown = until_end(frames[some], valid[some])
-        verdict = ask(judge, shown.to(device), first.to(device), texts, *seen)
-        scores.append([value.cpu() for value in verdict])
-    return Scores(*(torch.cat(parts) for parts in zip(*scores, strict=True)))
+
+    def shown(some: slice) -> Tensor:
+        return until_end(frames[some], valid[some])
+
+    return _judge(judge, shown, valid, store, episodes, features)
 
 
 def until_end(values: Tensor, valid: Tensor) -> Tensor:
@@ -108,9 +101,33 @@ def judge_recorded(
         valid, features: as of `judge_frames`.
     """
     rows = until_end(rows, valid)
-    scores = judge_frames(judge, store.frames(rows), valid, store, episodes, features)
+    scores = _judge(judge, lambda some: store.frames(rows[some]), valid, store, episodes, features)
     seen = store.arrays["present"][rows]
     return scores._replace(success=torch.where(seen, scores.success, 0.0))
+
+
+@torch.no_grad()
+def _judge(
+    judge: Judge,
+    shown: Callable[[slice], Tensor],
+    valid: Tensor,
+    store: ClipStore,
+    episodes: Tensor,
+    features: Tensor | None,
+) -> Scores:
+    """What the judge says of `shown` frames, made or read for a few episodes at a time; see judge_frames."""
+    device, scores = judge.threshold.device, []
+    if judge.reads_features and features is not None:
+        features = until_end(features, valid[:, :: store.spec.chunk])
+    size = side_by_side(store, 1 + valid.shape[1], _AT_ONCE)
+    for begin in range(0, len(episodes), size):
+        some = slice(begin, begin + size)
+        first = store.frames(store.start[episodes[some]])
+        texts = [store.instructions[n] for n in episodes[some].tolist()]
+        seen = (features[some].to(device),) if judge.reads_features and features is not None else ()
+        verdict = ask(judge, shown(some).to(device), first.to(device), texts, *seen)
+        scores.append([value.cpu() for value in verdict])
+    return Scores(*(torch.cat(parts) for parts in zip(*scores, strict=True)))
 
 
 def judge_table(

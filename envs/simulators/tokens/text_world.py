@@ -137,6 +137,24 @@ class TextWorld(nn.Module):
             instruction: B texts.
             seed: int64 [B]; an episode is the same in any batch.
         """
+        tokens, done, goal, finished = self._continue(first, instruction, seed)
+        frames = torch.cat([to_bytes(self.video.decode(new)) for new in tokens.split(1, 1)], 1)
+        return GoldenTrajectory(*(part.to(first.device) for part in (frames, done, goal, finished)))
+
+    @torch.no_grad()
+    def imagine_goals(self, first: Tensor, instruction: Sequence[str], seed: Tensor) -> tuple[Tensor, Tensor]:
+        """The frames uint8 [B, V, 3, H, W] with which golden trajectories end, and `finished` bool [B]; as of
+        `imagine`, of whose other frames none is decoded.
+        """
+        tokens, _, goal, finished = self._continue(first, instruction, seed)
+        ends = tokens[torch.arange(len(goal), device=goal.device), goal]
+        frames = to_bytes(self.video.decode(ends[:, None]))[:, 0]
+        return frames.to(first.device), finished.to(first.device)
+
+    def _continue(
+        self, first: Tensor, instruction: Sequence[str], seed: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Golden trajectories as tokens int64 [B, T, P, F], and what else a GoldenTrajectory says of them."""
         device = next(self.parameters()).device
         cond, known = self.reader(instruction), self.video.net.memory()
         self.video.net.observe(self.video.encode(first[:, None].to(device)), cond, None, known)
@@ -158,8 +176,7 @@ class TextWorld(nn.Module):
         every = torch.stack(done, 1)
         over = every > self.threshold
         goal = torch.where(ended, over.long().argmax(1), over.shape[1] - 1)
-        frames = torch.cat([to_bytes(self.video.decode(new[:, None])) for new in tokens], 1)
-        return GoldenTrajectory(*(part.to(first.device) for part in (frames, every, goal, ended)))
+        return torch.stack(tokens, 1), every, goal, ended
 
     @torch.no_grad()
     def redraw(self, frames: Tensor) -> Tensor:
@@ -173,8 +190,11 @@ class TextWorld(nn.Module):
         """
         cond, known = self.reader(instruction), self.video.net.memory()
         tokens = self.video.encode(frames.to(cond.device))
-        features = [self.video.net.observe(one, cond, None, known) for one in tokens.split(1, 1)]
-        return torch.cat([self.video.done(seen.float()) for seen in features], 1).to(frames.device)
+        said = [
+            self.video.done(self.video.net.observe(one, cond, None, known).float())
+            for one in tokens.split(1, 1)
+        ]
+        return torch.cat(said, 1).to(frames.device)
 
     @torch.no_grad()
     def done(self, frames: Tensor, instruction: Sequence[str]) -> Tensor:

@@ -82,6 +82,8 @@ def test_the_goal_is_the_first_frame_that_is_done_and_then_it_rests() -> None:
         if golden.finished[row]:
             assert bool((golden.frames[row, goal:] == golden.frames[row, goal]).all())
     assert golden.frames.shape[1] == int(golden.goal.max()) + 1
+    ends, finished = model.imagine_goals(first, TEXTS[:1] * 8, seeds)
+    assert torch.equal(ends, golden.frames[seeds, golden.goal]) and torch.equal(finished, golden.finished)
     turned = model.imagine(first, TEXTS[:1] * 8, seeds.flip(0))
     assert torch.equal(turned.goal.flip(0), golden.goal)
     assert torch.equal(turned.frames.flip(0), golden.frames)

@@ -11,6 +11,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+import envs.simulators.replay as replaying
 from envs.embodiment import Embodiment
 from envs.episodes import LeRobotWriter
 from envs.episodes.clips import ClipStore
@@ -48,6 +49,23 @@ def test_a_judge_learns_who_succeeded(
     right = judge.episode(success, store.whole(unseen)[1])
     truth = torch.tensor([store.episodes[n]["success"] for n in unseen.tolist()])
     assert float((right == truth).float().mean()) >= 0.8
+
+
+def test_as_many_recordings_are_judged_at_once_as_have_room(
+    tiny_store: Stores, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, read = tiny_store(ARM_DELTAS), list[tuple[int, ...]]()
+    judge, every, frames = judge_of(store.spec), torch.arange(5), store.frames
+
+    def reading(rows: torch.Tensor) -> torch.Tensor:
+        read.append(tuple(rows.shape))
+        return frames(rows)
+
+    together = judge_recordings(judge, store, every)
+    monkeypatch.setattr(store, "frames", reading)
+    monkeypatch.setattr(replaying, "_ROOM", 1)
+    assert torch.allclose(judge_recordings(judge, store, every), together, atol=1e-5)
+    assert read == [(1,), (1, together.shape[1])] * 5
 
 
 def test_a_judge_learns_who_succeeded_from_a_simulators_features(tiny_store: Stores, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import pytest
 import torch
 from torch import nn
 
+import envs.simulators.replay as replaying
 from envs.embodiment import Embodiment
 from envs.episodes import LeRobotWriter
 from envs.episodes.clips import ClipStore
@@ -52,10 +53,10 @@ class Sees(nn.Module):
     def __init__(self, shift: float):
         super().__init__()
         self.register_buffer("threshold", torch.tensor(0.9))
-        self.shift, self.seen = shift, 0
+        self.shift, self.asked = shift, list[tuple[int, ...]]()
 
     def done_along(self, frames: torch.Tensor, instruction: Sequence[str]) -> torch.Tensor:
-        self.seen += frames.shape[1]
+        self.asked.append(tuple(frames.shape))
         light = frames[:, :, 0].float().mean(2)  # of the main view, [B, T, H, W]
         light = (light - light.amin((2, 3), keepdim=True)).square()
         down = torch.linspace(0, 1, light.shape[2])[:, None]
@@ -79,6 +80,20 @@ def test_a_trajectory_ends_where_recorded_frames_are_as_likely_done_as_not(tiny_
     model = world(ending={"threshold": 0.97})
     lean(model, -3.0)  # of every frame the same, which rises with nothing
     assert not calibrate_ending(model, store, every, 2) and float(model.threshold) == pytest.approx(0.97)
+
+
+def test_as_many_episodes_are_looked_at_at_once_as_have_room(
+    tiny_store: Stores, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, together, apart = tiny_store(ARM_DELTAS), Sees(0.0), Sees(0.0)
+    every = torch.arange(len(store))
+    assert calibrate_ending(together, store, every, 2)  # type: ignore[arg-type]
+    (shape,) = together.asked
+    maps = 2 if store.spec.pose_map else 1
+    monkeypatch.setattr(replaying, "_ROOM", 3 * maps * math.prod(shape[1:]))  # of three episodes
+    assert calibrate_ending(apart, store, every, 2)  # type: ignore[arg-type]
+    assert [count for count, *_ in apart.asked] == [len(some) for some in every.split(3)]
+    assert torch.equal(apart.threshold, together.threshold)
 
 
 def test_what_is_said_along_a_video_hangs_on_the_frames_before_it() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+import envs.simulators.replay as replaying
 from envs.episodes.clips import ClipStore
 from envs.judges.base import Judge, Judgement
 from envs.judges.fitted import FittedJudge
@@ -46,6 +47,8 @@ class Store:
         self.pictures = bright.flatten()[:, None, None, None, None].expand(-1, 1, 3, 2, 2).clone()
         self.arrays = {"present": torch.ones(3 * FRAMES, dtype=torch.bool)}
         self.start = torch.arange(3) * FRAMES
+        self.spec = world_spec(ARM_DELTAS.at(SIZE), SIZE, chunk=2)
+        self.read: list[tuple[int, ...]] = []
         self.instructions = ["do a", "do b", "do a"]
         self.episodes: list[dict[str, Any]] = [
             {"seed": 10 + n, "source": "noisy", "instruction": text, "success": success}
@@ -53,6 +56,7 @@ class Store:
         ]
 
     def frames(self, rows: torch.Tensor) -> torch.Tensor:
+        self.read.append(tuple(rows.shape))
         return self.pictures[rows]
 
 
@@ -128,7 +132,6 @@ def test_a_judge_is_shown_nothing_past_an_episodes_end() -> None:
     picture.
     """
     store: ClipStore = Store()  # type: ignore[assignment]
-    store.spec = world_spec(ARM_DELTAS.at(SIZE), SIZE, chunk=2)
     judge, made = Doubtful(), replayed([[0, 0, 128, 128, 128], [0, 0, 0, 255, 128]])
     valid = torch.arange(5) < torch.tensor([[2], [4]])
     features = torch.arange(6.0).reshape(2, 3, 1)
@@ -141,6 +144,18 @@ def test_a_judge_is_shown_nothing_past_an_episodes_end() -> None:
     rows = torch.arange(2)[:, None] * FRAMES + torch.arange(1, FRAMES)  # as long strides show an end
     dark = judge_recorded(judge, store, torch.arange(2), rows, torch.arange(5).expand(2, -1) < 3, features)
     assert dark.success.round().sum() == 0
+
+
+def test_as_many_recorded_episodes_are_read_at_once_as_have_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    store: ClipStore = Store()  # type: ignore[assignment]
+    every, rows = torch.arange(3), torch.arange(3)[:, None] * FRAMES + torch.arange(1, FRAMES)
+    given = (Brightness(), store, every, rows, torch.ones(3, FRAMES - 1) > 0)
+    together = judge_recorded(*given)
+    monkeypatch.setattr(replaying, "_ROOM", 1)
+    store.read.clear()  # type: ignore[attr-defined]
+    for one, other in zip(judge_recorded(*given), together, strict=True):
+        assert torch.equal(one, other)
+    assert store.read == [(1,), (1, FRAMES - 1)] * 3  # type: ignore[attr-defined]
 
 
 def test_recorded_frames_without_a_picture_show_no_success() -> None:
