@@ -69,6 +69,13 @@ class STBlock(nn.Module):
         self.space, self.time = TokenAttention(width, heads), TokenAttention(width, heads)
         self.ff = FeedForward(width, ratio)
 
+    def forward(self, x: Tensor, y: Tensor, cond: Tensor, causal: bool) -> tuple[Tensor, Tensor]:
+        """Both streams of a clip after the block: its T known frames [B, T, P, width], and those asked for
+        [B, T - 1, P, width]; see observe and predict.
+        """
+        x, known = self.observe(x, cond, FrameCache(), 0)
+        return x, self.predict(y, cond[:, 1:], known, causal)
+
     def observe(self, x: Tensor, cond: Tensor, cache: FrameCache, first: int) -> tuple[Tensor, Keys]:
         """Known frames [B, T, P, width], the first of which has number `first`, after the block; and the keys
         and values of time [B, P, heads, n, head_dim] of those in the cache and of these, which go into it.

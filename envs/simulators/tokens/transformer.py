@@ -11,6 +11,7 @@ from typing import cast
 
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from envs.ranges import Count
 from envs.simulators.row_linear import RowLinear, row_linear
@@ -33,6 +34,7 @@ class Trunk:
         width: numbers of a token.
         heads: of every attention; a divisor of the width.
         ratio: of the feed-forward's width to the tokens'.
+        checkpointing: compute blocks anew in the backward pass instead of keeping what they computed.
 
     Raises:
         ValueError: if the width is no multiple of the heads with an even number of channels each.
@@ -42,6 +44,7 @@ class Trunk:
     width: Count
     heads: Count
     ratio: Count
+    checkpointing: bool
 
     def __post_init__(self) -> None:
         if self.width % (2 * self.heads):
@@ -125,7 +128,7 @@ class SpatioTemporalTransformer(nn.Module):
 
     def __init__(self, vocabulary: Vocabulary, trunk: Trunk, window: int, conditioning: Conditioning):
         super().__init__()
-        self.vocabulary, width, v = vocabulary, trunk.width, vocabulary
+        self.vocabulary, self.trunk, width, v = vocabulary, trunk, trunk.width, vocabulary
         self.embed = nn.Embedding(v.factors * v.codes, width)
         signs = bit_signs(v.bits)
         with torch.no_grad():  # codes that differ in few bits mean much the same: they begin close together
@@ -157,9 +160,11 @@ class SpatioTemporalTransformer(nn.Module):
         """
         x = self._input(tokens, beside)
         y = self._input(shown, None if beside is None else beside[:, 1:]) + self.query
-        for block, cache in self._each(self.memory()):
-            x, known = block.observe(x, cond, cache, 0)
-            y = block.predict(y, cond[:, 1:], known, causal)
+        for block in self.blocks:
+            if self.trunk.checkpointing and torch.is_grad_enabled():
+                x, y = checkpoint(block, x, y, cond, causal, use_reentrant=False)
+            else:
+                x, y = block(x, y, cond, causal)
         return self._logits(y, tokens[:, :-1]), self.norm_seen(x)
 
     # -- rollouts, frame by frame

@@ -27,7 +27,7 @@ CHUNK = 3
 
 def net(conditioning: Conditioning, window: int) -> SpatioTemporalTransformer:
     torch.manual_seed(0)
-    made = SpatioTemporalTransformer(VOCABULARY, Trunk(2, 32, 2, 2), window, conditioning)
+    made = SpatioTemporalTransformer(VOCABULARY, Trunk(2, 32, 2, 2, False), window, conditioning)
     for parameter in made.parameters():
         if not parameter.any():
             torch.nn.init.normal_(parameter, std=0.2)
@@ -175,6 +175,21 @@ def test_seeds_draw_and_commands_tell() -> None:
     future["commands"][1] += 3.0
     told = model.step(model.reset(first, torch.tensor([3, 3])), future)[0]
     assert torch.equal(told[0], frames[0]) and not torch.equal(told[1], told[0])
+
+
+def test_checkpointed_blocks_keep_less_and_give_the_same_gradients() -> None:
+    kept, gradients = [], []
+    for checkpointing in (False, True):
+        model, held = engine(net={"checkpointing": checkpointing}).train(), list[torch.Tensor]()
+        clips, generator = clip(model.spec, 1, model.memory_frames), torch.Generator().manual_seed(0)
+        with torch.autograd.graph.saved_tensors_hooks(lambda x, held=held: held.append(x) or x, lambda x: x):
+            loss = model.loss(clips, generator)[0]
+        loss.backward()
+        kept.append(sum(tensor.numel() for tensor in held))
+        gradients.append([p.grad for p in model.parameters() if p.requires_grad])
+    assert kept[1] < 0.7 * kept[0]
+    for one, other in zip(*gradients, strict=True):
+        assert torch.equal(one, other)
 
 
 def test_frames_without_a_picture_are_never_asked_for() -> None:
