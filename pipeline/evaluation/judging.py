@@ -180,6 +180,9 @@ def facts_text(facts: Mapping[str, Any]) -> str:
 
 
 def cost_text(cost: Mapping[str, float]) -> str:
-    """What a judge was asked for and paid, in a line."""
-    parts = (f"{name.replace('_', ' ')} {value:.6g}" for name, value in cost.items() if value)
+    """What a judge was asked for and paid, in a line; also of how many answers nobody knows the cost."""
+    told = {name: value for name, value in cost.items() if value and name != "uncounted"}
+    parts = [f"{name.replace('_', ' ')} {value:.6g}" for name, value in told.items()]
+    if uncounted := cost.get("uncounted"):
+        parts.append(f"tokens of {uncounted:.6g} answers unknown (no usage told), so the cost lacks them")
     return ", ".join(parts) or ("all remembered" if cost else "free")

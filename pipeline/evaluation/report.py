@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 
 from pipeline.evaluation.charts import Curve, line_chart, progress_chart
 from pipeline.evaluation.heat import heat_maps
+from pipeline.evaluation.judging import cost_text
 from pipeline.evaluation.media import inline, smooth
 from pipeline.evaluation.result import manifests
 from pipeline.evaluation.statistics import percent_line, points_line, psnr_line, rate, rise
@@ -85,6 +86,7 @@ def templates() -> Environment:
         "psnr": psnr_line,
         "points": points_line,
         "progress_chart": progress_chart,
+        "cost": cost_text,
     }
     return page
 

@@ -101,7 +101,7 @@ class Asker:
             self._failures = 0
             self.cache.put(key, reply)
             self.ledger.pay(reply)
-            if self.budget.tokens and not reply.prompt_tokens + reply.completion_tokens:
+            if self.budget.tokens and not reply.counted:
                 raise JudgeError(
                     "the server does not say how many tokens it used, so judge.budget.tokens="
                     f"{self.budget.tokens} cannot be kept; set it to 0 and judge.budget.calls instead"

@@ -19,11 +19,18 @@ class Question:
 
 @dataclass(frozen=True)
 class Reply:
-    """What was answered, and the tokens that it took to read the question and to write the answer."""
+    """What was answered, and the tokens that it took to read the question and to write the answer; 0 where
+    the server does not say how many.
+    """
 
     text: str
     prompt_tokens: int
     completion_tokens: int
+
+    @property
+    def counted(self) -> bool:
+        """Whether the server said how many tokens it took: no question has none, nor have words."""
+        return self.prompt_tokens > 0 and (self.completion_tokens > 0 or not self.text)
 
 
 class Unanswered(RuntimeError):

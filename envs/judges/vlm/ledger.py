@@ -17,7 +17,10 @@ from envs.judges.vlm.chat import Reply
 from envs.ranges import Natural, NonNegative
 
 _FOLDER = "spent"
-_COUNTS = ("remembered", "calls", "unanswered", "unusable", "prompt_tokens", "completion_tokens")
+_COUNTS = (
+    *("remembered", "calls", "unanswered", "unusable", "uncounted"),
+    *("prompt_tokens", "completion_tokens"),
+)
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ class Budget:
 @dataclass
 class Ledger:
     """Counts of one process under one cache folder: answers remembered, calls, tries that came to nothing,
-    answers that say neither yes nor no, and tokens.
+    answers that say neither yes nor no, answers of unknown tokens, and tokens.
 
     Args:
         folder: of the cache; the counts lie in a file of their own there.
@@ -81,7 +84,8 @@ class Ledger:
         self.counts[name] += count
 
     def pay(self, reply: Reply) -> None:
-        """Count the tokens of an answer, and write everything down."""
+        """Count the tokens of an answer, or that nobody did, and write everything down."""
+        self.counts["uncounted"] += not reply.counted
         self.counts["prompt_tokens"] += reply.prompt_tokens
         self.counts["completion_tokens"] += reply.completion_tokens
         self.write()
@@ -104,11 +108,13 @@ def ledger_of(folder: Path) -> Ledger:
 
 
 def spent(folder: Path, budget: Budget) -> dict[str, float]:
-    """Counts of all processes that ever asked under a cache folder, and their cost."""
+    """Counts of all processes that ever asked under a cache folder, and their cost; "uncounted" answers, of
+    which no server said the tokens, are not in it.
+    """
     total = dict.fromkeys(_COUNTS, 0.0)
     for path in (folder / _FOLDER).glob("[!.]*.json"):
         counts: Mapping[str, int] = json.loads(path.read_text())
         for name in _COUNTS:
-            total[name] += counts[name]
+            total[name] += counts.get(name, 0)  # one of an older version lacks some
     price = budget.input_price * total["prompt_tokens"] + budget.output_price * total["completion_tokens"]
     return {**total, "cost": price / 1e6}

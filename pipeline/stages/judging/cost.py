@@ -37,7 +37,7 @@ def priced(run: Run) -> Run:
         if not now:
             return result
         before, after = json.loads(path.read_text()), kind.spent(cfg["judge"])
-        return {**result, "judge_cost": {name: after[name] - before[name] for name in after}}
+        return {**result, "judge_cost": {name: after[name] - before.get(name, 0.0) for name in after}}
 
     return with_cost
 

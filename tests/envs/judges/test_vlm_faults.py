@@ -29,6 +29,7 @@ from tests.envs.judges.vlm_clips import (
     new_command,
     score,
 )
+from tests.sections import merged
 
 
 def counted(tokens: str) -> str:
@@ -171,6 +172,22 @@ def test_useless_and_remembered_answers_are_told_beside_the_cost(
         spent = VLMJudge.spent(options)
         assert spent["calls"] == 3 and spent["remembered"] == remembered
         assert spent["unusable"] == 3 + remembered
+
+
+@pytest.mark.parametrize(
+    "usage", [{}, {"usage": None}, {"usage": {}}, {"usage": {"prompt_tokens": 90}}], ids=str
+)
+def test_answers_of_unknown_tokens_are_told_and_not_taken_for_free(
+    make: Make, options: dict[str, Any], server: ChatServer, usage: dict[str, Any]
+) -> None:
+    new_command()
+    server.faults.append(say(json.dumps(completion("Answer: Yes", None) | usage)))
+    score(make(asking={"in_flight": 1}), clip(DONE))
+    budget = {"input_price": 1e4, "output_price": 0.0}
+    known = sum((usage.get("usage") or {}).values())
+    spent = VLMJudge.spent(merged(options, {"budget": budget}))
+    assert spent["calls"] == 3 and spent["uncounted"] == 1
+    assert spent["prompt_tokens"] == known + 200 and spent["cost"] == pytest.approx(2.0 + known / 100)
 
 
 def test_a_dead_server_stops_the_run(make: Make, server: ChatServer) -> None:

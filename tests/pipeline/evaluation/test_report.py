@@ -219,6 +219,14 @@ def test_the_page_tells_alarms_and_what_nobody_knows(inputs: Inputs) -> None:
     assert "Alarms" not in page and "nobody knows" not in page
 
 
+def test_the_page_says_of_how_many_answers_nobody_knows_the_cost(inputs: Inputs) -> None:
+    cost = {"calls": 3.0, "unusable": 0.0, "uncounted": 2.0, "prompt_tokens": 100.0, "cost": 0.001}
+    page = build_report({}, inputs, {**result(), "verdict": "-", "judge_cost": cost})
+    assert "calls 3, prompt tokens 100, cost 0.001, tokens of 2 answers unknown" in page
+    page = build_report({}, inputs, {**result(), "verdict": "-", "judge_cost": {**cost, "uncounted": 0.0}})
+    assert "Asked for by the whole run: calls 3, prompt tokens 100, cost 0.001.</p>" in page
+
+
 def test_a_judge_that_judged_nothing_is_not_wrong(inputs: Inputs, tmp_path: Path) -> None:
     nothing = {"tp": 0, "fp": 0, "fn": 0, "tn": 0, "accuracy": None, "dropped": 4}
     told = result()
