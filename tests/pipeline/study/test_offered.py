@@ -52,3 +52,9 @@ def test_every_row_can_be_built(words: tuple[str, ...], tmp_path: Path) -> None:
             own = {key: value for key, value in cfg["simulator"].items() if key not in WORLD_OPTIONS}
             world = build(own, "simulator", spec=world_spec(cfg))
             assert world.spec.chunk == cfg["task"]["chunk"], row.title
+
+
+@pytest.mark.parametrize("name", ["reward_curves", "worlds"])
+def test_no_engine_learns_views_that_nobody_looks_through(name: str, tmp_path: Path) -> None:
+    study = plan_study([f"experiment={name}", f"runs={tmp_path}", "study.seeds=[0]"])
+    assert {(row.cfg["cameras"], world_spec(row.cfg).views) for row in study.rows} == {("main", 1)}
