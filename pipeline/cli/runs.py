@@ -210,7 +210,9 @@ def study(words: Words) -> None:
 
 
 def compare(words: Words) -> None:
-    """finished runs side by side as Markdown: worldloop compare runs/quickstart runs/quickstart_dit"""
+    """finished runs side by side as Markdown: worldloop compare runs/quickstart runs/quickstart_dit; engines
+    after equal training time are compared by worldloop study experiment=worlds
+    """
     from pipeline.evaluation.compare import compare as table
 
     if not words:

@@ -160,6 +160,9 @@ def test_every_command_explains_itself_at_once_and_starts_nothing() -> None:
     for words in (("convert", "--help"), ("help", "convert")):  # whose words are none of configs/
         usage, _, rest = worldloop(*words).stdout.partition("\n")
         assert usage == "worldloop convert SRC DST [frames=N] [size=[H,W]]" and "configs/" not in rest
+    usage, _, rest = worldloop("compare", "--help").stdout.partition("\n")
+    assert usage == "worldloop compare runs/quickstart runs/quickstart_dit"
+    assert "equal training time are compared by worldloop study experiment=worlds" in " ".join(rest.split())
     assert max(map(len, worldloop("--help").stdout.splitlines())) <= 100
     assert all(command.__doc__ for command in COMMANDS.values())
     assert worldloop("--version").stdout.startswith("worldloop 0.")
