@@ -19,6 +19,7 @@ from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
 from tests.envs.simulators.clips import clip, first_of, future_of, moving_square
 from tests.envs.simulators.test_engines import ROBOTS, build_engine, section_of
 from tests.envs.simulators.test_text_world import TEXTS, section, world
+from tests.sections import merged
 
 # One camera and seven numbers: what WPE's robots share.
 ARM = Embodiment(
@@ -45,9 +46,12 @@ def test_forcing_full_has_the_published_size_and_shapes() -> None:
     assert found.activations > 20 * 256 * 1024 * 4 * 16 * 2
 
 
+# RoboScape-R's robot has two cameras.
+TWO_VIEWS = replace(ARM, cameras=(ARM.cameras[0], replace(ARM.cameras[0], name="wrist")))
+
+
 def test_worlds_of_tokens_have_the_published_size() -> None:
-    two = replace(ARM, cameras=(ARM.cameras[0], replace(ARM.cameras[0], name="wrist")))
-    spec, half_a_billion = WorldSpec(two, (256, 256), 4), pytest.approx(515e6, rel=0.002)
+    spec, half_a_billion = WorldSpec(TWO_VIEWS, (256, 256), 4), pytest.approx(515e6, rel=0.002)
     cfg = load_config(["judge=golden_goal_full", "task=tabletop"])
     engine = {key: value for key, value in section_of("tokens_full").items() if key not in WORLD_OPTIONS}
     for options, key in (
@@ -57,6 +61,17 @@ def test_worlds_of_tokens_have_the_published_size() -> None:
         with torch.device("meta"):
             made = build(options, key, spec=spec)
         assert sum(p.numel() for p in made.parameters() if p.requires_grad) == half_a_billion, key
+
+
+def test_worlds_of_tokens_learn_and_generate_at_the_published_width() -> None:
+    spec, goal = WorldSpec(TWO_VIEWS, (256, 256), 1), load_config(["judge=golden_goal_full", "task=tabletop"])
+    # One of 24 blocks that are alike, 3 of 48 frames, 2 of 8 passes: more take seconds, and no other shapes.
+    few: dict[str, Any] = {"window": 3, "net": {"layers": 1}, "decoding": {"steps": 2}}
+    engine, text_world = merged(section_of("tokens_full"), few), merged(goal["judge"]["text_world"], few)
+    pass_of_a_frame = 2 * 16 * 1024**2 * 2 * 16 * 16  # two operations a weight of a block, and place
+    for found in (size_of(engine, spec), text_world_size(text_world, spec)):
+        assert found.training > 3 * pass_of_a_frame * 5  # three frames that are known, two asked for
+        assert found.generating > pass_of_a_frame * 4  # a frame that is known, two passes, and what they made
 
 
 @pytest.mark.parametrize("name", ["forcing_small", "dit_small", "unet_small", "tokens_small", "gesim_tiny"])
