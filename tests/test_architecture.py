@@ -114,6 +114,16 @@ def test_physics_workers_load_without_torch() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
+def test_no_task_suite_is_known_above_physics() -> None:
+    suites = {"tabletop", "metaworld", "aloha", "ogbench"}
+    assert suites <= {path.stem for path in (ROOT / "envs/physics").iterdir()}
+    for path in FILES:
+        if within(path, ("envs/physics", "pipeline/cli")):  # help gives examples
+            continue
+        said = [word for word in words(ast.parse(path.read_text())) if any(s in word.lower() for s in suites)]
+        assert not said, f"{named(path)} names a task suite: {said[:3]}"
+
+
 def test_random_numbers_come_from_one_module() -> None:
     makers = {"manual_seed", "default_rng", "SeedSequence", "RandomState", "Philox"}
     found = {named(path) for path in FILES if makers & set(words(ast.parse(path.read_text())))}
