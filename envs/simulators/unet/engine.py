@@ -140,7 +140,7 @@ class UNetSimulator(Simulator):
         for number, (shrink, sources) in enumerate(zip(self.shrink, views, strict=True)):
             view, chosen = choose(sources)
             if shrink > 1:
-                view = enlarge(view, chosen, sources.flow, memory[:, :, number])
+                view = enlarge(view, chosen, memory[:, :, number])
             exact = view.clamp(0, 1) * 255
             full.append(exact + (exact.round() - exact).detach())
         return torch.stack(full, 2)
