@@ -5,7 +5,6 @@ time.
 from __future__ import annotations
 
 import math
-from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -33,20 +32,20 @@ def knot_basis(chunk: int, knots: int, from_rest: bool) -> Tensor:
 
 
 class ChunkGaussian(Distribution):
-    """chunk = offset + gain * basis @ (loc + drawn @ noise), noise ~ Normal(0, scale); dimensions with gain 0
-    are constant.
+    """chunk = offset + gain * basis @ knots with knots ~ Normal(loc, scale); dimensions with gain 0 are
+    constant.
 
-    The density is that of a chunk's part in the span of `drawn`, all of it where that has as many columns as
-    the basis; the rest of a chunk is what the mode says, and likelihoods do not know it. It is the density
-    of chunks that are drawn; where the mode was taken instead (heads.some_drawn) its gradient with respect to
-    the mean is zero as long as the mean stays; once it moves, a mode that did well pulls it back, which holds
-    PPO near it (docs/results/trust.md). With respect to the spread it is not: every mode would tell it to
-    shrink. So the spread learns only where all chunks are drawn.
+    The density is that of the knots; a chunk determines them exactly (the basis has full column rank), so
+    likelihood ratios are those of the chunk. It is the density of chunks that are drawn; where the mode was
+    taken instead (heads.some_drawn) its gradient with respect to the mean is zero as long as the mean stays;
+    once it moves, a mode that did well pulls it back, which holds PPO near it (docs/results/trust.md).
+    With respect to the spread it is not: every mode would tell it to shrink. So the spread learns only where
+    all chunks are drawn.
 
     Args:
         loc: [..., n, A] mean knots in normalised units.
-        scale: [..., m, A] standard deviations.
-        basis: [K, n]; drawn: [n, m], of full column rank; gain and offset: [A] in action units.
+        scale: [..., n, A] standard deviations.
+        basis: [K, n]; gain and offset: [A] in action units.
         share: [...] of chunks that are drawn.
     """
 
@@ -58,7 +57,6 @@ class ChunkGaussian(Distribution):
         loc: Tensor,
         scale: Tensor,
         basis: Tensor,
-        drawn: Tensor,
         gain: Tensor,
         offset: Tensor,
         share: Tensor,
@@ -67,7 +65,7 @@ class ChunkGaussian(Distribution):
         self.loc, self.scale, self.share = loc, scale, share
         # TensorDict hands shared tensors over with batch dimensions; every row is the same
         shared = basis.ndim - 2
-        self.basis, self.drawn = basis[(0,) * shared], drawn[(0,) * shared]
+        self.basis = basis[(0,) * shared]
         self.gain, self.offset = gain[(0,) * (gain.ndim - 1)], offset[(0,) * (offset.ndim - 1)]
         self.active = self.gain > 0
         super().__init__(
@@ -78,19 +76,8 @@ class ChunkGaussian(Distribution):
         return self.offset + self.gain * (self.basis @ knots)
 
     def _encode(self, chunk: Tensor) -> Tensor:
-        """The part [..., m, A] of chunks [..., K, A] that is drawn."""
         safe = torch.where(self.active, self.gain, 1.0)
-        return self._reading @ ((chunk - self.offset) / safe)
-
-    @cached_property
-    def _reading(self) -> Tensor:
-        """[m, K]: of a chunk's numbers in normalised units the part that is drawn."""
-        return torch.linalg.pinv(self.basis @ self.drawn)
-
-    @property
-    def centre(self) -> Tensor:
-        """The mode's part [..., m, A] in what is drawn."""
-        return self._reading @ self.basis @ self.loc
+        return torch.linalg.pinv(self.basis) @ ((chunk - self.offset) / safe)
 
     @property
     def mean(self) -> Tensor:
@@ -103,8 +90,8 @@ class ChunkGaussian(Distribution):
     deterministic_sample = mean
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
-        shape = (*sample_shape, *self.scale.shape)
-        knots = self.loc + self.drawn @ (self.scale * torch.randn(shape, device=self.loc.device))
+        shape = (*sample_shape, *self.loc.shape)
+        knots = self.loc + self.scale * torch.randn(shape, device=self.loc.device)
         return some_drawn(self._decode(knots), self.mode, self.share)
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
@@ -114,25 +101,24 @@ class ChunkGaussian(Distribution):
     def log_prob(self, value: Tensor) -> Tensor:
         every = (self.share >= 1)[..., None, None]
         scale = torch.where(every, self.scale, self.scale.detach())
-        normal = torch.distributions.Normal(self.centre, scale, validate_args=False)
+        normal = torch.distributions.Normal(self.loc, scale, validate_args=False)
         return (normal.log_prob(self._encode(value)) * self.active).sum((-2, -1))
 
     def entropy(self) -> Tensor:
         return (
-            torch.distributions.Normal(self.centre, self.scale, validate_args=False).entropy() * self.active
+            torch.distributions.Normal(self.loc, self.scale, validate_args=False).entropy() * self.active
         ).sum((-2, -1))
 
     def held(self) -> ChunkGaussian:
         """The same with a spread that does not learn."""
-        shared = self.basis, self.drawn, self.gain, self.offset
-        return ChunkGaussian(self.loc, self.scale.detach(), *shared, self.share)
+        return ChunkGaussian(self.loc, self.scale.detach(), self.basis, self.gain, self.offset, self.share)
 
 
 @register_kl(ChunkGaussian, ChunkGaussian)
 def _kl(p: ChunkGaussian, q: ChunkGaussian) -> Tensor:
     """KL(p || q) in nats, [...], over the dimensions that vary."""
     ratio = (p.scale / q.scale).square()
-    shift = ((p.centre - q.centre) / q.scale).square()
+    shift = ((p.loc - q.loc) / q.scale).square()
     return (0.5 * (ratio + shift - 1 - ratio.log()) * p.active).sum((-2, -1))
 
 
@@ -144,15 +130,13 @@ class ChunkGaussianHead(Head):
         chunk: actions per chunk, K.
         actions: numbers of an action, A.
         knots: free points per dimension and chunk.
-        noise_knots: of them, as many as are drawn: 1 shifts a chunk as a whole. None: all.
         std: initial spread, in units of the demonstrations' own spread.
         mode: how the chunk's numbers are meant; relative ones begin where the robot is.
     """
 
-    names = ("loc", "scale", "basis", "drawn", "gain", "offset", "share")
+    names = ("loc", "scale", "basis", "gain", "offset", "share")
     distribution = ChunkGaussian
     basis: Tensor
-    drawn: Tensor
     gain: Tensor
     offset: Tensor
 
@@ -164,36 +148,28 @@ class ChunkGaussianHead(Head):
         knots: Count,
         std: Positive,
         mode: Literal["relative", "absolute"],
-        noise_knots: Count | None = None,
     ):
         super().__init__()
         if not 1 <= knots <= chunk:
             raise ValueError(f"knots={knots} must be between 1 and task.chunk={chunk}")
-        drawn = knots if noise_knots is None else noise_knots
-        if not 1 <= drawn <= knots:
-            raise ValueError(f"noise_knots={drawn} must be between 1 and knots={knots}")
         self.chunk, self.knots, self.actions, self.std = chunk, knots, actions, std
         self.mean = nn.Linear(width, knots * actions)
         nn.init.normal_(self.mean.weight, std=1e-2)
         nn.init.zeros_(self.mean.bias)
-        self.log_std = nn.Parameter(torch.full((drawn, actions), float(torch.tensor(std).log())))
+        self.log_std = nn.Parameter(torch.full((knots, actions), float(torch.tensor(std).log())))
         self.from_rest = ActionMode(mode) is ActionMode.RELATIVE
         self.register_buffer("basis", knot_basis(chunk, knots, self.from_rest))
-        coarse = knot_basis(chunk, drawn, self.from_rest)
-        exact = torch.eye(knots) if drawn == knots else torch.linalg.pinv(self.basis) @ coarse
-        self.register_buffer("drawn", exact)
         self.register_buffer("gain", torch.ones(actions))
         self.register_buffer("offset", torch.zeros(actions))
 
     def forward(self, hidden: Tensor) -> tuple[Tensor, ...]:
         loc = self.mean(hidden.float()).unflatten(-1, (self.knots, self.actions))
+        scale = self.log_std.clamp(-4.0, 0.5).exp().expand_as(loc)
         lead = hidden.shape[:-1]
-        scale = self.log_std.clamp(-4.0, 0.5).exp().expand(*lead, -1, -1)
         return (
             loc,
             scale,
             self.basis.expand(*lead, *self.basis.shape),
-            self.drawn.expand(*lead, *self.drawn.shape),
             self.gain.expand(*lead, -1),
             self.offset.expand(*lead, -1),
             self.share.expand(lead),
