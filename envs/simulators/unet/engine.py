@@ -3,8 +3,8 @@
 Each view is folded into channels (all but the main one at half the detail); memory frames, and pose maps
 where there are any, ride along as channels, and actions modulate every block. A pixel of the output is one of
 its sources (compose.py): a remembered frame as it is, the last one moved by a predicted flow (warp, mask and
-residual, as in Finn et al. 2016), or a drawn colour; half the detail is the choice's, and not that of what is
-remembered. What moves is then copied instead of repainted, which is learned far faster than a residual.
+residual, as in Finn et al. 2016), or a drawn colour. What moves is then copied instead of repainted, which is
+learned far faster than a residual.
 """
 
 from __future__ import annotations
