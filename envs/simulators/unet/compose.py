@@ -59,9 +59,8 @@ def surprise(sources: Sources, frames: Tensor) -> Tensor:
     return -torch.sub(sources.logs, gaps, alpha=1 / _SPREAD).logsumexp(2, keepdim=True)
 
 
-def choose(sources: Sources) -> tuple[Tensor, Tensor]:
-    """Frames [B, K, 3, H, W]: of every pixel's sources the one that the others agree with most; and its
-    position among them, int64 [B, K, H, W].
+def choose(sources: Sources) -> Tensor:
+    """Frames [B, K, 3, H, W]: of every pixel's sources the one that the others agree with most.
 
     The likeliest alone would be wrong: sources that say the same, as all do of a background, share their
     probability. Gradients are those of the mixture's mean.
@@ -75,39 +74,13 @@ def choose(sources: Sources) -> tuple[Tensor, Tensor]:
             cost[one] = cost[one] + share[other] * apart
             cost[other] = cost[other] + share[one] * apart
         frames, least = colours[0].detach().expand(-1, likely.shape[1], -1, -1, -1), cost[0]
-        chosen = torch.zeros_like(least, dtype=torch.int64)
-        for number, (colour, doubt) in enumerate(zip(colours[1:], cost[1:], strict=True), 1):
-            better = doubt < least  # torch's argmin takes longer
-            frames = torch.where(better[:, :, None], colour, frames)
-            chosen.masked_fill_(better, number)
+        for colour, doubt in zip(colours[1:], cost[1:], strict=True):  # torch's argmin takes longer
+            frames = torch.where((doubt < least)[:, :, None], colour, frames)
             least = torch.minimum(least, doubt)
     if not torch.is_grad_enabled():
-        return frames, chosen
+        return frames
     mean = torch.stack([p[:, :, None] * colour for p, colour in zip(share, colours, strict=True)]).sum(0)
-    return frames + (mean - mean.detach()), chosen
-
-
-def enlarge(frames: Tensor, chosen: Tensor, memory: Tensor) -> Tensor:
-    """Frames [B, K, 3, H, W] of a view at full size [B, K, 3, 2 H, 2 W]: what is remembered with all of its
-    detail, the rest interpolated such that each pixel remains the mean of its four. What a world sees of its
-    own frames is then what it drew; interpolation alone blurs a picture again in every chunk.
-
-    Args:
-        chosen: see choose.
-        memory: remembered frames at full size, bytes [B, M, 3, 2 H, 2 W], the sources that come first.
-    """
-    size = memory.shape[-2:]
-    smooth = F.interpolate(frames.flatten(0, 1), size, mode="bilinear", align_corners=False)
-    with torch.no_grad():
-        lost = frames.flatten(0, 1) - F.avg_pool2d(smooth, 2)
-        full = (smooth + F.interpolate(lost, size, mode="nearest")).unflatten(0, frames.shape[:2])
-        where = F.interpolate(chosen.flatten(0, 1)[:, None].float(), size).unflatten(0, frames.shape[:2])
-        for number, known in enumerate(memory.float().div(255).unbind(1)):
-            full = torch.where(where == number, known[:, None], full)
-    if not torch.is_grad_enabled():
-        return full
-    smooth = smooth.unflatten(0, frames.shape[:2])
-    return full + (smooth - smooth.detach())
+    return frames + (mean - mean.detach())
 
 
 def _apart(one: Tensor, other: Tensor) -> Tensor:

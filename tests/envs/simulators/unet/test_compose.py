@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from envs.simulators.unet.compose import DRAWN, Sources, choose, compose, enlarge, surprise
+from envs.simulators.unet.compose import DRAWN, Sources, choose, compose, surprise
 
 
 def scene(logits: list[float], drawn: float) -> Sources:
@@ -17,16 +17,16 @@ def scene(logits: list[float], drawn: float) -> Sources:
 
 
 def test_a_pixel_is_one_of_its_sources_and_never_a_mean() -> None:
-    frames, _ = choose(scene([0.0, 0.0, 0.0, 0.5], drawn=1.0))
+    frames = choose(scene([0.0, 0.0, 0.0, 0.5], drawn=1.0))
     assert set(frames.unique().tolist()) <= {0.0, 1.0}
 
 
 def test_sources_that_agree_outvote_the_likeliest() -> None:
     colours, logs = scene([0.0, 0.0, 0.0, 0.25], drawn=1.0)
     assert int(logs[0, 0, :, 0, 0].argmax()) == 3  # drawn, but three others say black
-    assert choose(Sources(colours, logs))[0].max() == 0.0
+    assert choose(Sources(colours, logs)).max() == 0.0
     colours, logs = scene([0.0, 0.0, 0.0, 1.0], drawn=1.0)
-    assert choose(Sources(colours, logs))[0].min() == 1.0
+    assert choose(Sources(colours, logs)).min() == 1.0
 
 
 def test_moved_pixels_come_from_where_the_flow_points() -> None:
@@ -36,22 +36,8 @@ def test_moved_pixels_come_from_where_the_flow_points() -> None:
     maps[:, :, 2] = 9.0  # moved
     flow = torch.zeros(1, 1, 2, 8, 8)
     flow[:, :, 0] = -3 / 8  # units of 8 pixels, from a frame to the last remembered one
-    frames, _ = choose(compose(maps, flow, memory))
+    frames = choose(compose(maps, flow, memory))
     assert frames[0, 0, 0].nonzero().tolist() == [[4, 5]]
-
-
-def test_a_view_at_half_the_detail_fades_in_no_number_of_chunks() -> None:
-    """What is remembered comes back as it is, and of what is drawn a world sees what it drew."""
-    memory = torch.randint(0, 256, (1, 2, 3, 8, 8), dtype=torch.uint8)
-    half = torch.nn.functional.avg_pool2d(memory[0].float() / 255, 2)
-    frames = torch.stack([half[1], torch.rand(3, 4, 4)])[None].requires_grad_()
-    chosen = torch.tensor([1, 3])[None, :, None, None].expand(1, 2, 4, 4)  # the second remembered one; drawn
-    full = enlarge(frames, chosen, memory)
-    assert torch.equal(full[0, 0], memory[0, 1].float() / 255)
-    again = torch.nn.functional.avg_pool2d(full.flatten(0, 1), 2)
-    assert torch.allclose(again, frames[0], atol=1e-6)
-    full.sum().backward()
-    assert frames.grad is not None and torch.allclose(frames.grad, torch.full_like(frames, 4.0))
 
 
 def test_surprise_is_least_at_what_is_likely_and_grows_with_doubt() -> None:
@@ -64,5 +50,5 @@ def test_surprise_is_least_at_what_is_likely_and_grows_with_doubt() -> None:
 def test_gradients_pass_the_choice() -> None:
     colours, logs = scene([0.0, 0.0, 0.0, 0.5], drawn=1.0)
     logs = logs.detach().requires_grad_()
-    choose(Sources(colours, logs))[0].sum().backward()
+    choose(Sources(colours, logs)).sum().backward()
     assert logs.grad is not None and float(logs.grad[:, :, 3].min()) > 0
