@@ -180,16 +180,17 @@ def test_a_judgement_does_not_depend_on_the_rest_of_the_batch(judge: Judge, spec
     frames, first, texts, seen = clips(judge, spec, 3, 4)
     together = judge.score(frames, first, texts, *seen)
     turned = judge.score(frames.flip(0), first.flip(0), texts[::-1], *(part.flip(0) for part in seen))
-    assert same(Judgement(*(value.flip(0) for value in turned)), together)
+    # Where a row lies in a batch, or how large the batch is, may choose a kernel that sums in another order.
+    near = partial(torch.allclose, rtol=0, atol=1e-5)
+    assert near(turned.success.flip(0), together.success) and near(turned.progress.flip(0), together.progress)
+    assert torch.equal(turned.status.flip(0), together.status)
     frames, first = frames.clone(), first.clone()
     frames[[0, 2]], first[[0, 2]] = 255 - frames[[0, 2]], 99
     others = ["stop", texts[1], "put the small green cube that lies beside the drawer onto the plate"]
     changed = [part * torch.tensor([2.0, 1.0, 2.0])[:, None, None] for part in seen]
     assert same(rows(judge.score(frames, first, others, *changed), slice(1, 2)), rows(together, slice(1, 2)))
     alone = judge.score(frames[1:2], first[1:2], texts[1:2], *(part[1:2] for part in seen))
-    # Other batch sizes may choose other kernels, which sum in another order.
-    assert torch.allclose(alone.success, together.success[1:2], atol=1e-5)
-    assert torch.allclose(alone.progress, together.progress[1:2], atol=1e-5)
+    assert near(alone.success, together.success[1:2]) and near(alone.progress, together.progress[1:2])
 
 
 def test_every_weight_is_learned_or_at_least_used(name: str, judge: Judge, spec: WorldSpec) -> None:
