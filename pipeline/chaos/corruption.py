@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from pathlib import Path
 
-from envs.manifest import MANIFEST, whole_files
+from envs.manifest import MANIFEST, read_manifest, whole_files
 
 
 def spoil(stages: Path, chance: random.Random) -> tuple[Path, str] | None:
@@ -16,8 +16,9 @@ def spoil(stages: Path, chance: random.Random) -> tuple[Path, str] | None:
     """
     places = []
     for stage in sorted(stages.glob("*")):
-        if (stage / MANIFEST).exists():
-            places.append((stage, _files(stage)))
+        if (manifest := read_manifest(stage)) is not None:
+            # checkpoints that a killed process left beside its manifest are removed, not read
+            places.append((stage, [stage / name for name in (MANIFEST, *manifest["files"])]))
             continue
         places += [(checkpoint, _files(checkpoint)) for checkpoint in sorted(stage.rglob("checkpoint-*"))]
         if whole := [stage / name for name in sorted(whole_files(stage))]:

@@ -34,7 +34,8 @@ from pipeline.commands.submit import entrypoint
 from pipeline.config import load_config
 
 
-def test_a_lost_node_costs_no_job(recipe: Recipe) -> None:
+def test_a_lost_node_costs_no_job(recipe: Recipe, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # else workers starve beside the other tests
     # Ray gives a silent node half a minute by default. One that is gone refuses at once; one on a busy
     # machine may take its time.
     soon = {
