@@ -84,17 +84,18 @@ def check_physics(cfg: Cfg, who: str) -> None:
         raise ConfigError(f"{who} records its own episodes; choose a task with a suite (task=push)")
 
 
-def check_labels(cfg: Cfg, graph: Graph, until: str = "") -> None:
+def check_labels(cfg: Cfg, graph: Graph, until: str | Sequence[str] = "") -> None:
     """See that recordings say what the judge is taught by, hours before it is its turn.
 
     Args:
-        until: the last node that is wanted; "" wants all.
+        until: the last nodes that are wanted; "" wants all.
 
     Raises:
         ConfigError: naming the column and the fix.
     """
     judge: Any = target(cfg["judge"], "judge")
-    if has_physics(cfg) or not judge.needs_labels or (until and "judge-1" not in graph.needs(until)):
+    wanted = graph.needs(until) if until else graph.nodes
+    if has_physics(cfg) or not judge.needs_labels or not any(name.startswith("judge-") for name in wanted):
         return
     if not any(SUCCESS in read_info(Path(folder))["features"] for folder in cfg["task"]["data"]):
         raise ConfigError(
@@ -131,7 +132,7 @@ def imagined_iterations(cfg: Cfg) -> int:
 
 
 def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
-    data: list[str] = [graph.add("collect", collect.collect)]
+    data = add_episodes(graph, cfg)
     first = add_imitation(graph, cfg, data)
     policy = _explore(graph, cfg, first, data)
     starts = _extra_starts(graph, cfg) if with_rl else []
@@ -188,13 +189,19 @@ def _extra_starts(graph: Graph, cfg: Cfg) -> list[str]:
 
 
 def _data_loop(graph: Graph, cfg: Cfg) -> None:
-    mark = fingerprint(cfg["task"]["data"])
-    data = [graph.add("recordings", collect.recordings, fingerprint=mark)]
+    data = add_episodes(graph, cfg)
     first = add_imitation(graph, cfg, data)
     made = add_world(graph, cfg, data, World(), 1)
     starts = _extra_starts(graph, cfg)
     policy = _learn(graph, cfg, data, made, first, 1, starts, known="")
     _conclude(graph, data, made, first, policy, {})
+
+
+def add_episodes(graph: Graph, cfg: Cfg) -> list[str]:
+    """The stage of the first episodes: scripted ones where there is physics, else the recordings."""
+    if has_physics(cfg):
+        return [graph.add("collect", collect.collect)]
+    return [graph.add("recordings", collect.recordings, fingerprint=fingerprint(cfg["task"]["data"]))]
 
 
 def add_imitation(graph: Graph, cfg: Cfg, data: list[str]) -> str:

@@ -28,9 +28,10 @@ from pipeline.evaluation.judging import judge_frames, judge_table, labelled
 from pipeline.evaluation.measurement import rollout_error, speed
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, Place, stage
-from pipeline.loop import check_physics
+from pipeline.loop import add_episodes, check_labels
 from pipeline.markdown import markdown_table
-from pipeline.stages import collect, world
+from pipeline.outside import CHECKPOINT, KINEMATICS, files_at
+from pipeline.stages import world
 from pipeline.stages.given import WORLD, Cfg, open_store
 from pipeline.stages.judging import stage as judging
 
@@ -61,7 +62,7 @@ def distil(cfg: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Print the table, and leave it in distil.json of the run's folder; returns the figures by row.
 
     Raises:
-        ConfigError: if the task has no physics, or the simulator no steps.
+        ConfigError: if the simulator has no steps, or recordings do not say what the judge learns from.
     """
     prepare_process(cfg["seed"], cfg["threads"])
     root = root_of(cfg)
@@ -124,15 +125,17 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
     with as many updates. "not distilled" has the weights of the teacher jump as students do: a jump that
     nobody has taught ends in the mean of all that may come, which PSNR likes, and which has no detail.
     """
-    check_physics(cfg, "bench distil")
     engine, most = target(cfg["simulator"], "simulator"), cfg["distill"]["steps"]
     if not most:
         raise ConfigError("distill.steps=0 is without a student; say distill.steps=4")
     acting(cfg)  # says what cannot be distilled
     graph = Graph(cfg, root)
-    data = [graph.add("collect", collect.collect)]
-    warm = graph.add("tokenizer", world.tokenizer, {"data": data}) if "codec" in cfg["simulator"] else ""
-    teacher = graph.add("simulator", world.simulator, {"data": data, "warm": warm}, phase="first")
+    data, released = add_episodes(graph, cfg), files_at(cfg, CHECKPOINT, KINEMATICS)
+    warm = ""
+    if "codec" in cfg["simulator"]:
+        warm = graph.add("tokenizer", world.tokenizer, {"data": data}, **released)
+    roles = {"data": data, "warm": warm}
+    teacher = graph.add("simulator", world.simulator, roles, phase="first", **released)
     rows, left = dict[str, str](), dict[str, str]()
     judge_class: Any = target(cfg["judge"], "judge")
     golden = (
@@ -173,6 +176,7 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
             roles = {"data": data, "simulator": teacher}
             student = own.add(f"student-{name}-{steps}", world.student, roles, phase="first")
             measured(f"{name}, {steps}", f"{name}-{steps}", student, acting(own.cfg)["simulator"], steps)
+    check_labels(cfg, graph, list(rows.values()))
     return graph, rows, left
 
 

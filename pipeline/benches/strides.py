@@ -19,6 +19,7 @@ from actors.factory import build_judge, build_simulator
 from actors.process import prepare_process
 from envs.files import write_json
 from envs.simulators.replay import replay
+from pipeline.acting import acting
 from pipeline.cli.words import root_of
 from pipeline.evaluation.fidelity.strides import VERDICTS, common_stride
 from pipeline.evaluation.fidelity.verdicts import judged, verdict_tables, verdict_text
@@ -26,11 +27,9 @@ from pipeline.evaluation.judging import thinned
 from pipeline.evaluation.statistics import mean
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, Place, stage
-from pipeline.loop import check_physics
+from pipeline.loop import World, add_episodes, add_world, check_labels
 from pipeline.markdown import markdown_table
-from pipeline.stages import collect, world
 from pipeline.stages.given import WORLD, Cfg, open_store
-from pipeline.stages.judging import stage as judging
 from pipeline.stages.judging.cost import priced
 
 _EPISODES = 48  # held-out ones that are measured
@@ -44,7 +43,7 @@ def strides(cfg: dict[str, Any]) -> dict[int, dict[str, Any]]:
     """Print the table, and leave it in strides.json of the run's folder; returns the figures by stride.
 
     Raises:
-        ConfigError: if the task has no physics.
+        ConfigError: if recordings do not say what the judge learns from.
     """
     prepare_process(cfg["seed"], cfg["threads"])
     root = root_of(cfg)
@@ -63,22 +62,14 @@ def strides(cfg: dict[str, Any]) -> dict[int, dict[str, Any]]:
 
 def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[int, str]]:
     """The stages, and the names of those that measure, by stride: simulator_fit.first.strides."""
-    check_physics(cfg, "bench strides")
-    graph = Graph(cfg, root)
-    data = [graph.add("collect", collect.collect)]
-    warm = graph.add("tokenizer", world.tokenizer, {"data": data}) if "codec" in cfg["simulator"] else ""
-    roles = {"data": data, "warm": warm}
-    simulator = graph.add("simulator", world.simulator, roles, phase="first")
-    numbers = sorted(cfg["simulator_fit"]["first"]["strides"])
-    golden = (
-        graph.add("text_world", judging.text_world, {"data": data}, phase="first")
-        if "text_world" in cfg["judge"]
-        else ""
-    )
-    roles = {"data": data, "simulator": simulator, "text_world": golden}
-    judge = graph.add("judge", judging.judge, roles, phase="first")
-    roles, common = {"data": data, "simulator": simulator, "judge": judge}, common_stride(numbers)
-    return graph, {n: graph.add(f"stride-{n}", measure, roles, stride=n, common=common) for n in numbers}
+    graph = Graph(acting(cfg), root)
+    data = add_episodes(graph, cfg)
+    made, numbers = add_world(graph, cfg, data, World(), 1), sorted(cfg["simulator_fit"]["first"]["strides"])
+    roles, common = {"data": data, **made.roles()}, common_stride(numbers)
+    del roles["state"]  # which knows stride 1 alone
+    rows = {n: graph.add(f"stride-{n}", measure, roles, stride=n, common=common) for n in numbers}
+    check_labels(cfg, graph, list(rows.values()))
+    return graph, rows
 
 
 @stage(reads=WORLD, place=Place.EVALUATOR)

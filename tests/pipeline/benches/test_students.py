@@ -21,6 +21,7 @@ TINY = (
     *("experiment=soak", "task.horizon=8", "policy.width=64", "track=disabled", "threads=1"),
     *("task.suite.cameras=[head]", "launch.workers=1", "collect.episodes.held_out=1", "name=bench"),
 )
+RECORDED = ("experiment=soak", "task=lerobot", "task.size=[32,32]", "task.horizon=8", "threads=1")
 STUDENTS = (
     *("simulator=dit_small", "distill.steps=2", "tokenizer_fit={steps: 2, batch: 4}"),
     *("distill.first.fit={steps: 4, batch: 2}", "distill.method.critic_updates=1"),
@@ -102,6 +103,13 @@ def test_strides_reach_as_many_times_further(tmp_path: Path, capsys: pytest.Capt
         assert all(math.isfinite(value) for value in row.values())
         assert verdicts.keys() == {"generated", "recorded"}
     assert "| verdicts right |" in capsys.readouterr().out
+    (recorded,) = tmp_path.glob("bench/strides/collect-*/dataset")
+    own = [*RECORDED, f"task.data=[{recorded}]", f"runs={tmp_path}"]
+    cfg = load_config([*own, "simulator_fit.first.strides=[1,2]", "name=recorded"])
+    for row in strides(cfg).values():
+        assert math.isfinite(row["psnr"]) and row["verdicts"]
+    graph, rows, _ = students.build_table(load_config([*own, *STUDENTS, "name=few"]), tmp_path / "few")
+    assert "recordings" in graph.needs(list(rows.values())) and "collect" not in graph.nodes
 
 
 def test_benches_say_what_they_cannot_do() -> None:
