@@ -3,8 +3,8 @@
 Each view is folded into channels (all but the main one at half the detail); memory frames, and pose maps
 where there are any, ride along as channels, and actions modulate every block. A pixel of the output is one of
 its sources (compose.py): a remembered frame as it is, the last one moved by a predicted flow (warp, mask and
-residual, as in Finn et al. 2016), or a drawn colour. What moves is then copied instead of repainted, which is
-learned far faster than a residual.
+residual, as in Finn et al. 2016), or a drawn colour; half the detail is the choice's, and not that of what is
+remembered. What moves is then copied instead of repainted, which is learned far faster than a residual.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from envs.simulators.unet.blocks import (
     flow_head,
     output_head,
 )
-from envs.simulators.unet.compose import DRAWN, Sources, changed, choose, compose, surprise
+from envs.simulators.unet.compose import DRAWN, Sources, changed, choose, compose, enlarge, surprise
 from envs.simulators.unet.folding import unfold
 from envs.specs import WorldSpec
 
@@ -125,25 +125,22 @@ class UNetSimulator(Simulator):
     def predict(self, inputs: TensorDict) -> tuple[Tensor, Tensor]:
         """See Simulator.predict; features are the pooled bottleneck beside the action embedding."""
         views, features = self.views(inputs)
-        return self._frames(views).round().to(torch.uint8), features
+        return self._frames(views, inputs["memory", "frames"]).round().to(torch.uint8), features
 
     def features(self, inputs: TensorDict) -> Tensor:
         """See Simulator.features; nothing is drawn."""
         *_, deep, cond = self._encode(inputs)
         return torch.cat([deep.float().mean((-2, -1)), cond.float()], 1)
 
-    def _frames(self, views: list[Sources]) -> Tensor:
-        """Frames float [B, K, V, 3, H, W] of all views at full size, whole numbers in 0..255; gradients pass
-        the rounding.
+    def _frames(self, views: list[Sources], memory: Tensor) -> Tensor:
+        """Frames float [B, K, V, 3, H, W] of all views at full size, whole numbers in 0..255, of the sources
+        of each view and the remembered frames, bytes [B, M, V, 3, H, W]; gradients pass the rounding.
         """
         full = []
-        for shrink, sources in zip(self.shrink, views, strict=True):
-            view = choose(sources)
+        for number, (shrink, sources) in enumerate(zip(self.shrink, views, strict=True)):
+            view, chosen = choose(sources)
             if shrink > 1:
-                large = F.interpolate(
-                    view.flatten(0, 1), self.spec.size, mode="bilinear", align_corners=False
-                )
-                view = large.unflatten(0, view.shape[:2])
+                view = enlarge(view, chosen, sources.flow, memory[:, :, number])
             exact = view.clamp(0, 1) * 255
             full.append(exact + (exact.round() - exact).detach())
         return torch.stack(full, 2)
@@ -216,11 +213,12 @@ class UNetSimulator(Simulator):
         losses = []
         for number in range(chunks):
             part = slice(number * chunk, (number + 1) * chunk)
-            views, _ = self.views(build_inputs(self.spec, clip, number, drawn))
+            inputs = build_inputs(self.spec, clip, number, drawn)
+            views, _ = self.views(inputs)
             truth, valid = clip["future", "frames"][:, part], clip["future", "valid"][:, part]
             losses.append(self._error(views, truth, clip["memory", "frames"][:, number, -1], valid))
             if number + 1 < chunks:
-                pictures = self._frames(views)
+                pictures = self._frames(views, inputs["memory", "frames"])
                 drawn = pictures if drawn is None else torch.cat([drawn, pictures], 1)
         return torch.stack(losses).mean(), {
             "first_chunk": losses[0].detach(),
