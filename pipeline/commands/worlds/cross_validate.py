@@ -15,10 +15,18 @@ from tqdm import tqdm
 from envs.files import write_json
 from envs.targets import ConfigError
 from learners.rl.algorithm import RLConfig
-from pipeline.commands.worlds.subject import round_inputs
+from pipeline.commands.worlds.subject import Keep, kept_of_round, round_inputs
 from pipeline.evaluation.by_task import tasks_of_episodes
 from pipeline.evaluation.trust.gradients import Measured, plain_row
-from pipeline.evaluation.trust.held_out import Moment, folds_of, joined, learned_without, mean_gain
+from pipeline.evaluation.trust.held_out import (
+    Moment,
+    folds_of,
+    joined,
+    learned_without,
+    mean_gain,
+    packed,
+    unpacked,
+)
 from pipeline.loop import build_loop
 from pipeline.markdown import markdown_table
 from pipeline.stages.given import deployed_in, imagined_chunks
@@ -53,7 +61,8 @@ def cross_validate(cfg: Mapping[str, Any], root: Path, number: int, folds: int) 
             " algorithm=ppo, a policy that is not scored on action tokens, and labelled episodes of a"
             " deployed policy"
         )
-    found = measured(graph.cfg, ready, deployed_in(inputs, "known"), folds)
+    keep = kept_of_round(graph, root / "cross-validate", number, learned_without.__module__)
+    found = measured(graph.cfg, ready, deployed_in(inputs, "known"), folds, keep)
     write_json(root / f"cross-validate-{number}.json", {"round": number, "folds": folds, **plain(found)})
     return tables(found, folds)
 
@@ -75,8 +84,9 @@ class Found:
     episodes: int
 
 
-def measured(cfg: Mapping[str, Any], ready: Imagination, deployed: int, folds: int) -> Found:
-    """What is learned without each fold of the episodes of the policy that was deployed in round `deployed`.
+def measured(cfg: Mapping[str, Any], ready: Imagination, deployed: int, folds: int, keep: Keep) -> Found:
+    """What is learned without each fold of the episodes of the policy that was deployed in round `deployed`;
+    what was learned without one is kept.
 
     Raises:
         ConfigError: if those are fewer than folds.
@@ -98,8 +108,17 @@ def measured(cfg: Mapping[str, Any], ready: Imagination, deployed: int, folds: i
     steps = looks(steps_of(settings, imagined_chunks(cfg)))
     fold = folds_of(episode, own, folds, settings.seed)
     parts = (ready.algorithm, decisions, settings, episode, task)
+
+    def without(out: int) -> list[Moment]:
+        made = keep(
+            f"fold-{out}",
+            {"fold": out, "folds": folds, "steps": steps},
+            lambda: packed(learned_without(*parts, fold == out, steps)),
+        )
+        return unpacked(made)
+
     bar = tqdm(range(folds), desc="folds", unit="fold", dynamic_ncols=True)
-    moments = joined([learned_without(*parts, fold == out, steps) for out in bar])
+    moments = joined([without(out) for out in bar])
     by_task = [{"task": each, **_row(moments[-1], place)} for place, each in enumerate(tasks)]
     rows = [_row(moment, None) for moment in moments]
     return Found(rows, by_task if len(tasks) > 1 else [], len(own), int(own.sum()), episodes)

@@ -2,38 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
-from actors.fleets.fleet import EpisodeLedger
-from actors.fleets.launch import build_fleet
-from actors.policies.contract import device_of, trained_part
-from actors.rollouts.host import trained_weights
 from envs.files import write_json
-from envs.rng import order_generator
-from envs.specs import EPISODE
 from envs.targets import ConfigError
-from learners.rl.algorithm import sound
-from learners.rl.feed import build_feed
 from learners.rl.ppo import PPO
-from learners.rl.recorded.decisions import RecordedDecisions
-from pipeline.commands.worlds.subject import round_inputs
-from pipeline.evaluation.by_task import tasks_of_episodes
+from pipeline.commands.worlds.gradient_parts import COUNTS, FEWEST, LAMBDA, PARTS, TASK, Parts, rollouts
+from pipeline.commands.worlds.subject import Keep, kept_of_round, round_inputs
 from pipeline.evaluation.trust.gradients import PER, Measured, alignment, plain_row, policy_gradient, signal
+from pipeline.graph.kept import Tensors
 from pipeline.loop import build_loop
 from pipeline.markdown import markdown_table
 from pipeline.stages.rl import Imagination, begin, rl, tasks_of_starts
 
 LAMS = (0.0, 0.5, 0.8, 0.95)  # and the one in use; the largest hardly leans on the critic
-_PARTS = 16  # of the recorded decisions
-_FEWEST = 2  # decisions of a part of which a gradient is taken
 _COLUMNS = ("signal of imagined", "of recorded", "imagined along recorded")
 
 
@@ -70,6 +60,16 @@ class Found:
     by_task: dict[str, Gradients]
     used: float | None
 
+    def add(self, side: str, parts: Tensors) -> None:
+        """Add gradients of one side, "imagined" or "recorded"."""
+        lambdas = {f"{LAMBDA}{lam}": mine for lam, mine in self.by_lambda.items()}
+        for name, gradients in parts.items():
+            if name.startswith(COUNTS):
+                continue
+            mine = lambdas.get(name) or self.by_task.setdefault(name.removeprefix(TASK), Gradients())
+            getattr(mine, side).extend(gradients)
+            getattr(mine, f"{side}_decisions").extend(parts[f"{COUNTS}{name}"].tolist())
+
 
 def gradients(cfg: Mapping[str, Any], root: Path, number: int, batches: int) -> str:
     """Tables of what imagined and recorded decisions of a round tell RL, and gradients-<round>.json.
@@ -89,7 +89,8 @@ def gradients(cfg: Mapping[str, Any], root: Path, number: int, batches: int) -> 
     inputs = round_inputs(graph, root, number, "rl")
     name = f"rl-{number}"
     ready = begin(rl.view(name, graph.cfg, graph.nodes[name].settings), inputs)
-    found = measured(graph.cfg, ready, batches)
+    keep = kept_of_round(graph, root / "gradients", number, policy_gradient.__module__)
+    found = measured(graph.cfg, ready, batches, keep)
     lambdas, tasks = rows_by_lambda(found), rows_by_task(found)
     kept = [[*map(plain_row, rows)] for rows in (lambdas, tasks)]
     about = {"round": number, "batches": batches, "lambda": found.used}
@@ -97,83 +98,28 @@ def gradients(cfg: Mapping[str, Any], root: Path, number: int, batches: int) -> 
     return tables(lambdas, tasks, found, batches)
 
 
-def measured(cfg: Mapping[str, Any], ready: Imagination, batches: int) -> Found:
-    """Gradients of so many imagined batches and of all recorded decisions, none of which is a step."""
-    algorithm, policy = ready.algorithm, trained_part(ready.policy)
-    settings, device = replace(ready.settings, schedule="sync"), device_of(algorithm.modules())
+def measured(cfg: Mapping[str, Any], ready: Imagination, batches: int, keep: Keep) -> Found:
+    """Gradients of so many imagined batches and of all recorded decisions, none of which is a step; each
+    batch's are kept.
+    """
+    algorithm = ready.algorithm
     used = algorithm.config.lam if isinstance(algorithm, PPO) else None
     lams = (None,) if used is None else tuple(sorted({*LAMS, used}))
-    found = Found({lam: Gradients() for lam in lams}, {}, used)
     tasks = [] if used is None else tasks_of_starts(cfg, ready.store, ready.inside, ready.beyond)
+    parts = Parts(ready, lams, used, tasks if len(set(tasks)) > 1 else [])
+    found = Found({lam: Gradients() for lam in lams}, {}, used)
+    with rollouts(ready) as rollout:
 
-    def of(data: TensorDict) -> Tensor:
-        return policy_gradient(algorithm, policy, data, settings.minibatch)
+        def once(number: int) -> Tensors:
+            return parts.imagined(rollout(number))
 
-    fleet = build_fleet(ready.recipe)
-    try:
-        fleet.ledger = EpisodeLedger()
-        feed, weights = build_feed(fleet, algorithm, settings, ready.starts), trained_weights(ready.policy)
         for number in tqdm(range(batches), desc="imagined batches", unit="batch", dynamic_ncols=True):
-            batch = feed.gather(number, weights)[0].to(device)
-            for lam, mine in found.by_lambda.items():
-                _credit(algorithm, lam)
-                data, _ = algorithm.prepare(batch.clone())
-                mine.imagined.append(of(data))
-                mine.imagined_decisions.append(len(data))
-                if lam is not None and lam == used and len(set(tasks)) > 1:
-                    begun = batch[EPISODE] % ready.starts.count if ready.starts.count else batch[EPISODE]
-                    known = [tasks[start] for start in begun.reshape(batch.shape)[sound(batch)].tolist()]
-                    for task, part in _by_task(data, known):
-                        its = found.by_task.setdefault(task, Gradients())
-                        its.imagined.append(of(part))
-                        its.imagined_decisions.append(len(part))
-    finally:
-        fleet.close()
+            made = keep(f"imagined-{number}", {"batch": number}, partial(once, number))
+            found.add("imagined", made)
     decisions = ready.true.decisions
-    if decisions is not None and ready.rollout is not None and len(decisions) >= _FEWEST * _PARTS:
-        _of_recorded(cfg, ready, decisions, found, of, data)
+    if decisions is not None and ready.rollout is not None and len(decisions) >= FEWEST * PARTS:
+        found.add("recorded", keep("recorded", {}, lambda: parts.recorded(cfg, decisions)))
     return found
-
-
-def _of_recorded(
-    cfg: Mapping[str, Any],
-    ready: Imagination,
-    decisions: RecordedDecisions,
-    found: Found,
-    of: Callable[[TensorDict], Tensor],
-    like: TensorDict,
-) -> None:
-    """Add gradients of the recorded decisions, with the keys of the transitions `like`."""
-    order = torch.randperm(len(decisions), generator=order_generator(ready.settings.seed))
-    episodes = torch.searchsorted(ready.store.start, decisions.known["row"], right=True) - 1
-    played = episodes.unique()
-    names = dict(zip(played.tolist(), tasks_of_episodes(cfg, ready.store, played), strict=True))
-    for lam, mine in tqdm(found.by_lambda.items(), desc="recorded decisions", unit="lambda", leave=False):
-        if isinstance(ready.algorithm, PPO) and lam is not None:  # others keep the advantages that they gave
-            ready.algorithm.credit(lam)
-            ready.algorithm.value(ready.rollout)
-            decisions.revalue(ready.rollout)
-        for part in range(_PARTS):
-            some = order[part::_PARTS]
-            data = decisions.taken(some, like)
-            mine.recorded.append(of(data))
-            mine.recorded_decisions.append(len(data))
-            if lam == found.used and found.by_task:
-                for task, own in _by_task(data, [names[number] for number in episodes[some].tolist()]):
-                    its = found.by_task.setdefault(task, Gradients())
-                    its.recorded.append(of(own))
-                    its.recorded_decisions.append(len(own))
-
-
-def _by_task(data: TensorDict, tasks: Sequence[str]) -> list[tuple[str, TensorDict]]:
-    """Parts of transitions [N] by their tasks [N]."""
-    rows = {task: [n for n, name in enumerate(tasks) if name == task] for task in sorted(set(tasks))}
-    return [(task, data[torch.tensor(mine)]) for task, mine in rows.items() if len(mine) >= _FEWEST]
-
-
-def _credit(algorithm: Any, lam: float | None) -> None:
-    if lam is not None:
-        algorithm.credit(lam)
 
 
 def _signal(gradients: Sequence[Tensor], decisions: Sequence[int]) -> Measured | None:
@@ -210,7 +156,7 @@ def rows_by_task(found: Found) -> list[dict[str, Any]]:
             **mine.signals(),
             "imagined_along_recorded": _along(mine.imagined, mine.recorded),
         }
-        for task, mine in found.by_task.items()
+        for task, mine in sorted(found.by_task.items())
     ]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,14 @@ from pipeline.evaluation.measurement import followed
 from pipeline.evaluation.result import result_of
 from pipeline.graph.code_version import code_of, json_digest
 from pipeline.graph.graph import Graph, decisive
+from pipeline.graph.kept import Kept, Tensors
 from pipeline.graph.stage import WEIGHTS, Inputs
 from pipeline.loop import build_loop, has_physics
 from pipeline.outside import CHECKPOINT, KINEMATICS, STATE_CHECKPOINT, files_at, fingerprint, judge_files
 from pipeline.stages.given import datasets, learns
 
 Cfg = Mapping[str, Any]
+Keep = Callable[[str, Mapping[str, Any], Callable[[], Tensors]], Tensors]
 
 _RELEASED = {"simulator": CHECKPOINT, "state": STATE_CHECKPOINT}  # keys of the config, by role
 
@@ -215,6 +217,19 @@ def round_inputs(graph: Graph, root: Path, number: int, stage: str) -> Inputs:
             " (`worldloop stages` says what differs); first `worldloop run` with the same options"
         )
     return graph.inputs(f"{stage}-{number}")
+
+
+def kept_of_round(graph: Graph, folder: Path, number: int, module: str) -> Keep:
+    """Keeps parts of what is measured of a round's RL in a folder, by what tells them apart; what `make` gave
+    at some earlier time is not made again.
+
+    Args:
+        module: that measures, by name.
+    """
+    # folders of stages are named by all that they hang on, code included
+    identity = {"stage": graph.folder(f"rl-{number}").name, "code": code_of(module, {})}
+    kept = Kept(folder)
+    return lambda name, about, make: kept.get(name, {**identity, **about}, make)
 
 
 def pages_of(root: Path, graph: Graph, section: Mapping[str, Any]) -> Path:

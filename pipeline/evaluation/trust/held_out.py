@@ -9,7 +9,7 @@ Decisions that the policy did not draw, but took at its mode, do not count: r is
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -22,6 +22,7 @@ from learners.rl.recorded.decisions import RecordedDecisions
 from learners.training.parallel import clip_gradients
 from pipeline.evaluation.trust.gradients import Measured
 
+_OF_EPISODES = ("learned", "learned_tasks", "left_out", "left_out_tasks")
 _AT_MOST = 10.0  # of a ratio, above which single decisions would decide
 
 
@@ -103,14 +104,31 @@ def learned_without(
     return out
 
 
+def packed(moments: Sequence[Moment]) -> dict[str, Tensor]:
+    """Moments as files of tensors hold them."""
+    out = {
+        "steps": torch.tensor([moment.steps for moment in moments]),
+        "kl": torch.tensor([moment.kl for moment in moments], dtype=torch.float64),
+    }
+    for place, moment in enumerate(moments):
+        out |= {f"{name}-{place}": getattr(moment, name) for name in _OF_EPISODES}
+    return out
+
+
+def unpacked(held: Mapping[str, Tensor]) -> list[Moment]:
+    """Moments out of what `packed` made of them."""
+    steps, kl = held["steps"].tolist(), held["kl"].tolist()
+    return [
+        Moment(steps[place], **{name: held[f"{name}-{place}"] for name in _OF_EPISODES}, kl=kl[place])
+        for place in range(len(steps))
+    ]
+
+
 def joined(folds: Sequence[Sequence[Moment]]) -> list[Moment]:
     """Moments of all folds together."""
     out = []
     for parts in zip(*folds, strict=True):
-        found = {
-            name: torch.cat([getattr(part, name) for part in parts])
-            for name in ("learned", "learned_tasks", "left_out", "left_out_tasks")
-        }
+        found = {name: torch.cat([getattr(part, name) for part in parts]) for name in _OF_EPISODES}
         out.append(Moment(parts[0].steps, **found, kl=sum(part.kl for part in parts) / len(parts)))
     return out
 

@@ -41,9 +41,7 @@ def test_a_slice_of_the_soak_leaves_nothing_wrong_unnoticed(tmp_path: Path) -> N
         "disk full: told in a line",
         "corruption: told by name",
     }
-    again = json.loads(
-        (chaos(tmp_path, "chaos.events=8", "chaos.seconds=0") / "soak/books.json").read_text()
-    )
+    again = json.loads((chaos(tmp_path, "chaos.events=8", "chaos.seconds=0") / "soak/books.json").read_text())
     assert again == books  # a soak goes on where it was: here, at its end
 
 

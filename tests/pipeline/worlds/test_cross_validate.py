@@ -14,8 +14,16 @@ from envs.specs import CHUNK
 from envs.targets import ConfigError
 from pipeline.commands.worlds.cross_validate import cross_validate, looks, measured, plain, tables
 from pipeline.config import load_config
-from pipeline.evaluation.trust.held_out import folds_of, gains, joined, learned_without, mean_gain
-from tests.beginning import begun
+from pipeline.evaluation.trust.held_out import (
+    folds_of,
+    gains,
+    joined,
+    learned_without,
+    mean_gain,
+    packed,
+    unpacked,
+)
+from tests.beginning import anew, begun
 
 
 def test_gains_by_hand() -> None:
@@ -48,7 +56,9 @@ def test_what_is_true_holds_on_other_episodes_and_noise_does_not(tmp_path: Path,
     parts = (ready.algorithm, decisions, ready.settings, episode, torch.zeros_like(episode))
     fold = folds_of(episode, episode >= 0, 3, 0)
     before = {name: value.clone() for name, value in ready.algorithm.modules().state_dict().items()}
-    first, last = joined([learned_without(*parts, fold == out, [8, 48]) for out in range(3)])
+    folds = [learned_without(*parts, fold == out, [8, 48]) for out in range(3)]
+    first, last = joined([unpacked(packed(moments)) for moments in folds])
+    assert (first.kl, last.kl) == tuple(moment.kl for moment in joined(folds))
     after = ready.algorithm.modules().state_dict()
     assert all(torch.equal(value, before[name]) for name, value in after.items())
     assert (first.steps, last.steps) == (8, 48) and 0 < first.kl != last.kl
@@ -61,7 +71,7 @@ def test_what_is_true_holds_on_other_episodes_and_noise_does_not(tmp_path: Path,
 
 def test_tables_and_what_cannot_be_asked(tmp_path: Path) -> None:
     cfg, ready = begun(tmp_path, "rl.minibatch=64", "policy.head.std=0.07")
-    found = measured(cfg, ready, 0, 2)
+    found = measured(cfg, ready, 0, 2, anew)
     text = tables(found, 2)
     assert (
         text.count("| move the square") == 2 and "holds on episodes" in text and found.own == found.decisions
@@ -70,7 +80,7 @@ def test_tables_and_what_cannot_be_asked(tmp_path: Path) -> None:
     untold = tables(replace(found, by_steps=[{**found.by_steps[0], "kl": None, "left_out": None}]), 2)
     assert "| - |" in untold and "holds on episodes" not in untold
     with pytest.raises(ConfigError, match="fewer folds"):
-        measured(cfg, ready, 0, 900)
+        measured(cfg, ready, 0, 900, anew)
     with pytest.raises(ConfigError, match="2 of them at least"):
         cross_validate(load_config(["experiment=soak"]), tmp_path, 1, 1)
     with pytest.raises(ConfigError, match=r"not come to round 1 .*first `worldloop run`"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,8 @@ from pipeline.commands.worlds.gradients import (
     tables,
 )
 from pipeline.config import load_config
-from tests.beginning import begun
+from pipeline.graph.kept import Tensors
+from tests.beginning import anew, begun
 
 
 def said(found: Found, batches: int) -> str:
@@ -30,7 +32,7 @@ def said(found: Found, batches: int) -> str:
 def test_imagined_and_recorded_decisions_by_lambda_and_task(tmp_path: Path) -> None:
     cfg, ready = begun(tmp_path)
     before = {name: value.clone() for name, value in ready.policy.state_dict().items()}
-    found = measured(cfg, ready, 3)
+    found = measured(cfg, ready, 3, anew)
     assert list(found.by_lambda) == sorted({*LAMS, found.used})  # type: ignore[type-var]
     decisions = ready.true.decisions
     assert decisions is not None and len(decisions) >= 32
@@ -52,8 +54,24 @@ def test_imagined_and_recorded_decisions_by_lambda_and_task(tmp_path: Path) -> N
     assert text.count("(in use)") == 1 and "half signal" in text and text.count("| move the square") == 2
 
 
+def test_what_is_kept_is_not_taken_again_and_is_the_same_if_it_is(tmp_path: Path) -> None:
+    cfg, ready = begun(tmp_path)
+    kept: dict[str, Tensors] = {}
+
+    def keep(name: str, about: Mapping[str, Any], make: Callable[[], Tensors]) -> Tensors:
+        return kept[name] if name in kept else kept.setdefault(name, make())
+
+    whole = rows_by_lambda(measured(cfg, ready, 3, keep))
+    assert list(kept) == ["imagined-0", "imagined-1", "imagined-2", "recorded"]
+    before = kept.pop("imagined-1")
+    assert rows_by_lambda(measured(cfg, ready, 3, keep)) == whole
+    assert before.keys() == kept["imagined-1"].keys()
+    assert all(torch.equal(value, kept["imagined-1"][name]) for name, value in before.items())
+    assert rows_by_lambda(measured(cfg, replace(ready, recipe=None), 3, keep)) == whole  # type: ignore[arg-type]
+
+
 def test_an_algorithm_without_lambda_has_one_row(tmp_path: Path) -> None:
-    found = measured(*begun(tmp_path, "algorithm=grpo", "algorithm.group=2"), 3)
+    found = measured(*begun(tmp_path, "algorithm=grpo", "algorithm.group=2"), 3, anew)
     assert list(found.by_lambda) == [None] and not found.by_task and not found.by_lambda[None].recorded
     assert "| none (in use) |" in said(found, 3)
 
@@ -72,7 +90,7 @@ class Own:
 
 def test_somebody_elses_algorithm_keeps_the_advantages_that_it_gave(tmp_path: Path) -> None:
     cfg, ready = begun(tmp_path)
-    found = measured(cfg, replace(ready, algorithm=Own(ready.algorithm)), 3)
+    found = measured(cfg, replace(ready, algorithm=Own(ready.algorithm)), 3, anew)
     assert list(found.by_lambda) == [None] and len(found.by_lambda[None].recorded) == 16
 
 
