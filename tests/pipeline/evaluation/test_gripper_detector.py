@@ -43,7 +43,7 @@ from pipeline.evaluation.objects.rays import nearest_on_ray, rays, triangulate
 from tests.arms import two_arms
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES, world_spec
 from tests.moving_square import SIZE, moving_square
-from tests.pipeline.evaluation.test_fidelity import Drawing
+from tests.pipeline.evaluation.fidelity.test_measures import Drawing
 from tests.second_device import DEVICE, second_device
 
 SECTION = {

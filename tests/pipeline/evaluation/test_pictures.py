@@ -35,7 +35,7 @@ from pipeline.evaluation.grippers.ruler import GripperRuler
 from pipeline.evaluation.measurement import rollout_error, speed
 from tests.embodiments import BIMANUAL_POSES, world_spec
 from tests.moving_square import SIZE, episodes_of, moving_square
-from tests.pipeline.evaluation.test_fidelity import Drawing
+from tests.pipeline.evaluation.fidelity.test_measures import Drawing
 
 SPEC = world_spec(BIMANUAL_POSES.at(SIZE), SIZE)
 DARK = (5, 8, 11)  # frames of each episode of 13 without a picture
