@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 from actors.factory import build_simulator, build_state_decoder
 from actors.serving.sessions import ServeConfig, SessionHost
 from actors.world_config import build_kinematics, world_spec
@@ -22,7 +24,7 @@ def build_session_host(cfg: Mapping[str, Any], root: Path, config: ServeConfig) 
     """The sessions of the configured simulator.
 
     With finetune.data it is what `worldloop finetune` made of those data; else the experiment's last, or,
-    where nothing was trained, a released checkpoint.
+    where nothing was trained, a released checkpoint, without joint states if it holds no state expert.
 
     Raises:
         ConfigError: if it has no weights yet, or is itself remote.
@@ -50,8 +52,14 @@ def build_session_host(cfg: Mapping[str, Any], root: Path, config: ServeConfig) 
             f" `{way}` with these words go on"
         )
     simulator = build_simulator(cfg, weights if weights.exists() else None)
-    decoder = build_state_decoder(cfg, simulator, states if weights.exists() else None)
-    return SessionHost(simulator, decoder.eval(), config, _joints(cfg), cfg["simulator"]["bf16"])
+    made = build_state_decoder(cfg, simulator, states if weights.exists() else None).eval()
+    decoder = made if weights.exists() or made.normalised else None
+    if decoder is None:
+        tqdm.write(
+            f"simulator.checkpoint={cfg['simulator']['checkpoint']} comes without a state expert, so frames are"
+            " served without joint states; `worldloop finetune` trains one"
+        )
+    return SessionHost(simulator, decoder, config, _joints(cfg), cfg["simulator"]["bf16"])
 
 
 def _joints(cfg: Mapping[str, Any]) -> JointCommands | None:

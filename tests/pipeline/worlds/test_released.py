@@ -16,9 +16,11 @@ from envs.simulators.gesim.engine import GESimulator
 from envs.simulators.gesim.state_expert import GESimStateExpert
 from envs.targets import ConfigError
 from pipeline.cli.runs import evaluate
+from pipeline.commands.serving import build_session_host
 from pipeline.commands.worlds.fidelity import fidelity
 from pipeline.commands.worlds.subject import Subject
 from pipeline.config import load_config
+from tests.actors.serving import serve_config
 from tests.arms import two_arms
 from tests.embodiments import BIMANUAL_JOINTS
 from tests.envs.simulators.gesim_tiny import write_checkpoint
@@ -95,3 +97,16 @@ def test_weights_of_ones_own_come_before_released_ones(tmp_path: Path, words: li
     other = Subject.of(load_config([*words, f"simulator.checkpoint={first}"]), root)
     with pytest.raises(ConfigError, match=r"ge_sim_v1\.safetensors holds no state expert; train one"):
         other.decoder(other.simulator())
+
+
+def test_what_has_no_state_expert_is_served_without_states(
+    tmp_path: Path, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    host = build_session_host(load_config(words), tmp_path / "runs/smoke", serve_config())
+    assert (
+        isinstance(host.decoder, GESimStateExpert) and "without joint states" not in capsys.readouterr().out
+    )
+    frames_alone = write_checkpoint(tmp_path / "older", expert=False)
+    cfg = load_config([*words, f"simulator.checkpoint={frames_alone}"])
+    host = build_session_host(cfg, tmp_path / "runs/smoke", serve_config())
+    assert host.decoder is None and "without joint states" in capsys.readouterr().out
