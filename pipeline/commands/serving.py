@@ -56,8 +56,8 @@ def build_session_host(cfg: Mapping[str, Any], root: Path, config: ServeConfig) 
     decoder = made if weights.exists() or made.normalised else None
     if decoder is None:
         tqdm.write(
-            f"simulator.checkpoint={cfg['simulator']['checkpoint']} comes without a state expert, so frames are"
-            " served without joint states; `worldloop finetune` trains one"
+            f"simulator.checkpoint={cfg['simulator']['checkpoint']} comes without a state expert, so frames"
+            " are served without joint states; `worldloop finetune` trains one"
         )
     return SessionHost(simulator, decoder, config, _joints(cfg), cfg["simulator"]["bf16"])
 
