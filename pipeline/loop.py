@@ -84,25 +84,30 @@ def check_physics(cfg: Cfg, who: str) -> None:
         raise ConfigError(f"{who} records its own episodes; choose a task with a suite (task=push)")
 
 
-def check_labels(cfg: Cfg, graph: Graph, until: str | Sequence[str] = "") -> None:
+def check_labels(cfg: Cfg, graph: Graph, until: str = "") -> None:
     """See that recordings say what the judge is taught by, hours before it is its turn.
 
     Args:
-        until: the last nodes that are wanted; "" wants all.
+        until: the last node that is wanted; "" wants all.
 
     Raises:
         ConfigError: naming the column and the fix.
     """
-    judge: Any = target(cfg["judge"], "judge")
     wanted = graph.needs(until) if until else graph.nodes
-    if has_physics(cfg) or not judge.needs_labels or not any(name.startswith("judge-") for name in wanted):
-        return
-    if not any(SUCCESS in read_info(Path(folder))["features"] for folder in cfg["task"]["data"]):
+    if any(name.startswith("judge-") for name in wanted) and not can_be_taught(cfg):
         raise ConfigError(
             f"judge={cfg['judge']['_target_']} learns from success, which no data set of"
             f" task.data={cfg['task']['data']} says; record {SUCCESS}, or choose a judge that needs none, as"
             " judge=goal_image judge.picture=<file> or judge=vlm"
         )
+
+
+def can_be_taught(cfg: Cfg) -> bool:
+    """Whether somebody tells the judge of success, if it learns from that."""
+    judge: Any = target(cfg["judge"], "judge")
+    if has_physics(cfg) or not judge.needs_labels:
+        return True
+    return any(SUCCESS in read_info(Path(folder))["features"] for folder in cfg["task"]["data"])
 
 
 def last_round(cfg: Cfg) -> int:

@@ -28,7 +28,7 @@ from pipeline.evaluation.judging import judge_frames, judge_table, labelled
 from pipeline.evaluation.measurement import rollout_error, speed
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, Place, stage
-from pipeline.loop import add_episodes, check_labels
+from pipeline.loop import add_episodes, can_be_taught
 from pipeline.markdown import markdown_table
 from pipeline.outside import CHECKPOINT, KINEMATICS, files_at
 from pipeline.stages import world
@@ -43,6 +43,7 @@ _EVALUATIONS, _FASTER, _LOST_DB, _DETAIL = 4, 4.0, 0.5, 0.8
 _EPISODES = 8  # held-out ones of full length whose pictures are measured
 _JUDGED = 48  # held-out ones that are judged
 _MOVED = 0.05  # by which a colour differs from the first frame's where something has moved
+_VERDICTS = ("tp", "fp", "fn", "tn")
 _TRAJECTORY = {"_target_": "learners.stages.distill.trajectory.TrajectoryRegression"}
 _FIGURES = {
     "frames/s at 1": "{speed_1:.0f}",
@@ -62,7 +63,7 @@ def distil(cfg: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Print the table, and leave it in distil.json of the run's folder; returns the figures by row.
 
     Raises:
-        ConfigError: if the simulator has no steps, or recordings do not say what the judge learns from.
+        ConfigError: if the simulator has no steps.
     """
     prepare_process(cfg["seed"], cfg["threads"])
     root = root_of(cfg)
@@ -145,7 +146,11 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
     )
 
     def judged(own: Graph, name: str, simulator: str, state: str) -> str:
-        """The judge of a simulator; one that learned from recorded pictures alone is the same for all."""
+        """The judge of a simulator, "" if nobody can teach it; one that learned from recorded pictures alone
+        is the same for all.
+        """
+        if not can_be_taught(cfg):
+            return ""
         if not judge_class.reads_features and not cfg["judge_fit"]["first"]["imagined"]:
             own, name, simulator, state = graph, "all", teacher, ""
         if f"judge-{name}" in own.nodes:
@@ -176,7 +181,6 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[str, st
             roles = {"data": data, "simulator": teacher}
             student = own.add(f"student-{name}-{steps}", world.student, roles, phase="first")
             measured(f"{name}, {steps}", f"{name}-{steps}", student, acting(own.cfg)["simulator"], steps)
-    check_labels(cfg, graph, list(rows.values()))
     return graph, rows, left
 
 
@@ -228,13 +232,16 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
 
 def _verdicts(cfg: Cfg, inputs: Inputs, simulator: Simulator, store: ClipStore) -> dict[str, float | None]:
     """Confusion of the judge's verdicts on generated video with recorded success, and imagined less true
-    success in points, of the episodes that it could judge; None if there are none.
+    success in points, of the episodes that it could judge; None of all where there is no judge, or nothing
+    says success.
     """
     held, bf16 = labelled(store, store.split("held_out"))[:_JUDGED], cfg["simulator"]["bf16"]
+    if "judge" not in inputs.found or not len(held):
+        return dict.fromkeys((*(f"judge_{name}" for name in _VERDICTS), "judge_gap"))
     made, judge = replay(simulator, store, held, bf16=bf16), build_judge(cfg, inputs.weights("judge"))
     scores = judge_frames(judge.eval(), made.frames, made.valid, store, held, made.features)
     found = judge_table(judge, scores, made.valid, store, held)
-    count = {name: float(found.get(name, 0)) for name in ("tp", "fp", "fn", "tn")}
+    count = {name: float(found.get(name, 0)) for name in _VERDICTS}
     judged = sum(count.values())
     gap = 100 * (count["fp"] - count["fn"]) / judged if judged else None
     return {**{f"judge_{name}": value for name, value in count.items()}, "judge_gap": gap}

@@ -27,7 +27,7 @@ from pipeline.evaluation.judging import thinned
 from pipeline.evaluation.statistics import mean
 from pipeline.graph.graph import Graph
 from pipeline.graph.stage import Inputs, Place, stage
-from pipeline.loop import World, add_episodes, add_world, check_labels
+from pipeline.loop import World, add_episodes, add_world, can_be_taught
 from pipeline.markdown import markdown_table
 from pipeline.stages.given import WORLD, Cfg, open_store
 from pipeline.stages.judging.cost import priced
@@ -40,11 +40,7 @@ _HEADINGS = (
 
 
 def strides(cfg: dict[str, Any]) -> dict[int, dict[str, Any]]:
-    """Print the table, and leave it in strides.json of the run's folder; returns the figures by stride.
-
-    Raises:
-        ConfigError: if recordings do not say what the judge learns from.
-    """
+    """Print the table, and leave it in strides.json of the run's folder; returns the figures by stride."""
     prepare_process(cfg["seed"], cfg["threads"])
     root = root_of(cfg)
     graph, rows = build_table(cfg, root / "strides")
@@ -65,17 +61,16 @@ def build_table(cfg: Mapping[str, Any], root: Path) -> tuple[Graph, dict[int, st
     graph = Graph(acting(cfg), root)
     data = add_episodes(graph, cfg)
     made, numbers = add_world(graph, cfg, data, World(), 1), sorted(cfg["simulator_fit"]["first"]["strides"])
-    roles, common = {"data": data, **made.roles()}, common_stride(numbers)
-    del roles["state"]  # which knows stride 1 alone
-    rows = {n: graph.add(f"stride-{n}", measure, roles, stride=n, common=common) for n in numbers}
-    check_labels(cfg, graph, list(rows.values()))
-    return graph, rows
+    judge, common = made.judge if can_be_taught(cfg) else "", common_stride(numbers)
+    roles = {"data": data, "simulator": made.simulator, "judge": judge}
+    return graph, {n: graph.add(f"stride-{n}", measure, roles, stride=n, common=common) for n in numbers}
 
 
 @stage(reads=WORLD, place=Place.EVALUATOR)
 @priced
 def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """Rollouts of held-out episodes, and what the judge says of them and of the same recorded frames.
+    """Rollouts of held-out episodes, and what the judge, if there is one, says of them and of the same
+    recorded frames.
 
     Settings: stride, and common, a multiple of it, at whose frames strides are compared.
     """
@@ -98,8 +93,10 @@ def measure(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
     shown = stride * torch.arange(1, psnr.shape[1] + 1)
     seen = made.pictured(store).valid
     alike = seen & (shown % common == 0)
-    with thinned(build_judge(cfg, inputs.weights("judge")).eval(), stride) as judge:
-        verdicts = verdict_tables(judge, store, held, [judged(judge, store, held, made)], made.valid)
+    verdicts: dict[str, Any] = {}
+    if "judge" in inputs.found:
+        with thinned(build_judge(cfg, inputs.weights("judge")).eval(), stride) as judge:
+            verdicts = verdict_tables(judge, store, held, [judged(judge, store, held, made)], made.valid)
     return {
         "covers": stride * store.spec.chunk / store.fps,
         "seconds": seconds,

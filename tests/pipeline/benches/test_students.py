@@ -110,6 +110,14 @@ def test_strides_reach_as_many_times_further(tmp_path: Path, capsys: pytest.Capt
         assert math.isfinite(row["psnr"]) and row["verdicts"]
     graph, rows, _ = students.build_table(load_config([*own, *STUDENTS, "name=few"]), tmp_path / "few")
     assert "recordings" in graph.needs(list(rows.values())) and "collect" not in graph.nodes
+    info = recorded / "meta/info.json"  # as of a set that says nothing of success
+    told = json.loads(info.read_text())
+    told["features"] = {name: value for name, value in told["features"].items() if "success" not in name}
+    info.write_text(json.dumps(told))
+    cfg = load_config([*own, "simulator_fit.first.strides=[1,2]", "name=unlabelled"])
+    assert all(row["verdicts"] == {} for row in strides(cfg).values())
+    graph, rows, _ = students.build_table(load_config([*own, *STUDENTS, "name=few"]), tmp_path / "none")
+    assert not any(name.startswith("judge") for name in graph.needs(list(rows.values())))
 
 
 def test_benches_say_what_they_cannot_do() -> None:
