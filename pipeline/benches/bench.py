@@ -88,8 +88,25 @@ def config_of(name: str, words: Sequence[str]) -> dict[str, Any]:
     Raises:
         ConfigError: see load_config; or if a simulator that should denoise in steps does not.
     """
-    given = [*without_given(BENCHES[name][1], words), *words]
+    given = [*fitting(without_given(BENCHES[name][1], words), words), *words]
     return load_config([*stepped(given, STEPS[name]), *given] if name in STEPS else given)
+
+
+def fitting(base: Sequence[str], words: Sequence[str]) -> list[str]:
+    """Those overrides of `base` that fit the choices of the words: what it says of a task's own parts, or of
+    keys that another choice lacks, is of its own choice alone.
+    """
+    chosen = {word.partition("=")[0] for word in words if "." not in word.partition("=")[0]}
+    paths = {word: word.partition("=")[0].split(".") for word in base}
+    if not any(len(path) > 1 and path[0] in chosen for path in paths.values()):
+        return list(base)
+    choices = [word for word, path in paths.items() if len(path) == 1]
+    found = read_config([*choices, *(word for word in words if word.partition("=")[0] in chosen)])
+    return [
+        word
+        for word, path in paths.items()
+        if path[0] not in chosen or len(path) == 1 or (len(path) == 2 and path[1] in found[path[0]])
+    ]
 
 
 def stepped(words: Sequence[str], steps: int) -> list[str]:

@@ -74,6 +74,19 @@ def test_every_row_can_be_built_of_every_engine_before_any_work(engine: str, tmp
     assert fewer == {**teacher, key: {**teacher[key], "steps": 6}}
 
 
+@pytest.mark.parametrize("bench", ["distil", "strides"])
+def test_what_a_bench_says_of_its_own_task_is_not_said_of_another(bench: str) -> None:
+    assert config_of(bench, [])["task"]["suite"]["cameras"] == ["head"]
+    for words in (["task=lerobot", "task.data=[somewhere]"], ["task=metaworld"]):
+        chosen = config_of(bench, words)["task"]
+        assert (chosen["horizon"], chosen["size"]) == ({"distil": 64, "strides": 48}[bench], [32, 32])
+        assert chosen["suite"] is None or "head" not in chosen["suite"]["cameras"]
+    assert (
+        "width"
+        not in config_of(bench, ["simulator=gesim_tiny", "task.chunk=5", "task.horizon=60"])["simulator"]
+    )
+
+
 def test_a_student_meets_all_that_it_should_or_it_is_said_what_it_missed() -> None:
     def row(evaluations: int, *figures: float | None) -> dict[str, float | None]:
         names = ("speed_1", "speed_32", "rollout_psnr", "rollout_detail", "judge_gap")
