@@ -17,7 +17,7 @@ from envs.targets import ConfigError
 from learners.rl.ppo import PPO
 from pipeline.commands.worlds.gradient_parts import COUNTS, FEWEST, LAMBDA, PARTS, TASK, Parts, rollouts
 from pipeline.commands.worlds.subject import Keep, kept_of_round, round_inputs
-from pipeline.evaluation.trust.gradients import PER, Measured, alignment, plain_row, policy_gradient, signal
+from pipeline.evaluation.trust.gradients import PER, Measured, alignment, plain_row, signal
 from pipeline.graph.kept import Tensors
 from pipeline.loop import build_loop
 from pipeline.markdown import markdown_table
@@ -89,7 +89,7 @@ def gradients(cfg: Mapping[str, Any], root: Path, number: int, batches: int) -> 
     inputs = round_inputs(graph, root, number, "rl")
     name = f"rl-{number}"
     ready = begin(rl.view(name, graph.cfg, graph.nodes[name].settings), inputs)
-    keep = kept_of_round(graph, root / "gradients", number, policy_gradient.__module__)
+    keep = kept_of_round(graph, root / "gradients", number, Parts.__module__)
     found = measured(graph.cfg, ready, batches, keep)
     lambdas, tasks = rows_by_lambda(found), rows_by_task(found)
     kept = [[*map(plain_row, rows)] for rows in (lambdas, tasks)]
@@ -106,6 +106,7 @@ def measured(cfg: Mapping[str, Any], ready: Imagination, batches: int, keep: Kee
     used = algorithm.config.lam if isinstance(algorithm, PPO) else None
     lams = (None,) if used is None else tuple(sorted({*LAMS, used}))
     tasks = [] if used is None else tasks_of_starts(cfg, ready.store, ready.inside, ready.beyond)
+    about = {"lambdas": [str(lam) for lam in lams]}
     parts = Parts(ready, lams, used, tasks if len(set(tasks)) > 1 else [])
     found = Found({lam: Gradients() for lam in lams}, {}, used)
     with rollouts(ready) as rollout:
@@ -114,11 +115,11 @@ def measured(cfg: Mapping[str, Any], ready: Imagination, batches: int, keep: Kee
             return parts.imagined(rollout(number))
 
         for number in tqdm(range(batches), desc="imagined batches", unit="batch", dynamic_ncols=True):
-            made = keep(f"imagined-{number}", {"batch": number}, partial(once, number))
+            made = keep(f"imagined-{number}", {**about, "batch": number}, partial(once, number))
             found.add("imagined", made)
     decisions = ready.true.decisions
     if decisions is not None and ready.rollout is not None and len(decisions) >= FEWEST * PARTS:
-        found.add("recorded", keep("recorded", {}, lambda: parts.recorded(cfg, decisions)))
+        found.add("recorded", keep("recorded", about, lambda: parts.recorded(cfg, decisions)))
     return found
 
 
