@@ -11,7 +11,7 @@ METAWORLD := metaworld==3.1.1
 ALOHA := dm_control==1.0.41 gym-aloha==0.1.5
 OGBENCH := dm_control==1.0.41 ogbench==1.2.2
 
-.PHONY: setup metaworld aloha ogbench gl test lint quickstart smoke controls clean
+.PHONY: setup metaworld aloha ogbench gl test test-all lint quickstart smoke controls clean
 
 setup: gl $(VENV)/.ready
 
@@ -55,6 +55,10 @@ lint: setup
 
 test: lint
 	$(BIN)/python -m pytest -n $(TEST_WORKERS) --dist loadfile
+
+# Also what takes long and proves no more than further variants of what `make test` samples.
+test-all: lint
+	$(BIN)/python -m pytest -n $(TEST_WORKERS) --dist loadfile -m ""
 
 quickstart: setup
 	$(BIN)/worldloop run experiment=quickstart seed=$(SEED)

@@ -71,12 +71,15 @@ def test_a_student_of_few_steps(
     "choices",
     [
         (),
-        (
-            "policy=chunk_tokens",
-            "algorithm=grpo",
-            "algorithm.group=2",
-            "simulator=dit_small",
-            "judge=embedding",
+        pytest.param(
+            (
+                "policy=chunk_tokens",
+                "algorithm=grpo",
+                "algorithm.group=2",
+                "simulator=dit_small",
+                "judge=embedding",
+            ),
+            marks=pytest.mark.long,
         ),
     ],
 )

@@ -7,8 +7,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import scipy
 import torch
-from scipy.stats import binomtest, ttest_1samp
 from torch import Tensor
 
 _MOST = 1_000_000  # values looked at; torch.quantile takes 16 M, and a million says the same
@@ -18,7 +18,7 @@ def wilson(successes: int, episodes: int, confidence: float = 0.95) -> tuple[flo
     """Wilson score interval of a success rate (Wilson 1927); (0, 1) without episodes."""
     if episodes == 0:
         return 0.0, 1.0
-    interval = binomtest(successes, episodes).proportion_ci(confidence, method="wilson")
+    interval = scipy.stats.binomtest(successes, episodes).proportion_ci(confidence, method="wilson")
     return float(interval.low), float(interval.high)
 
 
@@ -72,7 +72,7 @@ def mcnemar(before: Tensor, after: Tensor) -> dict[str, Any]:
     """Exact two-sided McNemar test of paired outcomes bool [N] -> {"gained", "lost", "p"}."""
     gained, lost = int((after & ~before).sum()), int((before & ~after).sum())
     discordant = gained + lost
-    p = float(binomtest(gained, discordant, 0.5).pvalue) if discordant else 1.0
+    p = float(scipy.stats.binomtest(gained, discordant, 0.5).pvalue) if discordant else 1.0
     return {"gained": gained, "lost": lost, "p": p}
 
 
@@ -84,7 +84,7 @@ def over_seeds(gains: Sequence[float], confidence: float = 0.95) -> dict[str, An
     mean = sum(gains) / len(gains)
     if max(gains) == min(gains):
         return {"mean": mean, "low": mean, "high": mean, "p": None}
-    test = ttest_1samp(gains, 0.0)
+    test = scipy.stats.ttest_1samp(gains, 0.0)
     low, high = test.confidence_interval(confidence)
     return {"mean": mean, "low": float(low), "high": float(high), "p": float(test.pvalue)}
 

@@ -34,6 +34,7 @@ from pipeline.commands.submit import entrypoint
 from pipeline.config import load_config
 
 
+@pytest.mark.long
 def test_a_lost_node_costs_no_job(recipe: Recipe, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_worker_niceness", "0")  # else workers starve beside the other tests
     # Ray gives a silent node half a minute by default. One that is gone refuses at once; one on a busy
@@ -82,7 +83,11 @@ def test_a_lost_node_costs_no_job(recipe: Recipe, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize(
     ("when", "number", "status"),
-    [("starting", signal.SIGKILL, -9), ("starting", signal.SIGTERM, 143), ("up", signal.SIGTERM, 143)],
+    [
+        ("starting", signal.SIGKILL, -9),
+        pytest.param("starting", signal.SIGTERM, 143, marks=pytest.mark.long),
+        ("up", signal.SIGTERM, 143),
+    ],
 )
 def test_an_ended_driver_leaves_no_ray_and_the_status_that_shells_expect(
     when: str, number: int, status: int
@@ -152,6 +157,7 @@ def test_a_sigterm_that_python_drops_counts_and_is_not_reported(capsys: pytest.C
     assert ended.value.code == 143 and "Traceback" not in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_wrong_token_is_named() -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

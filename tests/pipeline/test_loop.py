@@ -26,12 +26,17 @@ FEWER = (
 LEARNED = ("imitation", "simulator-1", "state-1", "judge-1", "clone-1", "rl-1")
 
 
+def finished(folder: Path) -> tuple[tuple[str, ...], Path]:
+    """The words and the folder of a run that has come to its end."""
+    words = ("experiment=smoke", f"runs={folder}", "track=offline", *FEWER)
+    out = worldloop(folder, "run", *words)
+    assert out.status == 0, out.output[-3000:]
+    return words, folder / "smoke"
+
+
 @pytest.mark.slow
 def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
-    words = ("experiment=smoke", f"runs={tmp_path}", "track=offline", *FEWER)
-    out = worldloop(tmp_path, "run", *words)
-    assert out.status == 0, out.output[-3000:]
-    run = tmp_path / "smoke"
+    words, run = finished(tmp_path)
     result = json.loads((run / "result.json").read_text())
     assert result["physics_before"]["episodes"] == 10 and len(result["rounds"]) == 2
     assert "on-policy" in result["rollout"]
@@ -50,6 +55,15 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     assert one.status == 0, one.output[-3000:]
     assert set(json.loads((run / "controls.json").read_text())) == {"before", "loop", "filtered BC"}
     assert "filtered BC" in (run / "report.html").read_text()
+    later = json.loads((run / "wandb.json").read_text())["rows"]
+    assert "filtered-bc" in later.keys() - tracked["rows"].keys()
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_controls_stand_beside_a_run(tmp_path: Path) -> None:
+    words, run = finished(tmp_path)
+    tracked = json.loads((run / "wandb.json").read_text())["rows"]
     controls = worldloop(tmp_path, "controls", *words)
     assert controls.status == 0, controls.output[-3000:]
     rows = json.loads((run / "controls.json").read_text())
@@ -64,7 +78,7 @@ def test_the_whole_loop_at_its_smallest(tmp_path: Path) -> None:
     assert noted == {"RL in physics, equal episodes", "RL in physics, equal steps"}
     assert "equal steps" in (run / "report.html").read_text() and controls.output.count(note) == 2
     later = json.loads((run / "wandb.json").read_text())["rows"]
-    assert {"rl-in-physics-equal-episodes", "filtered-bc"} <= later.keys() - tracked["rows"].keys()
+    assert {"rl-in-physics-equal-episodes", "filtered-bc"} <= later.keys() - tracked.keys()
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.dataset as pads
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from envs.embodiment import Embodiment, EmbodimentError
@@ -271,9 +271,7 @@ class LeRobotDataset:
             start = float(row[f"videos/{key}/from_timestamp"])
             return read_clip(video, start, length, self.fps, self.size)
         try:
-            part = pads.dataset(path, format="parquet").to_table(
-                columns=[key], filter=pads.field("episode_index") == row["episode_index"]
-            )
+            part = pq.read_table(path, columns=[key], filters=[("episode_index", "=", row["episode_index"])])
         except (OSError, pa.ArrowInvalid) as error:
             raise EpisodeError(f"{path}: {error}; restore the file") from error
         pictures = [stored_picture(self.root, key, cell) for cell in part[key].to_pylist()]

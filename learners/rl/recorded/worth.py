@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import scipy
 import torch
-from scipy.stats import rankdata
 from torch import Tensor
 
 Estimate = tuple[float, float]  # and its standard error
@@ -138,7 +138,7 @@ def _correlation(returns: Returns) -> float | None:
 
 def _scores(values: Tensor) -> Tensor:
     """Normal quantiles float64 [N] of the ranks of values [N]; those that are alike share theirs."""
-    ranks = torch.from_numpy(rankdata(values.numpy()))
+    ranks = torch.from_numpy(scipy.stats.rankdata(values.numpy()))
     return torch.special.ndtri((ranks - 0.5) / len(values))
 
 

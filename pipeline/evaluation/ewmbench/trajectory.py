@@ -12,9 +12,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
-from scipy.stats import wasserstein_distance
 
 from pipeline.evaluation.ewmbench.parity import public_travel, unfilled
 
@@ -105,7 +105,7 @@ def dynamics(one: Floats, other: Floats, strict_parity: bool) -> float:
     for weight, (a, b) in ((VELOCITY, speeds), (ACCELERATION, [np.diff(speed) for speed in speeds])):
         spans = sorted((float(np.ptp(a)), float(np.ptp(b))))
         ratio = (spans[0] + EPS) / (spans[1] + EPS)
-        distance = float(wasserstein_distance(a, b))
+        distance = float(scipy.stats.wasserstein_distance(a, b))
         if not strict_parity:
             score += weight * ratio / max(distance, least)
         elif distance:

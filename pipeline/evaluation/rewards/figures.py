@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy.stats import rankdata, spearmanr
 from torch import Tensor
 
 from envs.episodes.clips import ClipStore
@@ -81,7 +81,7 @@ def figures(judge: Judge, scores: Scores, truth: Truth, seed: int) -> dict[str, 
     each = np.array([_rank(*pair) for pair in _episodes(scores, truth)])
     flat = (scores.progress[truth.valid].numpy(), truth.progress[truth.valid].numpy())
     constant = not len(flat[0]) or any(np.ptp(side) == 0 for side in flat)
-    pooled = None if constant else float(spearmanr(*flat).statistic)
+    pooled = None if constant else float(scipy.stats.spearmanr(*flat).statistic)
     success = truth.success.numpy()
     return {
         "within": _interval(each[np.isfinite(each)], np.mean, seed),
@@ -99,7 +99,7 @@ def auc(score: Any, positive: Any) -> float:
     hits, misses = int(positive.sum()), int((~positive).sum())
     if not hits or not misses:
         return float("nan")
-    ranks = rankdata(score)
+    ranks = scipy.stats.rankdata(score)
     return float((ranks[positive].sum() - hits * (hits + 1) / 2) / (hits * misses))
 
 
@@ -122,7 +122,7 @@ def _rank(mine: Any, true: Any) -> float:
     """Spearman's correlation; NaN where the truth does not vary, 0 where the reward does not."""
     if len(true) < 3 or np.ptp(true) == 0:
         return float("nan")
-    return 0.0 if np.ptp(mine) == 0 else float(spearmanr(mine, true).statistic)
+    return 0.0 if np.ptp(mine) == 0 else float(scipy.stats.spearmanr(mine, true).statistic)
 
 
 def _interval(rows: Any, value: Callable[[Any], Any], seed: int) -> list[float] | None:

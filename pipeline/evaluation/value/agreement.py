@@ -15,8 +15,8 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy.stats import pearsonr, spearmanr
 from torch import Tensor
 
 from pipeline.evaluation.statistics import confusion, rate_entry
@@ -167,8 +167,8 @@ def _together(cells: Sequence[Cell], tasks: Sequence[Sequence[Cell]]) -> dict[st
     found: dict[str, Any] = {
         "policies": len({cell.policy for cell in cells}),
         "cells": len(cells),
-        "pearson": correlation(pearsonr, true, estimated),
-        "spearman": correlation(spearmanr, true, estimated),
+        "pearson": correlation(scipy.stats.pearsonr, true, estimated),
+        "spearman": correlation(scipy.stats.spearmanr, true, estimated),
         "mmrv": float(np.mean([mmrv(*_values(some)) for some in tasks])),
         "order": kept,
         "kept": kept["kept"] == kept["pairs"] if kept["pairs"] else None,

@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 from torch import Tensor
 
 from envs.rng import resampling_generator
@@ -138,7 +138,9 @@ def _figures(pairs: Sequence[tuple[Array, Array]], tasks: Sequence[Sequence[Cell
     inside = np.array([cell.inside for cells in tasks for cell in cells])
     out = {
         "pearson": _correlations(true, estimated),
-        "spearman": _correlations(rankdata(true, axis=1), rankdata(estimated, axis=1)),
+        "spearman": _correlations(
+            scipy.stats.rankdata(true, axis=1), scipy.stats.rankdata(estimated, axis=1)
+        ),
         "mmrv": np.mean([mmrv(*pair) for pair in pairs], 0),
         "difference": np.abs(off).mean(1),
     }

@@ -150,6 +150,7 @@ def stages(folder: Path, dataset: Path) -> list[float]:
     ]
 
 
+@pytest.mark.long
 def test_two_workers_follow_one_and_either_goes_on_from_the_others_checkpoint(tmp_path: Path) -> None:
     alone = train(tmp_path / "alone")
     leader, follower = two(whole_and_cut, tmp_path / "two")
@@ -160,6 +161,7 @@ def test_two_workers_follow_one_and_either_goes_on_from_the_others_checkpoint(tm
     assert two(train, tmp_path / "from-one")[1] == pytest.approx(alone, rel=1e-4)
 
 
+@pytest.mark.long
 def test_two_workers_follow_one_with_muon(tmp_path: Path) -> None:
     alone = train(tmp_path / "alone", optimiser="muon")
     leader, follower = two(train, tmp_path / "two", None, "muon")

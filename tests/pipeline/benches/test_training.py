@@ -10,7 +10,7 @@ from envs.targets import ConfigError
 from pipeline.benches.training import overfit, pretrained
 from pipeline.config import load_config
 
-SMALL = ["experiment=smoke", "task.size=[32,32]", "task.suite.cameras=[head]"]
+SMALL = ["experiment=soak", "task.suite.cameras=[head]"]
 
 
 def test_learned_weights_are_a_better_beginning() -> None:

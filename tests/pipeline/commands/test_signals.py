@@ -121,7 +121,7 @@ AT_ONCE = {"convert", "stages", "summary", "compare", "submit", "tasks", "config
 # live longest are asked both ways.
 BOTH = ("run", "serve", "chaos")
 CASES = [
-    (name, number)
+    pytest.param(name, number, marks=pytest.mark.long if name == "chaos soak" else ())
     for place, name in enumerate(LASTS)
     for asked, number in enumerate((signal.SIGINT, signal.SIGTERM))
     if name in BOTH or place % 2 == asked

@@ -58,7 +58,12 @@ def finished_in_name_only(words: list[str], root: Path) -> None:
     write_manifest(loop.folder("report"), {"stage": "report", "result": {}})
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+SAMPLED = ("run", "finetune", "submit")  # the others learn in stages of the same graph
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in SAMPLED else pytest.mark.long) for name in COMMANDS]
+)
 def test_rows_come_while_a_stage_learns(
     name: str, tmp_path: Path, tiny_data: Callable[[Embodiment], Path]
 ) -> None:

@@ -45,6 +45,7 @@ def losses(folder: Path, name: str) -> list[float]:
     return [json.loads(line)[name] for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.long
 def test_two_learners_and_an_evaluator_do_what_one_process_does(cluster: None, tmp_path: Path) -> None:
     cfg: dict[str, Any] = load_config([*WORDS, "rl.epochs=1", "launch.actors=1"])
     recipe = demo_recipe(cfg, tmp_path / "world", cfg["rl"]["envs"])

@@ -51,6 +51,7 @@ WORLDS = (
 )
 
 
+@pytest.mark.long
 def test_worlds_stand_side_by_side_after_equal_time(root: Path) -> None:
     text = run_study(planned(root, WORLDS))
     assert "not run" not in text and "## Side by side" in text and "Best in push, of what was run: " in text
@@ -81,6 +82,7 @@ TOKENS = (
 )
 
 
+@pytest.mark.long
 def test_worlds_of_tokens_differ_in_what_their_rows_say(root: Path) -> None:
     assert "not run" not in run_study(planned(root, TOKENS))
     assert {"training", "rollout", "speed", "verdicts"} <= set(table_of(root)["rows"][0]["cells"])
@@ -109,6 +111,7 @@ STUDENTS = (
 )
 
 
+@pytest.mark.long
 def test_students_gain_by_the_same_rl_as_their_teacher(root: Path) -> None:
     assert "not run" not in run_study(planned(root, STUDENTS))
     cells = [entry["cells"] for entry in table_of(root)["rows"]]
@@ -187,6 +190,7 @@ DATA = (
 )
 
 
+@pytest.mark.long
 def test_worlds_of_fewer_episodes_are_tried_on_the_same_ones(root: Path) -> None:
     assert "not run" not in run_study(planned(root, DATA))
     quarter, whole = planned(root, DATA).rows

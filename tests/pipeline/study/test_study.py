@@ -27,6 +27,7 @@ SMALL = (
 )
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_study_runs_what_is_missing_and_says_what_is_not_run(tmp_path: Path) -> None:
     words = ("study", *SMALL, f"runs={tmp_path}")
@@ -110,15 +111,27 @@ def test_rows_over_seeds_share_evaluation_episodes_and_only_as_many_seeds_as_ask
         (["study.rows=[imitation,pp]"], "study.rows holds 'pp'"),
         (["study.only=[grpo]"], "study.only holds 'grpo', which study.rows has not"),
         (["study.minutes=-1"], "study.minutes=-1 should be greater than or equal to 0"),
-        (["study.methods.ppo.changes=['rl.epoch=2']"], "study.methods.ppo.changes=['rl.epoch=2']: rl.epoch"),
+        (
+            ["study.rows=[ppo]", "study.methods.ppo.changes=['rl.epoch=2']"],
+            "study.methods.ppo.changes=['rl.epoch=2']: rl.epoch",
+        ),
         (
             ["study.measures.out_of_domain.variant=elsewhere"],
             "study.measures.out_of_domain in the row imitation",
         ),
-        (["study.methods.ppo.policy._target_=pathlib.Path"], "which is no pipeline.study.methods.Method"),
-        (["study.methods.physics_episodes.policy.equal=hours"], "policy.equal='hours' should be"),
+        (
+            ["study.rows=[ppo]", "study.methods.ppo.policy._target_=pathlib.Path"],
+            "which is no pipeline.study.methods.Method",
+        ),
+        (
+            ["study.rows=[physics_episodes]", "study.methods.physics_episodes.policy.equal=hours"],
+            "policy.equal='hours' should be",
+        ),
         (["study.places=[moon]"], "study.places holds 'moon', which study.across has not"),
-        (["+study.methods.filtered_bc.policy.kept=false"], "rl=false leaves no policy of RL's to take"),
+        (
+            ["study.rows=[filtered_bc]", "+study.methods.filtered_bc.policy.kept=false"],
+            "rl=false leaves no policy of RL's to take",
+        ),
         (
             ["+study.across={moon: ['task.gravity=1']}", "study.places=[moon]"],
             "study.methods.imitation.changes=['task.gravity=1'] in study.across.moon: task.gravity",
@@ -127,7 +140,7 @@ def test_rows_over_seeds_share_evaluation_episodes_and_only_as_many_seeds_as_ask
 )
 def test_what_is_wrong_with_a_plan_is_told_by_key(words: list[str], told: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as error:
-        plan_study([*SMALL, f"runs={tmp_path}", *words])
+        plan_study([*SMALL, "study.rows=[imitation]", "study.against=[]", f"runs={tmp_path}", *words])
     assert told in str(error.value)
 
 
