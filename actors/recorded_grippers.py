@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from envs.conditioning.units import RESOLUTION
 from envs.embodiment import Embodiment
 from envs.episodes.episode import EpisodeError
-from envs.episodes.formats.lerobot_files import column_array, open_parquet
+from envs.episodes.formats.lerobot.files import column_array, open_parquet
 from envs.files import files_below
 
 log = logging.getLogger(__name__)

@@ -13,8 +13,8 @@ from actors.rehearsal import judge_faults, policy_faults, refusals
 from envs.chunked import check_mode
 from envs.conditioning import PoseMapStyle
 from envs.embodiment import Embodiment, EmbodimentError, Robot
-from envs.episodes.formats.lerobot_info import arms_are_said
-from envs.episodes.formats.lerobot_robot import agreed_robot, alike_calibrated
+from envs.episodes.formats.lerobot.info import arms_are_said
+from envs.episodes.formats.lerobot.robot import agreed_robot, alike_calibrated
 from envs.geometry.kinematics import Kinematics, KinematicsError
 from envs.physics.suite import SuiteError, build_suite, check_task, task_names
 from envs.simulators.base import WORLD_OPTIONS

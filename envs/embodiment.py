@@ -1,7 +1,7 @@
 """What a robot is, as data: the names and kinds of its action and state, its cameras, its rate.
 
 Every shape, head, encoder, transform, server and test is built from an `Embodiment`. Data sets carry it along
-(envs/episodes/formats/lerobot_info.py). Nothing here imports torch, so physics workers start fast.
+(envs/episodes/formats/lerobot/info.py). Nothing here imports torch, so physics workers start fast.
 """
 
 from __future__ import annotations

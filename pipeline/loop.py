@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from envs.episodes.formats.lerobot_columns import SUCCESS
-from envs.episodes.formats.lerobot_files import read_info
+from envs.episodes.formats.lerobot.columns import SUCCESS
+from envs.episodes.formats.lerobot.files import read_info
 from envs.targets import ConfigError, target
 from pipeline.acting import acting
 from pipeline.choice import Choice

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from envs.embodiment import PYTHON
-from envs.episodes.formats.lerobot_info import INFO_KEY
+from envs.episodes.formats.lerobot.info import INFO_KEY
 from envs.files import files_below, named_files
 from envs.manifest import digest_of, hashes, mark_of
 from envs.targets import TARGET, ConfigError, target

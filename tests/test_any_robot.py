@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from envs.embodiment import Embodiment
-from envs.episodes.formats.lerobot_info import from_info
+from envs.episodes.formats.lerobot.info import from_info
 from tests.commands import worldloop
-from tests.envs.episodes.lerobot_sets import FakeSet, write_set
+from tests.envs.episodes.lerobot.sets import FakeSet, write_set
 
 POSE = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
 SMALL = (

@@ -28,8 +28,9 @@ from envs.conditioning import PoseMapStyle, end_effector_poses, render_pose_map
 from envs.embodiment import ActionKind
 from envs.episodes.angles import check_poses, check_radians, turned_steadily
 from envs.episodes.episode import Episode, EpisodeError
-from envs.episodes.formats.lerobot import LeRobotDataset
-from envs.episodes.formats.lerobot_robot import cameras_without_columns
+from envs.episodes.formats.lerobot import version2
+from envs.episodes.formats.lerobot.dataset import LeRobotDataset
+from envs.episodes.formats.lerobot.robot import cameras_without_columns
 from envs.files import files_below, new_neighbour, put
 from envs.geometry.cameras import follow_wrists
 from envs.geometry.kinematics import Kinematics
@@ -63,7 +64,7 @@ def open_cached(folder: Path, spec: WorldSpec, style: PoseMapStyle, chosen: Path
     """Open the cache of a data set, making it first if it is missing or older than the data.
 
     Args:
-        folder: a LeRobot v3.0 data set.
+        folder: a LeRobot data set.
         spec: how it is read.
         style: how pose maps are drawn.
         chosen: folder for caches; None takes $WORLDLOOP_CACHE, else one beside the data, and where nothing
@@ -115,8 +116,11 @@ def _places(folder: Path, chosen: Path | None) -> list[Path]:
 def _stamp(folder: Path) -> str:
     """Changes whenever a file of the data set does."""
     digest = hashlib.sha256((folder / "meta/info.json").read_bytes())
-    tasks = folder / "meta/tasks.parquet"
-    found = [*files_below(folder / "meta/episodes"), *([tasks] if tasks.is_file() else [])]
+    meta = ("meta/tasks.parquet", version2.TASKS, version2.EPISODES)
+    found = [
+        *files_below(folder / "meta/episodes"),
+        *(folder / name for name in meta if (folder / name).is_file()),
+    ]
     for kind in ("data", "videos", "images"):
         found += files_below(folder / kind)
     for path in found:

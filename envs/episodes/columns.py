@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from envs.episodes.episode import EpisodeError
-from envs.episodes.formats.lerobot_columns import PRIVILEGED
+from envs.episodes.formats.lerobot.columns import PRIVILEGED
 
 
 class Columns(dict[str, Tensor]):

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from envs.episodes.clips import ClipStore
-from envs.episodes.formats.lerobot import LeRobotDataset
-from envs.episodes.formats.lerobot_columns import PRIVILEGED
+from envs.episodes.formats.lerobot.columns import PRIVILEGED
+from envs.episodes.formats.lerobot.dataset import LeRobotDataset
 
 
 def read_privileged(store: ClipStore, name: str) -> Tensor | None:

@@ -3,7 +3,8 @@
 A data set says it in LeRobot's own field, info.json's `splits`: a name and a range of episodes, such as
 {"train": "0:40,56:60", "held_out": "40:48", "calibration": "48:56"}; more than one range where episodes were
 appended later. A set that knows only "train", as LeRobot writes it, is divided by episode number, as far as
-that names episodes: of every eight one is held out and two calibrate.
+that names episodes: of every eight one is held out and two calibrate. Where others stand beside it, such as
+"val" and "test", all of these are held out, and of every eight episodes of "train" two calibrate.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from pathlib import Path
 from zlib import crc32
 
 from envs.episodes.episode import EpisodeError
-from envs.episodes.formats.lerobot_files import read_info
+from envs.episodes.formats.lerobot.files import read_info
 from envs.files import write_atomically
 
-TRAIN = "train"
-NAMES = (TRAIN, "held_out", "calibration")
+TRAIN, HELD_OUT, CALIBRATION = "train", "held_out", "calibration"
+NAMES = (TRAIN, HELD_OUT, CALIBRATION)
 
 
 def range_of(splits: Mapping[str, str], name: str, count: int, folder: Path) -> list[int]:
@@ -27,19 +28,29 @@ def range_of(splits: Mapping[str, str], name: str, count: int, folder: Path) -> 
     Raises:
         EpisodeError: if its splits lack the name, or say no range.
     """
-    divided = name in NAMES and not set(splits) - {TRAIN}
-    if divided and not splits:
-        return [number for number in range(count) if _by_number(number) == name]
-    key = TRAIN if divided else name
+    others = set(splits) - {TRAIN}
+    if name not in NAMES or others & set(NAMES):
+        return _named(splits, name, count, folder)
+    own = range(count) if not splits else _named(splits, TRAIN, count, folder)
+    if not others:
+        return [number for number in own if _by_number(number) == name]
+    apart = sorted({number for other in others for number in _named(splits, other, count, folder)})
+    if name == HELD_OUT:
+        return apart
+    left = [number for number in own if number not in set(apart)]
+    return [number for number in left if (_by_number(number) == CALIBRATION) == (name == CALIBRATION)]
+
+
+def _named(splits: Mapping[str, str], name: str, count: int, folder: Path) -> list[int]:
+    """Episodes of a data set of `count` that its splits give a name."""
     try:
-        ranges = [tuple(int(end) for end in part.split(":")) for part in splits[key].split(",")]
-        named = sorted({number for begin, end in ranges for number in range(begin, min(end, count))})
+        ranges = [tuple(int(end) for end in part.split(":")) for part in splits[name].split(",")]
+        return sorted({number for begin, end in ranges for number in range(begin, min(end, count))})
     except (KeyError, ValueError, AttributeError) as error:
         raise EpisodeError(
-            f"{folder / 'meta/info.json'}: splits are {dict(splits)}; {key!r} must be among them, as"
+            f"{folder / 'meta/info.json'}: splits are {dict(splits)}; {name!r} must be among them, as"
             ' "first:end" or "first:end,first:end"'
         ) from error
-    return [number for number in named if not divided or _by_number(number) == name]
 
 
 def write_splits(root: Path, sizes: Mapping[str, int]) -> None:
@@ -108,5 +119,5 @@ def _by_number(number: int) -> str:
     # Turned from one eight to the next: tasks that were recorded by turns would each be in one split alone.
     turned = (place - crc32(str(block).encode()) * (block > 0)) % 8
     if turned == 7:
-        return "held_out"
-    return "calibration" if turned % 4 == 2 else TRAIN
+        return HELD_OUT
+    return CALIBRATION if turned % 4 == 2 else TRAIN

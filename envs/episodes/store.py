@@ -15,8 +15,8 @@ from envs.conditioning import PoseMapStyle
 from envs.episodes.cache import CachedSet, open_cached
 from envs.episodes.columns import Columns
 from envs.episodes.episode import EpisodeError
-from envs.episodes.formats.lerobot_columns import SEED
-from envs.episodes.formats.lerobot_files import read_info
+from envs.episodes.formats.lerobot.columns import SEED
+from envs.episodes.formats.lerobot.files import read_info
 from envs.episodes.splits import range_of
 from envs.specs import WorldSpec, text_to_bytes, warn_of_cut
 

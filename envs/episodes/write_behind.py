@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
 from envs.episodes.episode import Episode
-from envs.episodes.formats.lerobot_writer import LeRobotWriter
+from envs.episodes.formats.lerobot.writer import LeRobotWriter
 
 
 class WriteBehind:

@@ -14,7 +14,7 @@ from actors.factory import build_simulator, open_clips
 from actors.process import prepare_process
 from actors.world_config import embodiment_of
 from envs.episodes.episode import Episode
-from envs.episodes.formats.lerobot_writer import LeRobotWriter
+from envs.episodes.formats.lerobot.writer import LeRobotWriter
 from envs.episodes.write_behind import WriteBehind
 from envs.physics.pool import TaskPool
 from envs.precision import mixed_precision

@@ -16,7 +16,7 @@ from actors.playing.game import Game, Recorded
 from actors.playing.imagination import ImaginedSide, start_of
 from actors.world_config import build_kinematics, embodiment_of, pose_style, world_spec
 from envs.embodiment import Embodiment
-from envs.episodes.formats.lerobot import LeRobotDataset
+from envs.episodes.formats.lerobot.dataset import LeRobotDataset
 from envs.initial_states import InitialStates
 from envs.physics.checked import observation, rendered
 from envs.physics.suite import Observation, TaskSuite, build_suite, task_names, task_of

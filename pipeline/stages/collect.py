@@ -21,8 +21,8 @@ from actors.world_config import world_spec
 from envs.episodes.clips import ClipStore
 from envs.episodes.episode import Episode
 from envs.episodes.filming import side_by_side, write_film
-from envs.episodes.formats.lerobot import LeRobotDataset
-from envs.episodes.formats.lerobot_writer import LeRobotWriter
+from envs.episodes.formats.lerobot.dataset import LeRobotDataset
+from envs.episodes.formats.lerobot.writer import LeRobotWriter
 from envs.episodes.splits import write_splits
 from envs.episodes.write_behind import WriteBehind
 from envs.files import write_text

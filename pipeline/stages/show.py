@@ -18,7 +18,7 @@ from actors.world_config import world_spec
 from envs.episodes.clips import ClipStore
 from envs.episodes.episode import Episode
 from envs.episodes.filming import write_film, write_gif
-from envs.episodes.formats.lerobot_writer import LeRobotWriter
+from envs.episodes.formats.lerobot.writer import LeRobotWriter
 from envs.files import write_json, write_text
 from envs.judges.base import Judge
 from envs.physics.suite import task_names

@@ -11,7 +11,7 @@ from typing import Any
 from actors.factory import build_pool
 from actors.world_config import world_spec
 from envs.episodes.episode import Episode
-from envs.episodes.formats.lerobot_writer import LeRobotWriter
+from envs.episodes.formats.lerobot.writer import LeRobotWriter
 from envs.episodes.splits import NAMES, keep_in_splits, read_splits
 from envs.rng import Purpose, episode_seeds
 from pipeline.graph.stage import Inputs, stage

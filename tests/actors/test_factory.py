@@ -20,12 +20,12 @@ from actors.process import device_of, prepare_process
 from actors.world_config import world_spec
 from envs.embodiment import Embodiment
 from envs.episodes import LeRobotWriter
-from envs.episodes.formats.lerobot_columns import C2W, INTRINSIC
-from envs.episodes.formats.lerobot_info import INFO_KEY, to_info
+from envs.episodes.formats.lerobot.columns import C2W, INTRINSIC
+from envs.episodes.formats.lerobot.info import INFO_KEY, to_info
 from envs.targets import ConfigError
 from pipeline.config import composed
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES
-from tests.envs.episodes.lerobot_sets import SETS, write_set
+from tests.envs.episodes.lerobot.sets import SETS, write_set
 from tests.moving_square import SIZE, moving_square
 from tests.sections import section
 

@@ -13,7 +13,7 @@ import pytest
 from actors.playing.controls import Controls
 from actors.world_config import embodiment_of
 from envs.embodiment import Arm, Embodiment
-from tests.envs.episodes.lerobot_sets import SETS, write_set
+from tests.envs.episodes.lerobot.sets import SETS, write_set
 
 
 def recorded(folder: Path, kind: str, low: float, high: float) -> Path:

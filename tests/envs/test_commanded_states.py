@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from envs.commanded_states import as_commands, as_states, joints_are_states, same_numbers
 from envs.embodiment import Embodiment
-from envs.episodes.formats.lerobot_numbers import first_command
+from envs.episodes.formats.lerobot.numbers import first_command
 from envs.simulators.remote.engine import GivenStates, RemoteError, RemoteSimulator
 from envs.simulators.state_experts.flow import StateTokens
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, BIMANUAL_POSES, world_spec

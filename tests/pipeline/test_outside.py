@@ -20,7 +20,7 @@ from pipeline.commands.finetune import build_finetune
 from pipeline.config import load_config
 from pipeline.loop import build_loop
 from pipeline.outside import fingerprint, option_files
-from tests.envs.episodes.lerobot_sets import SETS, write_set
+from tests.envs.episodes.lerobot.sets import SETS, write_set
 
 SUCCESS = "next.success"
 

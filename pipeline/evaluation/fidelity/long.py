@@ -20,8 +20,8 @@ from actors.factory import build_pool, open_clips
 from actors.world_config import world_spec
 from envs.episodes.clips import ClipStore
 from envs.episodes.episode import Episode
-from envs.episodes.formats.lerobot import LeRobotDataset
-from envs.episodes.formats.lerobot_writer import LeRobotWriter
+from envs.episodes.formats.lerobot.dataset import LeRobotDataset
+from envs.episodes.formats.lerobot.writer import LeRobotWriter
 from envs.files import write_json
 from envs.judges.perceptual import PerceptualDistance
 from envs.manifest import read_manifest, write_manifest

@@ -14,8 +14,8 @@ from torch import Tensor
 from envs.conditioning import end_effector_poses
 from envs.embodiment import ActionKind, Embodiment, EmbodimentError
 from envs.episodes.clips import ClipStore
-from envs.episodes.formats.lerobot import LeRobotDataset
-from envs.episodes.formats.lerobot_columns import POSES
+from envs.episodes.formats.lerobot.columns import POSES
+from envs.episodes.formats.lerobot.dataset import LeRobotDataset
 from envs.episodes.privileged import read_privileged
 from envs.geometry.kinematics import Kinematics
 from envs.geometry.rotations import fingertips

@@ -21,7 +21,7 @@ from actors.factory import build_policy
 from actors.process import prepare_process
 from actors.world_config import world_spec
 from envs.episodes.episode import Episode
-from envs.episodes.formats.lerobot_writer import LeRobotWriter
+from envs.episodes.formats.lerobot.writer import LeRobotWriter
 from envs.episodes.splits import TRAIN, write_splits
 from envs.episodes.write_behind import WriteBehind
 from envs.rng import Purpose, episode_seeds

@@ -25,7 +25,7 @@ from envs.episodes.video import write_video
 from envs.specs import WorldSpec
 from pipeline.commands.convert import convert, inspect
 from pipeline.graph.owner import RunInUse, owning
-from tests.envs.episodes.lerobot_sets import SETS, write_set
+from tests.envs.episodes.lerobot.sets import SETS, write_set
 from tests.moving_square import moving_square
 
 

@@ -43,6 +43,16 @@ def test_episodes_that_train_does_not_name_are_in_no_split() -> None:
         range_of({"train": "all"}, "held_out", 16, Path("set"))
 
 
+def test_nothing_is_learned_from_what_somebody_called_validation_or_test() -> None:
+    said = {"train": "0:14", "val": "12:15", "test": "15:16"}  # those that are in both are not learned from
+    parts = {name: range_of(said, name, 16, Path("set")) for name in ("train", "held_out", "calibration")}
+    assert parts["held_out"] == [12, 13, 14, 15]
+    assert sorted(parts["train"] + parts["calibration"]) == list(range(12))
+    assert len(parts["calibration"]) == 3
+    with pytest.raises(EpisodeError, match="'train' must be among them"):
+        range_of({"training": "0:14", "val": "14:16"}, "train", 16, Path("set"))
+
+
 def test_splits_are_those_of_each_data_set(dataset: Path, tmp_path: Path) -> None:
     root = tmp_path / "set"
     shutil.copytree(dataset, root)

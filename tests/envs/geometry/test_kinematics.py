@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from envs.embodiment import EmbodimentError, Robot
-from envs.episodes.formats.lerobot_info import INFO_KEY, from_info, to_info
+from envs.episodes.formats.lerobot.info import INFO_KEY, from_info, to_info
 from envs.geometry.kinematics import Kinematics, KinematicsError
 from tests.embodiments import BIMANUAL_JOINTS
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from envs.episodes.formats.lerobot_writer import LeRobotWriter
+from envs.episodes.formats.lerobot.writer import LeRobotWriter
 from envs.episodes.splits import write_splits
 from pipeline.config import load_config
 from pipeline.graph.stage import Inputs

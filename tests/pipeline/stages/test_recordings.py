@@ -21,7 +21,7 @@ from pipeline.commands.finetune import build_finetune
 from pipeline.config import load_config
 from pipeline.graph.graph import Graph
 from pipeline.loop import build_loop, check_labels
-from tests.envs.episodes.lerobot_sets import SETS, write_set
+from tests.envs.episodes.lerobot.sets import SETS, write_set
 
 
 def config(root: Path, kind: str, *words: str) -> Any:

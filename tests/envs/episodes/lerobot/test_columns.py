@@ -17,7 +17,7 @@ from envs.embodiment import ActionKind, Arm
 from envs.episodes import EpisodeError, LeRobotDataset, LeRobotWriter
 from envs.episodes.clips import ClipStore
 from tests.embodiments import ARM_DELTAS, world_spec
-from tests.envs.episodes.lerobot_sets import LENGTHS, SETS, change_info, set_column, write_set
+from tests.envs.episodes.lerobot.sets import LENGTHS, SETS, change_info, set_column, write_set
 from tests.moving_square import SIZE, moving_square
 
 SUCCESS = "next.success"

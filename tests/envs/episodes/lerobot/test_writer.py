@@ -20,7 +20,7 @@ from envs.embodiment import Embodiment
 from envs.episodes import Episode, EpisodeError, LeRobotDataset, LeRobotWriter
 from envs.episodes.video import read_clip, read_video, write_video
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_JOINTS, EMBODIMENTS
-from tests.envs.episodes.lerobot_sets import SETS, write_set
+from tests.envs.episodes.lerobot.sets import SETS, write_set
 from tests.moving_square import SIZE, moving_square
 
 FIELDS = ("commands", "states", "success", "c2w", "intrinsic", "poses", "present")
@@ -159,7 +159,7 @@ def test_an_interrupted_shard_is_written_again(point: str, tmp_path: Path) -> No
 import os, sys
 from pathlib import Path
 from envs.episodes import LeRobotWriter
-from envs.episodes.formats import lerobot_writer
+from envs.episodes.formats.lerobot import writer as lerobot_writer
 from tests.embodiments import BIMANUAL_POSES as robot
 from tests.moving_square import SIZE, moving_square
 writer = LeRobotWriter(Path({str(root)!r}), robot.at(SIZE))
@@ -173,7 +173,7 @@ def until_the_point(path, part):
 lerobot_writer.write_atomically = until_the_point
 writer.write([moving_square(robot, seed) for seed in (2, 3)])
 """
-    here = Path(__file__).resolve().parents[3]
+    here = Path(__file__).resolve().parents[4]
     ended = subprocess.run(
         [sys.executable, "-c", script], cwd=here, env={**os.environ, "PYTHONPATH": str(here)}
     )

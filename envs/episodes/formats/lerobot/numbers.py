@@ -1,7 +1,7 @@
 """The numbers of one episode in a LeRobot data set: its rows as the fields of an Episode, checked by column.
 
 LeRobot's own columns are read from any set. Of ours, `command`, `end_effector.command`, `present` and
-`privileged.*` are read only from sets that carry our description (lerobot_info.py): elsewhere they are
+`privileged.*` are read only from sets that carry our description (info.py): elsewhere they are
 somebody else's words.
 """
 
@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from envs.commanded_states import as_commands, same_numbers
 from envs.embodiment import Embodiment
 from envs.episodes.episode import EpisodeError
-from envs.episodes.formats import lerobot_columns as names
-from envs.episodes.formats.lerobot_columns import PRIVILEGED
-from envs.episodes.formats.lerobot_files import column_array
-from envs.episodes.formats.lerobot_info import INFO_KEY, described_here
+from envs.episodes.formats.lerobot import columns as names
+from envs.episodes.formats.lerobot.columns import PRIVILEGED
+from envs.episodes.formats.lerobot.files import column_array
+from envs.episodes.formats.lerobot.info import INFO_KEY, described_here
 from envs.episodes.pictures import resize_intrinsics
 
 _ANY_SET = {"action", "observation.state", "episode_index", "task_index", names.C2W, names.INTRINSIC}

@@ -7,8 +7,8 @@ from math import prod
 from typing import Any
 
 from envs.embodiment import Embodiment, EmbodimentError
-from envs.episodes.formats import lerobot_columns as names
-from envs.episodes.formats.lerobot_info import described_here, from_info, shape_in
+from envs.episodes.formats.lerobot import columns as names
+from envs.episodes.formats.lerobot.info import described_here, from_info, shape_in
 
 
 def agreed_robot(info: dict[str, Any], given: Embodiment | None = None) -> Embodiment:

@@ -20,11 +20,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from envs.episodes import Episode, LeRobotDataset, LeRobotWriter
-from envs.episodes.formats.lerobot_files import write_tasks
+from envs.episodes.formats.lerobot.files import write_tasks
 from envs.episodes.splits import write_splits
 from envs.episodes.video import read_video
-from tests.envs.episodes.lerobot_sets import write_yuv420
-from tests.envs.episodes.test_lerobot_writer import assert_equal, whole_episode
+from tests.envs.episodes.lerobot.sets import write_yuv420
+from tests.envs.episodes.lerobot.test_writer import assert_equal, whole_episode
 
 SHARDS = ((0, 1, 2), (3,), (4, 5))
 # Columns of meta/episodes that LeRobot's tools write, statistics aside; what else was there is gone.

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from envs.embodiment import Embodiment, EmbodimentError
 from envs.episodes.episode import Episode, EpisodeError
-from envs.episodes.formats import lerobot_columns as names
-from envs.episodes.formats.lerobot_columns import (
+from envs.episodes.formats.lerobot import columns as names
+from envs.episodes.formats.lerobot.columns import (
     CHUNK_FILES,
     DATA_PATH,
     EPISODES_PATH,
@@ -32,7 +32,7 @@ from envs.episodes.formats.lerobot_columns import (
     indexed_columns,
     plain_rate,
 )
-from envs.episodes.formats.lerobot_files import (
+from envs.episodes.formats.lerobot.files import (
     open_parquet,
     read_episode_rows,
     read_info,
@@ -40,9 +40,9 @@ from envs.episodes.formats.lerobot_files import (
     write_groups,
     write_tasks,
 )
-from envs.episodes.formats.lerobot_info import IMAGE_PREFIX
-from envs.episodes.formats.lerobot_robot import agreed_robot
-from envs.episodes.formats.lerobot_stats import column_stats, merge_stats, picture_stats
+from envs.episodes.formats.lerobot.info import IMAGE_PREFIX
+from envs.episodes.formats.lerobot.robot import agreed_robot
+from envs.episodes.formats.lerobot.stats import column_stats, merge_stats, picture_stats
 from envs.episodes.splits import TRAIN, extend_splits
 from envs.episodes.video import write_video
 from envs.files import files_below, write_atomically

@@ -16,7 +16,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from envs.episodes.episode import EpisodeError
-from envs.episodes.formats.lerobot_columns import VERSION
+from envs.episodes.formats.lerobot import version2
+from envs.episodes.formats.lerobot.columns import VERSION
 
 _SUMS: dict[str, Any] = {"write_page_checksum": True}  # a flipped bit is an error, not another number
 
@@ -90,7 +91,7 @@ def write_groups(path: Path, tables: Sequence[pa.Table]) -> None:
 
 
 def read_info(root: Path) -> dict[str, Any]:
-    """The contents of meta/info.json of a LeRobot v3.0 data set.
+    """The contents of meta/info.json of a LeRobot v3.0, v2.1 or v2.0 data set.
 
     Raises:
         EpisodeError: if there is none, or of another version.
@@ -106,10 +107,10 @@ def read_info(root: Path) -> dict[str, Any]:
         raise EpisodeError(
             f"{path}: holds {type(info).__name__} instead of a dictionary; the file is damaged"
         )
-    if info.get("codebase_version") != VERSION:
+    if info.get("codebase_version") != VERSION and not version2.is_version2(info):
         raise EpisodeError(
-            f"{path}: codebase_version {info.get('codebase_version')} is not {VERSION}; convert the data set"
-            " with LeRobot's own tools first"
+            f"{path}: codebase_version {info.get('codebase_version')} is none of {VERSION},"
+            f" {', '.join(version2.VERSIONS)}; convert the data set with LeRobot's own tools first"
         )
     missing = [key for key in ("features", "fps") if key not in info]
     if missing:

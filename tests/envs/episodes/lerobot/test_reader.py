@@ -19,7 +19,7 @@ from envs.episodes import EpisodeError, LeRobotDataset
 from envs.episodes.clip_spec import ClipSpec
 from envs.episodes.clips import ClipStore
 from envs.specs import WorldSpec
-from tests.envs.episodes.lerobot_sets import LENGTHS, SETS, write_set
+from tests.envs.episodes.lerobot.sets import LENGTHS, SETS, write_set
 
 SIZE = (48, 64)
 
@@ -165,8 +165,8 @@ def test_missing_features_and_versions_are_named(tmp_path: Path) -> None:
         (root / "meta/info.json").write_text(json.dumps({**info, "features": features}))
         with pytest.raises(EpisodeError, match=gone.rsplit(".", 1)[0].replace(".", r"\.")):
             LeRobotDataset(root)
-    (root / "meta/info.json").write_text(json.dumps({**info, "codebase_version": "v2.1"}))
-    with pytest.raises(EpisodeError, match=r"v2\.1.*convert"):
+    (root / "meta/info.json").write_text(json.dumps({**info, "codebase_version": "v1.6"}))
+    with pytest.raises(EpisodeError, match=r"v1\.6 is none of v3\.0, v2\.0, v2\.1; convert"):
         LeRobotDataset(root)
 
 

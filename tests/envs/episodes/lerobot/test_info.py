@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from envs.embodiment import ActionKind, Arm, Embodiment, EmbodimentError
-from envs.episodes.formats.lerobot_info import depth_features, from_info, to_info
-from envs.episodes.formats.lerobot_names import feature_names, guess_action, guess_arms
+from envs.episodes.formats.lerobot.info import depth_features, from_info, to_info
+from envs.episodes.formats.lerobot.names import feature_names, guess_action, guess_arms
 from tests.embodiments import ARM_JOINTS, EMBODIMENTS
 
 

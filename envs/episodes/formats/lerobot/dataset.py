@@ -1,7 +1,7 @@
-"""Reads any LeRobot v3.0 data set, whoever wrote it.
+"""Reads any LeRobot data set of v3.0, and of v2.1 and v2.0 (version2.py), whoever wrote it.
 
 Pictures, `action` and `observation.state` are needed; success, reward, calibration and all else are read
-where they are there (lerobot_columns.py). Files are found as LeRobot finds them: by the path templates of
+where they are there (columns.py). Files are found as LeRobot finds them: by the path templates of
 info.json and the file indices and timestamps of meta/episodes, so episodes may share files in any way.
 """
 
@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 
 from envs.embodiment import Embodiment, EmbodimentError
 from envs.episodes.episode import Episode, EpisodeError
-from envs.episodes.formats import lerobot_columns as names
-from envs.episodes.formats.lerobot_columns import PRIVILEGED
-from envs.episodes.formats.lerobot_files import (
+from envs.episodes.formats.lerobot import columns as names
+from envs.episodes.formats.lerobot import version2
+from envs.episodes.formats.lerobot.columns import PRIVILEGED
+from envs.episodes.formats.lerobot.files import (
     column_array,
     open_parquet,
     read_episode_rows,
@@ -32,9 +33,9 @@ from envs.episodes.formats.lerobot_files import (
     read_tasks,
     stored_picture,
 )
-from envs.episodes.formats.lerobot_info import camera_features, depth_features
-from envs.episodes.formats.lerobot_numbers import is_read, numbers_of, seed_of, shape_of, source_of
-from envs.episodes.formats.lerobot_robot import agreed_robot
+from envs.episodes.formats.lerobot.info import camera_features, depth_features
+from envs.episodes.formats.lerobot.numbers import is_read, numbers_of, seed_of, shape_of, source_of
+from envs.episodes.formats.lerobot.robot import agreed_robot
 from envs.episodes.pictures import resize_picture
 from envs.episodes.video import read_clip
 from envs.machine import available_cores
@@ -44,7 +45,7 @@ _DRIFT = 0.02  # of an episode's length, by which its video may be longer or sho
 
 
 class LeRobotDataset:
-    """The episodes of a LeRobot v3.0 data set, decoded one at a time.
+    """The episodes of a LeRobot data set, decoded one at a time.
 
     Args:
         root: folder of the data set.
@@ -87,10 +88,14 @@ class LeRobotDataset:
         self.size: tuple[int, int] = size or next(iter(sizes.values()))
         self.embodiment = recorded.at(self.size)
         self._cameras = camera_features(self.features)
-        self.rows = read_episode_rows(self.root)
+        self._version2 = version2.is_version2(self.info)
+        self.rows = (
+            version2.episode_rows(self.root, self.info) if self._version2 else read_episode_rows(self.root)
+        )
         self._check_rate()
         self._warn()
-        self._tasks = {index: task for task, index in read_tasks(self.root).items()}
+        tasks = version2.tasks(self.root) if self._version2 else read_tasks(self.root)
+        self._tasks = {index: task for task, index in tasks.items()}
         self._cached: tuple[Path, pa.Table] | None = None
         self._reading = Lock()  # of what is cached
 
@@ -223,13 +228,12 @@ class LeRobotDataset:
         return table, path
 
     def _format(self, template: str, row: dict[str, Any], prefix: str, **keys: str) -> str:
-        path: str = self.info.get(template) or getattr(names, template.upper())
+        usual = version2 if self._version2 else names
+        path: str = self.info.get(template) or getattr(usual, template.upper())
+        chunk, file = int(row[f"{prefix}/chunk_index"]), int(row[f"{prefix}/file_index"])
+        # v3.0 has chunks of files that hold several episodes, v2 chunks of episodes
         return str(
-            path.format(
-                chunk_index=int(row[f"{prefix}/chunk_index"]),
-                file_index=int(row[f"{prefix}/file_index"]),
-                **keys,
-            )
+            path.format(chunk_index=chunk, file_index=file, episode_chunk=chunk, episode_index=file, **keys)
         )
 
     def _numbers(self, path: Path) -> pa.Table:

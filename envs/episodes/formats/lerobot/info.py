@@ -12,7 +12,7 @@ from math import inf
 from typing import Any, Literal, TypeVar
 
 from envs.embodiment import PYTHON, ActionKind, Arm, Camera, Embodiment, EmbodimentError, Robot
-from envs.episodes.formats.lerobot_names import feature_names, guess_action, guess_arms
+from envs.episodes.formats.lerobot.names import feature_names, guess_action, guess_arms
 from envs.targets import ConfigError, options
 
 T = TypeVar("T")

@@ -16,7 +16,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from envs.episodes.episode import Episode
-from envs.episodes.formats.lerobot_info import IMAGE_PREFIX, INFO_KEY, to_info
+from envs.episodes.formats.lerobot.info import IMAGE_PREFIX, INFO_KEY, to_info
 
 VERSION = "v3.0"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
