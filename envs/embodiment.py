@@ -6,7 +6,6 @@ Every shape, head, encoder, transform, server and test is built from an `Embodim
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -14,7 +13,7 @@ from functools import cached_property
 from math import inf
 from typing import Any
 
-from envs.orientations import orientations
+from envs.orientations import orientations, words_of
 
 
 class EmbodimentError(ValueError):
@@ -239,7 +238,7 @@ class Embodiment:
         """
         if self.delta:
             return tuple(number for number in range(self.action_dim) if number not in self.grippers)
-        words = [{*re.split(r"[^a-z]+", name.lower())} for name in self.action_names]
+        words = [{*words_of(name)} for name in self.action_names]
         return tuple(number for number, some in enumerate(words) if some & {"vel", "velocity"})
 
     @property

@@ -1,4 +1,4 @@
-"""Which numbers of an action or a state tell orientations, as far as names tell."""
+"""What names of numbers say: their words, and which of an action or a state tell orientations."""
 
 from __future__ import annotations
 
@@ -7,8 +7,21 @@ from collections.abc import Sequence
 
 _ANGLES = ("roll", "pitch", "yaw")
 _JOINTS = ("joint", "waist", "shoulder", "elbow", "wrist", "forearm", "neck", "head")
-_VECTORS = (("wx", "wy", "wz"), ("rotvec",), ("axis", "angle"), ("axisangle",))  # as LeRobot and others say
+_VECTORS = (
+    ("wx", "wy", "wz"),
+    ("rotvec",),
+    ("rot", "vec"),
+    ("axis", "angle"),
+    ("axisangle",),
+)  # as LeRobot and others say
 _QUATERNIONS = (("qw", "qx", "qy", "qz"), ("quat",), ("quaternion",))
+
+
+def words_of(name: str) -> list[str]:
+    """The words of a name in lower case, whether dots, underscores, digits or capitals divide them:
+    kLeftShoulderPitch and k_left.shoulder1_pitch have the same.
+    """
+    return [word for word in re.split(r"[^a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()) if word]
 
 
 def orientations(names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
@@ -19,7 +32,7 @@ def orientations(names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
     names; four in a row a quaternion if they are called qx, qy, qz, qw in any order, or have quat or
     quaternion in them.
     """
-    words = [[word for word in re.split(r"[^a-z]+", name.lower()) if word] for name in names]
+    words = [words_of(name) for name in names]
     found: list[tuple[int, ...]] = []
     place = 0
     while place < len(words):

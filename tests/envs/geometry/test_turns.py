@@ -28,6 +28,7 @@ QUATERNION = ("x", "y", "z", "qx", "qy", "qz", "qw")
         ("ee.x ee.y ee.z ee.wx ee.wy ee.wz ee.gripper_pos", ((3, 4, 5),)),
         ("axis_angle_0 axis_angle_1 axis_angle_2 width", ((0, 1, 2),)),
         ("x y z qw qx qy qz", ((3, 4, 5, 6),)),
+        ("kLeftWristRoll leftYaw rotVec0 rotVec1 rotVec2", ((1,), (2, 3, 4))),
         ("left_quat_0 left_quat_1 left_quat_2 left_quat_3 right_quaternion_x gripper", ((0, 1, 2, 3),)),
         ("qx qy qz wx wy", ()),
         ("0 1 2 3", ()),

@@ -9,6 +9,7 @@ from math import prod
 from typing import Any
 
 from envs.embodiment import ActionKind, Arm
+from envs.orientations import words_of
 
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _ARM_JOINTS = ("joint", "waist", "shoulder", "elbow", "wrist", "forearm")
@@ -69,7 +70,7 @@ def guess_arms(names: Sequence[str], kind: ActionKind) -> tuple[Arm, ...]:
     shoulder_pan.pos or joint_3. What is called gripper is the arm's gripper; whatever else there is, such as
     a head or wheels, belongs to none.
     """
-    words = [re.split(r"[^a-z]+", name.lower().replace("delta", "")) for name in names]
+    words = [words_of(re.sub("delta", "", name, flags=re.IGNORECASE)) for name in names]
     sides = [next((word for word in parts if word in ("left", "right")), "") for parts in words]
     found = []
     for side in dict.fromkeys(side for side in sides if side) or ("",):

@@ -58,6 +58,8 @@ def test_a_few_keys_written_by_hand_are_enough() -> None:
         ),
         (("left_joint1", "left_gripper", "right_joint1", "right_gripper", "head_joint1"),
          (Arm("left", (0,), 1), Arm("right", (2,), 3))),
+        (("kLeftShoulderPitch", "kLeftWristYaw", "kRightElbow", "kLeftHandPinky", "kRightHandIndex"),
+         (Arm("left", (0, 1)), Arm("right", (2,)))),  # as Unitree's sets say; fingers are no arm's
         (("joint_1", "gripper_left_finger", "gripper_right_finger"), ()),  # sides of one gripper
         (("joint_1", "joint_2", "gripper_a", "gripper_b"), ()),  # which is the gripper?
         (("x", "y", "z", "target_x", "target_y", "target_z"), ()),  # which is the pose?
