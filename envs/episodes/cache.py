@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from tqdm import tqdm
 
 from envs.conditioning import PoseMapStyle, end_effector_poses, render_pose_map
 from envs.embodiment import ActionKind
@@ -209,7 +210,8 @@ class _Builder:
         maps = _reserve(place / "pose_maps.npy", shape) if self.spec.pose_map else None
         columns: dict[str, list[NDArray[Any]]] = {}
         episodes, intrinsics, row = [], [], 0
-        for episode in self.data:
+        name = f"cache of {self.data.root.name}"
+        for episode in tqdm(self.data, desc=name, unit="ep", dynamic_ncols=True, leave=False, delay=3):
             rows = slice(row, row + len(episode))
             frames[rows] = episode.frames
             numbers = self._numbers(episode)
