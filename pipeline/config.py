@@ -35,22 +35,12 @@ def load_config(overrides: Sequence[str]) -> dict[str, Any]:
     """
     cfg = read_config(overrides)
     from pipeline.checks import faults  # needs torch, which an unknown key should not wait for
+    from pipeline.decided import decided
 
-    cfg = _decided(cfg)
+    cfg = decided(cfg)
     if wrong := faults(cfg):
         raise ConfigError("\n".join(wrong))
     return cfg
-
-
-def _decided(cfg: dict[str, Any]) -> dict[str, Any]:
-    """The config with rl.freeze_perception=auto as the policy's class allows."""
-    rl = cfg.get("rl")
-    if not isinstance(rl, Mapping) or rl.get("freeze_perception") != "auto":
-        return cfg
-    able = False
-    with suppress(ConfigError, AttributeError):  # of what is no section, or not there, `faults` tells
-        able = hasattr(target(cfg["policy"], "policy"), "freeze_perception")
-    return {**cfg, "rl": {**rl, "freeze_perception": able}}
 
 
 def read_config(overrides: Sequence[str]) -> dict[str, Any]:

@@ -154,3 +154,21 @@ def test_missing_labels_are_told_before_anything_runs(tmp_path: Path) -> None:
     check_labels(other, build_loop(other, tmp_path / "other/smoke"))
     order = list(graph.nodes)
     assert order.index("imitation") < order.index("simulator-1")  # missing demonstrations are told early, too
+
+
+def test_from_nothing_a_world_learns_as_in_the_loop_and_from_weights_in_small_steps(tmp_path: Path) -> None:
+    def fits(*words: str) -> list[tuple[object, ...]]:
+        cfg = load_config(["simulator=unet_small", *words])
+        return [
+            tuple(cfg["finetune"][part]["fit"].get(key) for key in ("lr", "optimiser", "batch"))
+            for part in ("simulator", "state")
+        ]
+
+    loop, on = load_config([]), (1e-4, "adamw")
+    first, state = loop["simulator_fit"]["first"]["fit"], loop["state_fit"]["first"]["fit"]
+    mine = (first["lr"], first["optimiser"], 8), (state["lr"], None, state["batch"])
+    assert fits() == [*mine] and first["lr"] > 10 * on[0]
+    assert fits("finetune.weights=some.safetensors") == [(*on, 8), mine[1]]
+    assert fits("finetune.simulator.fit.lr=0.5")[0] == (0.5, *mine[0][1:])
+    released = load_config(["simulator=gesim", "simulator.state_expert.checkpoint=some"])["finetune"]
+    assert released["state"]["fit"] == {"steps": 1000, "batch": 8, "lr": 1e-4}
