@@ -161,7 +161,7 @@ def _recorded_robot(folder: Path) -> tuple[Embodiment, bool]:
     """The robot of a data set, and whether the set says itself which numbers are an arm's."""
     path = folder / "meta" / "info.json"
     if not path.is_file():
-        raise ConfigError(f"task.data: {path} does not exist; name folders of LeRobot v3.0 data sets")
+        raise ConfigError(f"task.data: {path} does not exist; name folders of LeRobot data sets")
     try:
         info = json.loads(path.read_text())
         return agreed_robot(info), arms_are_said(info["features"])

@@ -49,14 +49,14 @@ def fingerprint(paths: list[str], key: str = "task.data") -> str:
         key: of the config, that names them.
 
     Raises:
-        ConfigError: for a folder that is no LeRobot v3.0 data set.
+        ConfigError: for a folder that is no LeRobot data set.
     """
     marks = []
     for path in paths:
         info = Path(path) / "meta" / "info.json"
         if not info.is_file():
             raise ConfigError(
-                f"{key}: {info} is missing; name folders of LeRobot v3.0 data sets (`worldloop convert`"
+                f"{key}: {info} is missing; name folders of LeRobot data sets (`worldloop convert`"
                 " makes them of other recordings)"
             )
         root = Path(path).resolve()

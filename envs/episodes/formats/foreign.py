@@ -27,5 +27,5 @@ def read_foreign(source: Path, cut: Cut | None = None) -> Iterator[Episode]:
             return (cut.of(known.read(place, number, cut)) for number, place in enumerate(places))
     raise EpisodeError(
         f"{source} holds no recording in a known format: {', '.join(known.name for known in FORMATS)}, or"
-        " LeRobot v3.0 (meta/info.json)"
+        " LeRobot (meta/info.json)"
     )

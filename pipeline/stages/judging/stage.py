@@ -141,18 +141,24 @@ def _as_imagined(cfg: Cfg, world: Simulator, store: ClipStore, episodes: Tensor)
 
 def _calibrate(cfg: Cfg, model: Judge, store: ClipStore, world: Simulator, bf16: bool) -> dict[str, float]:
     """Set the judge's threshold on the calibration split, where its scores tell success; a judge that says
-    (judge.votes.calibrate=false) that its answers need none is not asked.
+    (judge.votes.calibrate=false) that its answers need none is not asked. Where nobody said of any episode
+    there whether it succeeded, all count as demonstrations, as they do for imitation: each shows success at
+    its end, and its first half alone, which counts as another episode, does not. A judge that charges is not
+    asked for that.
 
     Returns:
         auc of its confidence against recorded success, over calibration_successes and calibration_failures
-        episodes; {} if there are none of either.
+        episodes, or halves of as many calibration_demonstrations; {} if there are none of either.
 
     Raises:
         ConfigError: if it gives no judgement on any episode there.
     """
     if not model.calibrates:
         return {}
-    unseen = labelled(store, followed(store, store.split("calibration")))
+    there = followed(store, store.split("calibration"))
+    unseen = labelled(store, there)
+    demonstrated = not len(unseen) and not model.charges
+    unseen = there if demonstrated else unseen
     if not len(unseen):
         return {}
     features = features_of_episodes(world, store, unseen, bf16) if model.reads_features else None
@@ -168,19 +174,25 @@ def _calibrate(cfg: Cfg, model: Judge, store: ClipStore, world: Simulator, bf16:
         if blank == len(unseen):  # nor would it on generated ones, which RL would drop one after the other
             raise ConfigError(why)
         tqdm.write(why)
+    if demonstrated:
+        half = torch.arange(score.shape[1]) < (store.length[unseen] // 2)[:, None]
+        score, judged = torch.cat([score, score.where(half, 0.0)]), judged.repeat(2)
+        succeeded = torch.arange(len(score)) < len(unseen)
     won, sure = succeeded[judged], model.confidence(score[judged].double())
     if not calibrate(model, score, succeeded):
         why = "its scores do not tell which"
         if won.all() or not won.any():
             why = f"one that {'failed' if won.all() else 'succeeded'} is needed beside them; record some"
+        seen = "halves of demonstrations show an end" if demonstrated else "calibration episodes succeeded"
         tqdm.write(
-            f"judge: {int(won.sum())} of {len(won)} calibration episodes succeeded, and {why}; threshold"
-            f" left at {float(model.threshold):.3f}"
+            f"judge: {int(won.sum())} of {len(won)} {seen}, and {why}; threshold left at"
+            f" {float(model.threshold):.3f}"
         )
     if won.all() or not won.any():
         return {}
-    return {
+    told = {
         "auc": auc(sure, won),
         "calibration_successes": float(won.sum()),
         "calibration_failures": float((~won).sum()),
     }
+    return told | ({"calibration_demonstrations": float(won.sum())} if demonstrated else {})

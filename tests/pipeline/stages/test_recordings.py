@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 import torch
 from safetensors.torch import load_file
 
 from actors.factory import build_judge, build_simulator, build_state_decoder, build_world, open_clips
 from actors.world_config import world_spec
-from envs.episodes import EpisodeError
+from envs.episodes import EpisodeError, LeRobotDataset
 from envs.episodes.splits import write_splits
 from envs.episodes.video import read_video
 from envs.initial_states import DecisionPoints, InitialStates
@@ -154,6 +155,20 @@ def test_missing_labels_are_told_before_anything_runs(tmp_path: Path) -> None:
     check_labels(other, build_loop(other, tmp_path / "other/smoke"))
     order = list(graph.nodes)
     assert order.index("imitation") < order.index("simulator-1")  # missing demonstrations are told early, too
+
+
+def test_where_nobody_says_success_ends_of_demonstrations_calibrate_a_goal(tmp_path: Path) -> None:
+    picture = tmp_path / "goal.png"
+    write_set(tmp_path / "other", SETS["single_arm"])
+    shown = LeRobotDataset(tmp_path / "other", (64, 64)).episode(2).frames[-1, 0]
+    cv2.imwrite(str(picture), shown.transpose(1, 2, 0)[..., ::-1])
+    cfg = config(
+        *(tmp_path, "single_arm", "judge=goal_image", f"judge.picture={picture}"),
+        *smoke("simulator_fit.first", "state_fit.first"),
+    )
+    made = build_loop(cfg, tmp_path / "smoke").run(until="judge-1")["judge-1"]["result"]
+    assert made["calibration_demonstrations"] == made["calibration_failures"] == 1
+    assert made["auc"] == 1 and 0.02 <= made["threshold"] < cfg["judge"]["threshold"]
 
 
 def test_from_nothing_a_world_learns_as_in_the_loop_and_from_weights_in_small_steps(tmp_path: Path) -> None:
