@@ -13,6 +13,7 @@ from pipeline.config import load_config
 SMALL = ["experiment=soak", "task.suite.cameras=[head]"]
 
 
+@pytest.mark.long
 def test_learned_weights_are_a_better_beginning() -> None:
     found = pretrained(load_config(SMALL), learned=80, steps=10, seeds=(0,))
     assert found["from learned weights"][0] < found["from nothing"][0] - 0.01
