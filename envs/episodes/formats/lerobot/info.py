@@ -1,4 +1,4 @@
-"""A robot in the info.json of a LeRobot v3.0 data set.
+"""A robot in the info.json of a LeRobot data set.
 
 Feature names and shapes are most of its description, arms and grippers included where names tell them; the
 rest stands in features.action.info.worldloop, which LeRobot's tools carry along, and may be missing.
@@ -56,7 +56,7 @@ class CameraDescription:
 
 
 def from_info(info: Mapping[str, Any]) -> Embodiment:
-    """The robot that a LeRobot v3.0 data set was recorded with.
+    """The robot that a LeRobot data set was recorded with.
 
     Args:
         info: its info.json.

@@ -27,12 +27,11 @@ def as_version2(root: Path, version: str) -> None:
     rows = LeRobotDataset(root, SIZE).rows
     for row in rows:
         index = row["episode_index"]
-        for path in sorted(root.glob(f"*/**/file-{index:03d}.*")):
+        for path in sorted(root.glob(f"[dv]*/**/file-{index:03d}.*")):  # data and videos
             kind, *key = path.relative_to(root).parts[:-2]
             place = root / kind / f"chunk-{index // CHUNK:03d}" / "/".join(key)
             place.mkdir(parents=True, exist_ok=True)
-            if kind != "meta":
-                path.rename(place / f"episode_{index:06d}{path.suffix}")
+            path.rename(place / f"episode_{index:06d}{path.suffix}")
     for name in ("meta/tasks.parquet", "meta/episodes/chunk-000/file-000.parquet"):
         (root / name).unlink()
     told = [{key: row[key] for key in ("episode_index", "tasks", "length")} for row in rows]
