@@ -42,7 +42,8 @@ class Alarms:
                 f"rl: {bad} not finite at iteration {iteration}; lower rl.lr or raise algorithm clipping; the"
                 " last checkpoint is kept"
             )
-        self.silent = self.silent + 1 if figures["reward_std"] < 1e-6 else 0
+        # without a rollout there are no rewards
+        self.silent = self.silent + 1 if figures.get("reward_std", 1.0) < 1e-6 else 0
         if self.silent == self.patience:
             self._warn(
                 "no reward variance",

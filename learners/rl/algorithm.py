@@ -46,7 +46,8 @@ class RLConfig:
             deployed is not one moment of a random walk.
         clip: largest gradient norm of the policy, and of the critic.
         kl_stop: mean KL to the behaviour policy at which an iteration's epochs end early.
-        imagined: weight of the algorithm's loss on imagined decisions; 0 leaves them out, as a control.
+        imagined: weight of the algorithm's loss on imagined decisions; 0 leaves them out, as a control, and
+            imagines none if there are recorded ones.
         recorded: decisions of deployed policies in physics per iteration, learned from beside the imagined
             ones by the same loss; 0 for none. Algorithms without a critic, and policies that are scored on
             action tokens, learn from imagined ones only.

@@ -62,7 +62,8 @@ def train_rl(
 
     Args:
         fleet: hosts of config.envs / config.shards episodes each; the policy's trained tensors are published
-            to it. Of several workers only the leading one has one.
+            to it. Of several workers only the leading one has one; none where nothing is imagined
+            (true.alone).
         starts: where episodes may begin.
         folder: receives checkpoints, metrics.jsonl and learned.jsonl, the jobs that were learned from, and
             as often as a checkpoint a video of imagined episodes; a checkpoint found there is resumed.
@@ -88,6 +89,7 @@ def train_rl(
     rates = [group["lr"] for group in optimiser.param_groups]
     alarms, ledger, first, episodes, wave, over = Alarms(), EpisodeLedger(), 0, 0, 0, False
     spent, figures = {"rollout": 0.0, "update": 0.0}, dict[str, float]()
+    alone = true is not None and true.alone > 0
 
     def state() -> dict[str, Any]:
         return {
@@ -126,13 +128,14 @@ def train_rl(
             "iteration": iteration,
             "over": over,
             "episodes": episodes,
+            "wave": 0 if feed is None else feed.upcoming(iteration),
             "spent": spent,
             "ledger": asdict(ledger),
             "alarms": asdict(alarms),
             "last": figures,
         }
         if feed is not None:
-            facts |= {"wave": feed.upcoming(iteration), "episodes_per_job": feed.fleet.episodes}
+            facts["episodes_per_job"] = feed.fleet.episodes
         return facts
 
     bar = tqdm(
@@ -150,7 +153,8 @@ def train_rl(
                 group["lr"] = lr * (1 - share_over(iteration))
             before = facts_of(iteration)
             try:
-                batch, supply = from_leader(partial(gather, iteration, trainee(trained_weights, policy)))
+                weights = trainee(trained_weights, policy)
+                batch, supply = (None, {}) if alone else from_leader(partial(gather, iteration, weights))
             except Exception:
                 # nothing was learned yet of this iteration, as where a judge's budget is used up; what was
                 # learned before is kept, and what was lost is asked for again
@@ -158,21 +162,24 @@ def train_rl(
                     checkpoints.save(iteration, state(), before)
                 raise
             collected = time.perf_counter()
-            if config.episodes is not None:
-                batch = within(batch, algorithm, config.episodes - episodes)
-            starts.check_groups(batch, algorithm.group_size)
+            if batch is not None:
+                if config.episodes is not None:
+                    batch = within(batch, algorithm, config.episodes - episodes)
+                starts.check_groups(batch, algorithm.group_size)
             seed = update_seed(config.seed, iteration)
             figures = update(batch, algorithm, trainee, optimiser, config, seed, true)
             updated = time.perf_counter()
             spent["rollout"] += collected - began
             spent["update"] += updated - collected
-            episodes += int(episode_counts(batch, algorithm).sum())
+            if batch is not None:
+                episodes += int(episode_counts(batch, algorithm).sum())
             last = iteration + 1 == config.iterations or share_over(iteration + 1) >= 1
-            spoiled = {reason: int(figures[key]) for reason, (key, _) in _SPOILED.items()}
-            ledger.settle(len(batch), spoiled)
-            if feed is not None:
-                causes = [what for reason, (_, what) in _SPOILED.items() if spoiled[reason]]
-                feed.check_losses(" and ".join(causes) or "none now")
+            if batch is not None:
+                spoiled = {reason: int(figures[key]) for reason, (key, _) in _SPOILED.items()}
+                ledger.settle(len(batch), spoiled)
+                if feed is not None:
+                    causes = [what for reason, (_, what) in _SPOILED.items() if spoiled[reason]]
+                    feed.check_losses(" and ".join(causes) or "none now")
             for version, shown in feed.footage.items() if feed is not None else ():
                 film_rollouts(folder, version, shown)
             figures |= supply | {"time/rollout": collected - began, "time/update": updated - collected}
@@ -203,7 +210,8 @@ def train_rl(
             )
             rows.flush()
             bar.update()
-            bar.set_postfix_str(f"success {figures['success']:.2f}", refresh=False)
+            if "success" in figures:
+                bar.set_postfix_str(f"success {figures['success']:.2f}", refresh=False)
             if iteration == first and leads():
                 tqdm.write(
                     f"{name}: about {(updated - began) * (config.iterations - first - 1) / 60:.1f} min for"

@@ -20,7 +20,7 @@ from learners.training.parallel import Trainee, averaged, clip_gradients, my_sha
 
 
 def update(
-    batch: TensorDict,
+    batch: TensorDict | None,
     algorithm: Algorithm,
     trainee: Trainee,
     optimiser: torch.optim.Optimizer,
@@ -31,13 +31,18 @@ def update(
     """One iteration's optimisation on a rollout [B, T]; returns its figures.
 
     Args:
+        batch: None: on recorded decisions alone, in as many updates as TrueExperience.alone says.
         trainee: algorithm.modules() in training.
         seed: of minibatches and of what is drawn of true experience.
     """
-    figures = outcome(batch)
-    batch = batch.to(device_of(algorithm.modules()))
-    data, extra = trainee(algorithm.prepare, batch)
-    figures |= extra
+    figures: dict[str, float] = {}
+    if batch is not None:
+        batch = batch.to(device_of(algorithm.modules()))
+        data, extra = trainee(algorithm.prepare, batch)
+        figures = outcome(batch) | extra
+    else:
+        assert true is not None and true.decisions is not None, "there is nothing else to learn from"
+        data = trainee(true.decisions.own_chunks, true.alone, seed)
     shuffle = order_generator(seed)
     known = None
     if true is not None and true.decisions is not None and config.recorded:
@@ -85,7 +90,9 @@ def _loss(
     true: TrueExperience | None,
     known: TensorDict | None,
 ) -> tuple[Tensor, dict[str, float]]:
-    loss, row = algorithm.loss(minibatch)
+    # what weighs nothing still tells how far the policy has come
+    with torch.set_grad_enabled(config.imagined > 0 or known is None):
+        loss, row = algorithm.loss(minibatch)
     loss = config.imagined * loss
     if known is not None and len(known):
         # by itself, for its likelihood ratios do not say how far the policy has come

@@ -60,7 +60,8 @@ LEARNING = ("policy", "algorithm", "rl", "imitation", "microbatches")
 @stage(reads=(*WORLD, *LEARNING, "extra_starts.share"), place=Place.LEARNERS)
 @priced
 def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """Reinforcement learning inside the simulator; the role `starts`, if somebody plays it, holds first
+    """Reinforcement learning inside the simulator, or by recorded decisions alone where imagined ones weigh
+    nothing and so are not made; the role `starts`, if somebody plays it, holds first
     frames that nothing more was recorded of.
 
     The role `known` says in which round the policy was deployed, whose true decisions are learned from and
@@ -72,7 +73,7 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         FleetError: if too many episodes are lost; also what to change, where the judge lost most of them.
     """
     ready = begin(cfg, inputs)
-    fleet = build_fleet(ready.recipe) if leads() else None
+    fleet = build_fleet(ready.recipe) if leads() and not ready.true.alone else None
     try:
         watch = true_success(cfg, ready.settings, inputs.weights("policy"))
         learning = (fleet, ready.policy, ready.algorithm, ready.settings, folder, ready.starts)
@@ -156,7 +157,10 @@ def begin(cfg: ConfigView, inputs: Inputs) -> Imagination:
         if decisions is not None and settings.recorded:
             settings = replace(settings, imagined=settings.imagined * mean)
         known["imagined_weight"] = settings.imagined
-    true = TrueExperience(anchor, decisions)
+    alone = 0
+    if decisions is not None and settings.recorded and not settings.imagined:
+        alone = settings.envs * imagined_chunks(cfg)
+    true = TrueExperience(anchor, decisions, alone)
     return Imagination(
         *(policy, algorithm, settings, recipe, starts, true, rollout, known), store, inside, beyond
     )

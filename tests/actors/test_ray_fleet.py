@@ -74,8 +74,9 @@ def equal(one: TensorDict, other: TensorDict) -> bool:
     ) == set(other.keys(True, True))
 
 
+@pytest.mark.parametrize("actors", [pytest.param(1, marks=pytest.mark.long), 3])
 def test_rollouts_and_learned_weights_are_the_same_bits_for_any_number_of_actors(
-    cluster: None, recipe: Recipe, tmp_path: Path
+    cluster: None, recipe: Recipe, tmp_path: Path, actors: int
 ) -> None:
     local = LocalFleet(build_host(recipe))
     wanted = rollout(local, recipe)
@@ -87,17 +88,16 @@ def test_rollouts_and_learned_weights_are_the_same_bits_for_any_number_of_actors
     weights, _ = learn(LocalFleet(build_host(recipe)), recipe, tmp_path / "local")
     films = films_of(tmp_path / "local")
     assert list(films) == ["imagined-step000000.mp4", "imagined-step000001.mp4"]
-    for actors in (1, 3):
-        fleet = RayFleet(recipe, actors)
-        try:
-            got = rollout(fleet, recipe)
-            assert len(got) == 4 and all(equal(a, b) for a, b in zip(wanted, got, strict=True))
-            learned, stats = learn(fleet, recipe, tmp_path / str(actors))
-        finally:
-            fleet.close()
-        assert all(torch.equal(value, learned[name]) for name, value in weights.items())
-        assert films_of(tmp_path / str(actors)) == films
-        assert stats["ledger"]["learned"] == stats["ledger"]["requested"] == 32
+    fleet = RayFleet(recipe, actors)
+    try:
+        got = rollout(fleet, recipe)
+        assert len(got) == 4 and all(equal(a, b) for a, b in zip(wanted, got, strict=True))
+        learned, stats = learn(fleet, recipe, tmp_path / str(actors))
+    finally:
+        fleet.close()
+    assert all(torch.equal(value, learned[name]) for name, value in weights.items())
+    assert films_of(tmp_path / str(actors)) == films
+    assert stats["ledger"]["learned"] == stats["ledger"]["requested"] == 32
 
 
 def test_hosts_get_a_core_as_soon_as_the_learner_does(cluster: None) -> None:

@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from actors.policies.contract import action_key, device_of, distribution, inputs_for, trained_part
 from envs.episodes.clips import ClipStore
-from envs.rng import seed_process
+from envs.rng import order_generator, seed_process
 from envs.specs import CHUNK, IMAGE, LOG_PROB, ActionMode
 from envs.targets import ConfigError
 from learners.rl.algorithm import Anchor
@@ -112,6 +112,30 @@ class RecordedDecisions:
         seen = observe(self.store, some["row"], pictures=IMAGE in self.policy.in_keys)
         return seen.update(some)
 
+    @torch.no_grad()
+    def own_chunks(self, count: int, seed: int) -> TensorDict:
+        """Transitions [count] of these decisions, each as often as it takes, whose chunks the policy draws
+        itself as it is now: by them is told how far updates have moved it, as by imagined ones.
+
+        Args:
+            seed: of which and of what it draws.
+        """
+        order = order_generator(seed)
+        rounds = [
+            torch.randperm(len(self.known), generator=order) for _ in range(-(-count // len(self.known)))
+        ]
+        seen, device = self.taken(torch.cat(rounds)[:count]), device_of(self.policy)
+        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+            seed_process(seed)
+            parts = [self._drawn_at(some) for some in seen.split(_AT_ONCE)]
+        chunks, likely = zip(*parts, strict=True)
+        return seen.update({CHUNK: torch.cat(chunks), LOG_PROB: torch.cat(likely)})
+
+    def _drawn_at(self, seen: TensorDict) -> tuple[torch.Tensor, torch.Tensor]:
+        said = distribution(self.policy, inputs_for(seen, self.policy))
+        chunks = said.sample()
+        return chunks, said.log_prob(chunks)
+
     def revalue(self, rollout: TensorDict) -> None:
         """Take advantages and values anew from the rollout that they were made of."""
         for key in ("advantage", "value_target", "state_value"):
@@ -136,7 +160,10 @@ class TrueExperience:
     Args:
         anchor: cloning of what has worked, see RLConfig.anchor.
         decisions: see RLConfig.recorded.
+        alone: as many decisions does an iteration make its updates of where nothing is imagined, for it would
+            weigh nothing; 0 where iterations have rollouts.
     """
 
     anchor: Anchor | None = None
     decisions: RecordedDecisions | None = None
+    alone: int = 0

@@ -18,13 +18,17 @@ from actors.policies.contract import (
     inputs_for,
     trained_part,
 )
+from actors.rollouts.host import Weights
 from envs.embodiment import Embodiment
 from envs.episodes.clips import ClipStore
 from envs.specs import C2W, CHUNK, COMMAND, IMAGE, INTRINSIC, LOG_PROB, STATE, ActionMode, Rewards
 from learners.rl.algorithm import Algorithm
+from learners.rl.loop import train_rl
 from learners.rl.recorded.decisions import RecordedDecisions, TrueExperience
 from learners.rl.recorded.rollout import dataset_rollout
+from learners.rl.starts import Starts
 from learners.rl.update import update
+from learners.rl.watch import Watch
 from learners.stages.imitation import chunks_ahead
 from learners.stages.observed import observe
 from learners.training.parallel import Trainee
@@ -180,3 +184,40 @@ def test_updates_learn_from_both_and_without_imagination_from_true_ones_alone(
     assert not torch.equal(with_true, without)
     other, _ = learned(16, -1.0)  # imagined rewards turned round
     assert torch.equal(with_true, other) == (imagined == 0.0)
+
+
+class Stop(Exception):
+    """A learner that dies."""
+
+
+def stopping(iteration: int, weights: Weights) -> tuple[dict[str, float], bool]:
+    raise Stop
+
+
+def test_without_a_rollout_recorded_decisions_alone_are_learned_from(
+    tiny_store: Stores, tmp_path: Path
+) -> None:
+    store = tiny_store(ARM_DELTAS)
+
+    def learned(name: str, killed: bool = False) -> tuple[torch.Tensor, dict[str, Any]]:
+        policy = policy_of("chunk_gaussian", store.spec, ActionMode.ABSOLUTE)
+        ppo, decisions = known(store, policy)
+        true = TrueExperience(None, decisions, alone=40)
+        plan = settings(recorded=16, imagined=0.0, epochs=2, minibatch=20, iterations=3, checkpoint_every=1)
+        if killed:
+            with pytest.raises(Stop):
+                watch = Watch(2, stopping)
+                train_rl(None, policy, ppo, plan, tmp_path / name, Starts(range(4)), true=true, watch=watch)
+            return learned(name)
+        stats = train_rl(None, policy, ppo, plan, tmp_path / name, Starts(range(4)), true=true)
+        return torch.nn.utils.parameters_to_vector(policy.parameters()).detach(), stats
+
+    policy = policy_of("chunk_gaussian", store.spec, ActionMode.ABSOLUTE)
+    before = torch.nn.utils.parameters_to_vector(policy.parameters()).detach()
+    after, stats = learned("one")
+    assert not torch.equal(before, after)
+    assert stats["ledger"]["requested"] == stats["episodes"] == 0 and not stats["alarms"]
+    last = stats["last"]
+    assert last["planned_updates"] == 4 and last["transitions"] == 40 and last["kl"] != 0.0
+    resumed, _ = learned("two", killed=True)
+    assert torch.equal(after, resumed)

@@ -73,9 +73,10 @@ def test_what_a_dead_owner_held_is_taken_over(
 
 
 def test_two_commands_in_one_run_leave_one_good_run(tmp_path: Path) -> None:
-    words = ["stage", "collect", "experiment=smoke", f"runs={tmp_path}", "track=disabled"]
+    few = "collect.episodes={train: 4, held_out: 1, calibration: 1}"
+    words = ["stage", "collect", "experiment=soak", f"runs={tmp_path}", "track=disabled", few]
     first = _worldloop(words)
-    lock = tmp_path / "smoke/.owner.json"
+    lock = tmp_path / "soak/.owner.json"
     deadline = time.monotonic() + 60
     while not lock.exists() and time.monotonic() < deadline and first.poll() is None:
         time.sleep(0.02)
@@ -85,7 +86,7 @@ def test_two_commands_in_one_run_leave_one_good_run(tmp_path: Path) -> None:
     first.send_signal(signal.SIGCONT)
     assert first.wait() == 0 and second.returncode == 1, said
     assert "belongs to `worldloop stage collect`, process" in said and "Traceback" not in said
-    (folder,) = (tmp_path / "smoke/stages").glob("collect-*")
+    (folder,) = (tmp_path / "soak/stages").glob("collect-*")
     info = json.loads((folder / "dataset/meta/info.json").read_text())
     assert info["total_episodes"] == json.loads((folder / "manifest.json").read_text())["result"]["episodes"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +13,17 @@ import torch
 
 from actors.factory import build_algorithm, build_policy, open_clips
 from envs.embodiment import Embodiment
+from envs.episodes import LeRobotWriter
 from envs.manifest import write_manifest
 from pipeline.config import load_config
 from pipeline.graph.stage import Inputs
 from pipeline.loop import build_loop, deployed_episodes
 from pipeline.stages import rl as stages
-from pipeline.stages.given import DATASETS, rl_options
+from pipeline.stages.given import DATASETS, imagined_chunks, rl_options
 from pipeline.study.methods import add_rl_in_physics
 from pipeline.track import read_metrics
 from tests.embodiments import ARM_DELTAS
+from tests.moving_square import SIZE, episodes_of
 from tests.worlds import untrained_world
 
 SETTINGS = {"imagined": 0.0, "iterations": 1, "seed": 0, "lr": 1e-4}
@@ -63,6 +66,27 @@ def test_true_decisions_are_learned_from_whatever_measures_progress(
     )
     assert "nothing but the anchor" in alarm and stages.nothing_left(learning, None) == [alarm]
     assert not stages.nothing_left(rl_options(cfg, **{**SETTINGS, "imagined": 1.0}), None)
+
+
+def test_what_weighs_nothing_is_not_imagined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = tmp_path / "deployed/dataset"
+    played = [replace(episode, source="policy-0") for episode in episodes_of(ARM_DELTAS)]
+    LeRobotWriter(data, ARM_DELTAS.at(SIZE)).write(played)
+    words = ("experiment=smoke", "judge=learned", "algorithm=ppo", *SQUARE, "launch.device=cpu")
+    cfg = load_config([*words, f"task.data=[{data}]", "imitation.sources=['*']"])
+    untrained_world(cfg, tmp_path)
+    roles: dict[str, Any] = {name: tmp_path / name for name in ("policy", "simulator", "state", "judge")}
+    for role, result in (("known", {"round": 0}), ("worth", {"worth": {"push": {"value": 0.0}}})):
+        write_manifest(tmp_path / role, {"stage": role, "result": result})
+        roles[role] = tmp_path / role
+    roles["data"] = (tmp_path / "deployed",)
+    settings = {"number": 1, "iterations": 2}
+    view = stages.rl.view("rl-1", cfg, settings)
+    monkeypatch.setattr(stages, "build_fleet", None)  # nobody asks for hosts
+    made = stages.rl.run(view, tmp_path / "rl", Inputs(roles, settings))
+    assert made["ledger"]["requested"] == made["episodes"] == made["imagined_weight"] == 0
+    assert made["recorded_decisions"] > 0 and made["last_updates"] > 0
+    assert made["last_transitions"] == cfg["rl"]["envs"] * imagined_chunks(cfg)
 
 
 def test_goals_that_hosts_imagine_are_counted(

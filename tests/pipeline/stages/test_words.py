@@ -29,6 +29,7 @@ WORDS = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_cloned_policy_does_what_the_words_ask_at_the_same_first_frame(tmp_path: Path) -> None:
     cfg = load_config(WORDS)
