@@ -168,6 +168,7 @@ CURVES = (
 )
 
 
+@pytest.mark.long
 def test_success_is_drawn_against_training_time_under_each_reward(root: Path) -> None:
     assert "not run" not in run_study(planned(root, CURVES))
     page = (root / "soak/study.html").read_text()
