@@ -4,6 +4,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 # Extra words for pip, such as an index with CPU builds of torch: make quickstart PIP_ARGS="--extra-index-url URL"
 PIP_ARGS ?=
+# Compiling every module of every package takes a minute and a half; what is imported is compiled then.
+INSTALL = $(BIN)/python -m pip install --quiet --no-compile $(PIP_ARGS)
 SEED ?= 0
 # Processes that share the test files: one more than two cores, for the one that has all Rays mostly waits for them.
 TEST_WORKERS ?= 3
@@ -21,24 +23,24 @@ $(BIN)/pip:
 	$(BIN)/python -m pip install --upgrade pip --quiet
 
 $(VENV)/.ready: pyproject.toml constraints.txt | $(BIN)/pip
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[dev,metaworld,aloha]"
+	$(INSTALL) -c constraints.txt -e ".[dev,metaworld,aloha]"
 	# These two ask for an old numpy and an old mujoco, which nothing in them needs; their real needs are ours.
 	# The third and fourth ask for a video encoder and a compiled maze, which we do not use.
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps openpi-client==0.1.2 $(METAWORLD) $(ALOHA)
+	$(INSTALL) --no-deps openpi-client==0.1.2 $(METAWORLD) $(ALOHA)
 	touch $@
 
 # One suite alone, for an environment that was set up without it or not at all; ogbench is not part of the set-up.
 metaworld: gl | $(BIN)/pip
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[metaworld]"
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps $(METAWORLD)
+	$(INSTALL) -c constraints.txt -e ".[metaworld]"
+	$(INSTALL) --no-deps $(METAWORLD)
 
 aloha: gl | $(BIN)/pip
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[aloha]"
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps $(ALOHA)
+	$(INSTALL) -c constraints.txt -e ".[aloha]"
+	$(INSTALL) --no-deps $(ALOHA)
 
 ogbench: gl | $(BIN)/pip
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e ".[ogbench]"
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --no-deps $(OGBENCH)
+	$(INSTALL) -c constraints.txt -e ".[ogbench]"
+	$(INSTALL) --no-deps $(OGBENCH)
 
 # OpenGL in software, for rendering without a screen. Installed where we may, else the line to type is printed.
 gl:
