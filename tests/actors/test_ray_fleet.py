@@ -173,6 +173,7 @@ def test_a_job_that_raises_is_given_up_and_counted(cluster: None, recipe: Recipe
         fleet.close()
 
 
+@pytest.mark.long
 def test_a_job_that_ends_every_host_stops_the_run(cluster: None, recipe: Recipe) -> None:
     fleet = RayFleet(recipe, 1, patience=patience(recipe, job=0.01, deaths=1))
     try:

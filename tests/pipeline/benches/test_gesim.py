@@ -15,6 +15,7 @@ PARTS = {
 }
 
 
+@pytest.mark.long
 def test_the_bench_times_chunks_their_parts_and_single_changes(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

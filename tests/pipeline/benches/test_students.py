@@ -29,6 +29,7 @@ STUDENTS = (
 )
 
 
+@pytest.mark.long
 def test_students_and_teacher_stand_in_one_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -19,6 +19,7 @@ def test_learned_weights_are_a_better_beginning() -> None:
     assert found["from learned weights"][0] < found["from nothing"][0] - 0.01
 
 
+@pytest.mark.long
 def test_latent_worlds_share_an_autoencoder() -> None:
     found = pretrained(load_config([*SMALL, "simulator=dit_small"]), learned=3, steps=1, seeds=(0,))
     assert all(math.isfinite(loss) for losses in found.values() for loss in losses)

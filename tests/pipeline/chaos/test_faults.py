@@ -129,6 +129,7 @@ def test_faults_count_what_python_writes_and_nothing_else(tmp_path: Path) -> Non
         (tmp_path / "in/two").unlink()
 
 
+@pytest.mark.long
 def test_a_disk_that_is_really_full_is_told_and_work_goes_on_when_there_is_room(tmp_path: Path) -> None:
     own = ["unshare", "--map-root-user", "--mount"]
     if not shutil.which("unshare") or subprocess.run([*own, "true"], capture_output=True).returncode:

@@ -152,6 +152,7 @@ ROBOSCAPE = (
 )
 
 
+@pytest.mark.long
 def test_roboscapes_table_has_both_tasks_in_and_out_of_domain(root: Path) -> None:
     assert "not run" not in run_study(planned(root, ROBOSCAPE))
     table = table_of(root)

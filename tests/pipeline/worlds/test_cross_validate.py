@@ -43,7 +43,8 @@ def test_every_own_episode_is_left_out_once() -> None:
     assert looks(64) == [2, 4, 8, 16, 32, 64] and looks(1) == [1]
 
 
-@pytest.mark.parametrize("true", [True, pytest.param(False, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("true", [True, False])
 def test_what_is_true_holds_on_other_episodes_and_noise_does_not(tmp_path: Path, true: bool) -> None:
     _, ready = begun(tmp_path, "rl.lr=1e-3", "rl.minibatch=64", "policy.head.std=0.07")
     decisions = ready.true.decisions
