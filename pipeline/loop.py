@@ -98,7 +98,7 @@ def check_labels(cfg: Cfg, graph: Graph, until: str = "") -> None:
         raise ConfigError(
             f"judge={cfg['judge']['_target_']} learns from success, which no data set of"
             f" task.data={cfg['task']['data']} says; record {SUCCESS}, or choose a judge that needs none, as"
-            " judge=goal_image judge.picture=<file> or judge=vlm"
+            " judge=golden_goal, judge=goal_image judge.picture=<file> or judge=vlm"
         )
 
 
