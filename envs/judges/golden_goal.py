@@ -51,8 +51,6 @@ class GoldenGoalJudge(GoalJudge):
         cache: goals remembered.
     """
 
-    needs_labels = True
-
     def __init__(
         self,
         spec: WorldSpec,

@@ -32,6 +32,7 @@ class ActionGoldenGoalJudge(GoldenGoalJudge):
         ConfigError: if the simulator does not say it.
     """
 
+    needs_labels = True
     reads_features = True
     asks_world = True
 

@@ -20,12 +20,21 @@ from learners.stages.tokenizer import train_tokenizer
 from learners.training.fit import FitConfig, fit
 
 
+def shown(store: ClipStore, episodes: Tensor, rows: Tensor) -> Tensor:
+    """Whether the task is done in frames `rows` [B, T] of `episodes` [B], float32 [B, T], NaN where nobody
+    labelled the episode. Where nobody labelled any, all are demonstrations, done in their last frame.
+    """
+    if store.arrays["labelled"].any():
+        return store.success(episodes, rows)
+    return (rows == (store.start + store.length - 1)[episodes][:, None]).float()
+
+
 @dataclass(frozen=True)
 class SuccessfulClips:
     """Clips of successful episodes, as TextWorld.loss takes them.
 
     Args:
-        store: whose recorded success counts.
+        store: whose success counts, see `shown`.
         episodes: to learn from, int64 [N], all of them successful.
         frames: of a clip.
         stride: recorded frames between two frames of a clip: a plan needs fewer than a robot's rate.
@@ -52,7 +61,7 @@ class SuccessfulClips:
             {
                 "frames": store.frames(rows),
                 "valid": store.arrays["present"][rows],
-                "success": store.success(chosen, rows),
+                "success": shown(store, chosen, rows),
                 "text": store.text[chosen],
             },
             [count],
@@ -68,8 +77,9 @@ def train_text_world(
     folder: Path,
     tokenizer: FitConfig | None = None,
 ) -> dict[str, Any]:
-    """Train `world` in place on those of the episodes that are labelled successes, and set how long its
-    golden trajectories may become by the time that these took (TextWorld.longest).
+    """Train `world` in place on those of the episodes that are labelled successes, or on all where nobody
+    labelled any, and set how long its golden trajectories may become by the time that these took
+    (TextWorld.longest).
 
     Args:
         stride: see SuccessfulClips.
@@ -79,14 +89,17 @@ def train_text_world(
         What `fit` does, how many episodes it learned from, and what the tokenizer's training says.
 
     Raises:
-        ConfigError: if none of them is a success, or an instruction of the store, whatever its split, is
+        ConfigError: if all that are labelled failed, or an instruction of the store, whatever its split, is
             longer than its encoder takes.
     """
-    good = episodes[[store.episodes[number]["success"] is True for number in episodes.tolist()]]
+    good = episodes
+    if store.arrays["labelled"].any():
+        good = episodes[[store.episodes[number]["success"] is True for number in episodes.tolist()]]
     if not len(good):
         raise ConfigError(
-            "no episode of the data is labelled a success (next.success), and a text world learns from those"
-            " alone; collect or label some, or use a judge without judge.text_world"
+            "no episode to learn from is labelled a success (next.success), and where others are labelled a"
+            " text world learns from successes alone; record or label some, or use a judge without"
+            " judge.text_world"
         )
     # All of them: calibration and measurements ask about episodes that it does not learn from.
     world.check(store.instructions)
@@ -108,9 +121,9 @@ def longest_of(store: ClipStore, episodes: Tensor, stride: Count) -> int:
     """Frames, `stride` recorded ones apart, after which the task is done in the slowest of these successful
     episodes, int64 [N], and a quarter more; at least 1.
     """
-    done = store.arrays["success"]
-    spans = zip(store.start[episodes].tolist(), store.length[episodes].tolist(), strict=True)
-    slowest = max(int(done[start : start + length].long().argmax()) for start, length in spans)
+    last = store.length[episodes][:, None] - 1
+    rows = store.start[episodes][:, None] + torch.minimum(torch.arange(int(last.max()) + 1), last)
+    slowest = int((shown(store, episodes, rows) > 0).long().argmax(1).max())
     return max(1, -(-5 * slowest // (4 * stride)))
 
 
@@ -131,7 +144,7 @@ def calibrate_ending(world: TextWorld, store: ClipStore, episodes: Tensor, strid
     last = store.length[episodes][:, None] - 1
     ahead = stride * torch.arange(1, -(-int(last.max()) // stride) + 1)  # up to the last frame of each
     rows = store.start[episodes][:, None] + torch.minimum(ahead, last)
-    done = store.success(episodes, rows)
+    done = shown(store, episodes, rows)
     known = (ahead - stride < last) & store.arrays["present"][rows] & torch.isfinite(done)
     if not known.any():
         return False

@@ -22,7 +22,7 @@ from learners.training.fit import FitConfig
 from tests.embodiments import ARM_DELTAS, world_spec
 from tests.envs.simulators.clips import moving_square
 from tests.envs.simulators.test_text_world import TEXTS, lean, world
-from tests.moving_square import INSTRUCTION, SIZE
+from tests.moving_square import INSTRUCTION, SIZE, episodes_of
 from tests.moving_square import moving_square as square_episode
 
 Stores = Callable[[Embodiment], ClipStore]
@@ -118,8 +118,22 @@ def test_clips_rest_at_the_end_where_the_task_is_done(tiny_store: Stores) -> Non
 def test_data_without_successes_are_refused(tiny_store: Stores, tmp_path: Path) -> None:
     store = tiny_store(ARM_DELTAS)
     failed = store.select(succeeded=False)
-    with pytest.raises(ValueError, match="no episode of the data is labelled a success"):
+    with pytest.raises(ValueError, match="no episode to learn from is labelled a success"):
         train_text_world(world(), store, failed, 1, FitConfig(1, 1, 1e-3), tmp_path)
+
+
+def test_where_nobody_labelled_anything_demonstrations_are_done_at_their_end(tmp_path: Path) -> None:
+    robot, episodes = ARM_DELTAS.at(SIZE), episodes_of(ARM_DELTAS)[:8]
+    LeRobotWriter(tmp_path / "data", robot).write([replace(one, success=None) for one in episodes])
+    store = ClipStore([tmp_path / "data"], world_spec(robot, SIZE))
+    every, model = torch.arange(len(store)), world(window=6)
+    clips = SuccessfulClips(store, every, frames=8, stride=3).sample(64, torch.Generator().manual_seed(0))
+    at_rest, done = (clips["frames"] == clips["frames"][:, -1:]).flatten(2).all(2), clips["success"] == 1
+    assert bool(at_rest[done].all()) and bool(done[:, -1].all()) and not done.all()
+    assert longest_of(store, every, 1) == -(-5 * (int(store.length.max()) - 1) // 4)
+    stats = train_text_world(model, store, every, 2, FitConfig(2, 4, 1e-3, bf16=False), tmp_path / "fit")
+    assert stats["successes"] == len(store)
+    assert calibrate_ending(Sees(0.0), store, every, 2)  # type: ignore[arg-type]
 
 
 def test_an_instruction_that_would_be_cut_is_refused_before_training_whatever_its_split(
