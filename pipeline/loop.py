@@ -152,11 +152,8 @@ def _physics_loop(graph: Graph, cfg: Cfg, with_rl: bool) -> None:
         policy = choice.policy
         known = choice.stage if choice.compared else deployed
         if number <= cfg["rounds"]["clone"]:
-            policy = graph.add(
-                f"clone-{number}",
-                imitation.clone,
-                {"data": data, "policy": policy, "known": known, "simulator": made.simulator},
-            )
+            roles = {"data": data, "policy": policy, "known": known}
+            policy = graph.add(f"clone-{number}", imitation.clone, roles)
         if with_rl:
             policy = _learn(graph, cfg, data, made, policy, number, starts, known)
     last = last_round(cfg) + 1

@@ -196,11 +196,9 @@ class ChunkGaussianHead(Head):
 
     def error(self, hidden: Tensor, target: Tensor) -> Tensor:
         """Mean absolute error of the knots that vary, in units of the demonstrations' spread."""
-        return self._gap(self(hidden)[0], target)
-
-    def apart(self, one: Tensor, other: Tensor) -> Tensor:
-        """Mean absolute distance of the mean knots that vary."""
-        return self._gap(self(one)[0], self(other)[0])
+        active = (self.gain > 0).float()
+        error = (self(hidden)[0] - target).abs() * active
+        return error.sum() / (active.sum().clamp(min=1) * error.shape[0] * error.shape[1])
 
     @torch.no_grad()
     def scale_spread(self, width: float) -> None:
@@ -211,8 +209,3 @@ class ChunkGaussianHead(Head):
     def exploration(self) -> float:
         """See Head.exploration: the geometric mean of all spreads says it."""
         return math.exp(float(self.log_std.detach().mean())) / self.std
-
-    def _gap(self, one: Tensor, other: Tensor) -> Tensor:
-        active = (self.gain > 0).float()
-        error = (one - other).abs() * active
-        return error.sum() / (active.sum().clamp(min=1) * error.shape[0] * error.shape[1])

@@ -145,11 +145,6 @@ class ChunkTokenHead(Head):
         active = self.varies.float()
         return (wrong * active).sum() / (active.sum().clamp(min=1) * target.shape[0] * target.shape[1])
 
-    def apart(self, one: Tensor, other: Tensor) -> Tensor:
-        """Symmetric KL divergence per number that varies, in nats."""
-        p, q = (ChunkTokens(*self(hidden)) for hidden in (one, other))
-        return 0.5 * (_kl(p, q) + _kl(q, p)).mean() / (p.active.sum().clamp(min=1) * self.chunk)
-
     @torch.no_grad()
     def scale_spread(self, width: float) -> None:
         """Multiply the temperature at which tokens are drawn, by dividing the logits."""

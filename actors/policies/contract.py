@@ -35,7 +35,6 @@ from tensordict import NestedKey, NonTensorStack, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data.vla import ACTION_TOKENS_KEY
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from envs.specs import CHUNK, INSTRUCTION, INSTRUCTION_UTF8, bytes_to_text
 from envs.targets import ConfigError
@@ -135,21 +134,6 @@ def imitation_loss(policy: TensorDictModuleBase, observed: TensorDictBase, chunk
     if own is not None:
         return own(with_text(observed, policy), chunks)  # type: ignore[no-any-return]
     return -distribution(policy, observed).log_prob(chunks).mean() / chunks[0].numel()
-
-
-def disagreement(policy: TensorDictModuleBase, one: TensorDictBase, other: TensorDictBase) -> Tensor:
-    """Scalar, by how much a policy acts otherwise on other observations [B] of the same moments: its own
-    measure, or the mean loss of imitating on each side what it would do on the other.
-
-    Both sides learn. With one side as the other's teacher, a policy that moves away on the teacher's side is
-    followed and moves on: cloning diverged that way.
-    """
-    own = getattr(policy, "disagreement", None)
-    if own is not None:
-        return own(with_text(one, policy), with_text(other, policy))  # type: ignore[no-any-return]
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        chunks = [policy(inputs_for(side, policy))[CHUNK] for side in (one, other)]
-    return (imitation_loss(policy, one, chunks[1]) + imitation_loss(policy, other, chunks[0])) / 2
 
 
 def with_fixed_spread(dist: Any) -> Any:

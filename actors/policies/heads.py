@@ -54,10 +54,6 @@ class Head(nn.Module, abc.ABC):
         """Scalar loss of imitation."""
 
     @abc.abstractmethod
-    def apart(self, one: Tensor, other: Tensor) -> Tensor:
-        """Scalar distance of what is said of two hidden vectors [N, width]."""
-
-    @abc.abstractmethod
     def scale_spread(self, width: float) -> None:
         """Multiply how widely chunks are drawn around the mode, which stays."""
 

@@ -284,10 +284,6 @@ class ChunkPolicy(ProbabilisticTensorDictSequential):
         """See Head.exploration."""
         return self.head.exploration
 
-    def disagreement(self, one: TensorDictBase, other: TensorDictBase) -> Tensor:
-        """By how much the head says something else of observations [B] than of others."""
-        return self.head.apart(self.policy_features(one), self.policy_features(other))
-
     def imitation_loss(self, observed: TensorDictBase, chunks: Tensor) -> Tensor:
         """The head's loss of imitating chunks [B, K, A] from observations [B]."""
         return self.head.error(self.policy_features(observed), self.head.target(chunks))

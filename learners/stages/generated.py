@@ -20,8 +20,7 @@ def generated_frames(
 ) -> TensorDict:
     """Frames that a simulator generates under the recorded actions of some episodes.
 
-    Judges learn from them what generated video looks like, labelled by what truly happened; policies learn to
-    act on them as on recorded ones.
+    Judges learn from them what generated video looks like, labelled by what truly happened.
 
     Args:
         alone: see replay.

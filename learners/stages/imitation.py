@@ -12,7 +12,6 @@ from torch import Tensor
 
 from actors.policies.contract import (
     VISUAL_FEATURES,
-    disagreement,
     feature_part,
     imitation_loss,
     inputs_for,
@@ -47,20 +46,10 @@ class Cloning:
         store: whose spec says how many commands a chunk has, K.
         episodes: whose behaviour is imitated, int64 [N].
         mode: how the numbers of the policy's chunks are meant.
-        generated: frames of generated.py, or None. On these the policy learns to do what it does on the
-            recorded ones: what it learns in imagination is of use only as far as it acts alike on both.
     """
 
-    def __init__(
-        self,
-        policy: TensorDictModuleBase,
-        store: ClipStore,
-        episodes: Tensor,
-        mode: ActionMode,
-        generated: TensorDict | None = None,
-    ):
+    def __init__(self, policy: TensorDictModuleBase, store: ClipStore, episodes: Tensor, mode: ActionMode):
         self.policy, self.store = policy, store
-        self.generated = generated if generated is not None and len(generated) else None
         rows = store.rows(episodes)
         self.rows = rows[store.arrays["present"][rows]]
         self.targets = chunks_ahead(store, self.rows, mode)
@@ -88,24 +77,14 @@ class Cloning:
         self._features = torch.cat(parts)
 
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
-        """Random observations and the chunks that followed, and generated frames beside recorded ones.
-
-        Returns:
-            TensorDict [] with observed [count], target [count, K, A] and, if frames were generated, recorded
-            and generated [count // 2] observations.
+        """Random observations and the chunks that followed: TensorDict [] with observed [count] and target
+        [count, K, A].
         """
         pick = torch.randint(len(self.rows), (count,), generator=generator)
         observed = observe(self.store, self.rows[pick], pictures=self._features is None)
         if self._features is not None:
             observed[VISUAL_FEATURES] = self._features[pick]
-        out = TensorDict({"observed": observed, "target": self.targets[pick]}, [])
-        if self.generated is not None:
-            some = torch.randint(len(self.generated), (max(1, count // 2),), generator=generator)
-            made = self.generated[some]
-            out["recorded"] = observe(self.store, made["row"])
-            out["generated"] = out["recorded"].clone(recurse=False)
-            out["generated", IMAGE] = made["frames"]
-        return out
+        return TensorDict({"observed": observed, "target": self.targets[pick]}, [])
 
     def disturbed(self, observed: TensorDict, generator: torch.Generator) -> tuple[TensorDict, Tensor]:
         """Observations [N] whose pictures, states and words are disturbed a little, for robustness; and by
@@ -125,10 +104,7 @@ class Cloning:
     def loss(self, data: TensorDict, generator: torch.Generator) -> Tensor:
         """Imitation loss of a batch of `sample`; pictures, states and words are disturbed a little."""
         observed, _ = self.disturbed(data["observed"], generator)
-        total = imitation_loss(self.policy, with_text(observed, self.policy), data["target"])
-        if "generated" not in data.keys():
-            return total
-        return total + disagreement(self.policy, data["recorded"], data["generated"])
+        return imitation_loss(self.policy, with_text(observed, self.policy), data["target"])
 
 
 def chunks_ahead(store: ClipStore, rows: Tensor, mode: ActionMode) -> Tensor:

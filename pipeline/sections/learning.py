@@ -119,7 +119,6 @@ class ExtraStartsSection:
 class CloneSection:
     """Section clone."""
 
-    imagined: Natural
     perception: Fit
     fit: Fit
 

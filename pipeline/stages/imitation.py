@@ -5,15 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from actors.factory import build_policy, build_simulator
+from actors.factory import build_policy
 from actors.process import prepare_process
 from actors.world_config import build_kinematics, pose_style
 from envs.episodes.clips import ClipStore
-from learners.stages.generated import generated_frames
 from learners.stages.imitation import Cloning, train_imitation
 from learners.stages.perception import train_perception
 from learners.stages.traces import Hands
@@ -22,7 +20,6 @@ from pipeline.graph.artefact import save_weights
 from pipeline.graph.stage import Inputs, Place, stage
 from pipeline.stages.given import (
     POLICY,
-    SIMULATOR,
     Cfg,
     demonstrations,
     deployed_in,
@@ -65,19 +62,15 @@ def cloned(cfg: Cfg, folder: Path, store: ClipStore, episodes: Tensor) -> dict[s
     return {**_both(stats, seen), "constant": constant}
 
 
-@stage(reads=(*SIMULATOR, "policy", "imitation", "clone"), place=Place.LEARNERS)
+@stage(reads=(*POLICY, "imitation", "clone", "microbatches"), place=Place.LEARNERS)
 def clone(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """The deployed policy, perception and all, learns from what worked in physics, and to see generated
-    pictures as it sees true ones; the role `known` says in which round it was deployed.
+    """The deployed policy, perception and all, learns from what worked in physics; the role `known` says in
+    which round it was deployed.
     """
     store, section = open_store(cfg, inputs), cfg["clone"]
     prepare_process(cfg["seed"], cfg["threads"])
     policy = build_policy(cfg, inputs.weights("policy"))
     episodes = successful_episodes(cfg, store, deployed_in(inputs, "known"))
-    own = store.select(["policy-*"])
-    own = own[torch.isin(own, learning_episodes(store))].flip(0)[: section["imagined"]]  # the newest first
-    simulator = build_simulator(cfg, inputs.weights("simulator"))
-    made = generated_frames(simulator, store, own, cfg["simulator"]["bf16"])
     mode, discount = mode_of(cfg), cfg["imitation"]["discount"]
     eyes = fit_options(cfg, section["perception"], "clone.perception")
     everything = learning_episodes(store)
@@ -85,9 +78,9 @@ def clone(cfg: Cfg, folder: Path, inputs: Inputs) -> dict[str, Any]:
         policy, store, everything, mode, eyes, folder / "perception", discount, _hands(cfg), fresh=False
     )
     fit = fit_options(cfg, section["fit"], "clone.fit")
-    stats = train_imitation(Cloning(policy, store, episodes, mode, made), fit, folder, fresh=False)
+    stats = train_imitation(Cloning(policy, store, episodes, mode), fit, folder, fresh=False)
     save_weights(policy, folder)
-    return {**_both(stats, seen), "episodes": len(episodes), "generated_frames": len(made)}
+    return {**_both(stats, seen), "episodes": len(episodes)}
 
 
 def _hands(cfg: Cfg) -> Hands:

@@ -131,7 +131,7 @@ def changed(before: dict[str, str], after: dict[str, str]) -> set[str]:
     [
         (
             "simulator.checkpoint",
-            {"collect", "imitation", "explore", "deploy-1", "trial-1", "evaluate-before"},
+            {"collect", "imitation", "explore", "deploy-1", "clone-1", "trial-1", "evaluate-before"},
         ),
         ("simulator.kinematics.model", {"collect"}),
     ],

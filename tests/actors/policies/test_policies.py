@@ -15,7 +15,6 @@ from actors.policies.chunk_tokens import ChunkTokens
 from actors.policies.contract import (
     VISUAL_FEATURES,
     action_key,
-    disagreement,
     distribution,
     imitation_loss,
     input_keys,
@@ -252,29 +251,6 @@ def test_imitates_a_few_chunks_after_taking_units_from_them(name: str) -> None:
         said = policy(inputs_for(seen, policy))[CHUNK]
     assert float((said[..., 1] - 5.0).abs().max()) < 1e-3
     assert float((said - chunks).abs().mean()) < float((chunks - chunks.mean(0)).abs().mean())
-
-
-@pytest.mark.parametrize("name", POLICIES)
-def test_learns_to_act_alike_on_other_pictures_of_the_same_moments(name: str) -> None:
-    spec = world_spec(ARM_JOINTS)
-    policy = policy_of(name, spec, "absolute")
-    one, other = observations(spec, 6), observations(spec, 6)
-    other["observation", "image"] = 255 - one["observation", "image"]
-    other["observation", "state"] = one["observation", "state"]
-    policy.normalise(torch.randn(6, spec.chunk, spec.action_dim), one[STATE], one[COMMAND])
-
-    def apart() -> float:
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            mine, theirs = (policy(inputs_for(side, policy))[CHUNK] for side in (one, other))
-        return float((mine - theirs).abs().mean())
-
-    assert torch.allclose(disagreement(policy, one, other), disagreement(policy, other, one), rtol=1e-4)
-    optimiser, before = torch.optim.Adam([p for p in policy.parameters() if p.requires_grad], 3e-3), apart()
-    for _ in range(40):
-        optimiser.zero_grad()
-        disagreement(policy, one, other).backward()
-        optimiser.step()
-    assert apart() < 0.5 * before
 
 
 @pytest.mark.parametrize("name", POLICIES)

@@ -9,19 +9,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModuleBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from actors.policies.contract import inputs_for
 from envs.embodiment import Arm, Embodiment
 from envs.episodes.clips import ClipStore
-from envs.specs import C2W, CHUNK, IMAGE, INSTRUCTION_UTF8, ActionMode, bytes_to_text
-from learners.stages.generated import generated_frames
+from envs.specs import C2W, IMAGE, INSTRUCTION_UTF8, ActionMode, bytes_to_text
 from learners.stages.imitation import Cloning, chunks_ahead, train_imitation
 from learners.stages.observed import observe
 from learners.training.fit import FitConfig
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_POSES, EMBODIMENTS
-from tests.learners.models import POLICIES, policy_of, simulator_of
+from tests.learners.models import POLICIES, policy_of
 from tests.moving_square import INSTRUCTION
 
 Stores = Callable[[Embodiment], ClipStore]
@@ -114,30 +110,3 @@ def test_a_policy_without_features_cannot_keep_them(tiny_store: Stores) -> None:
     cloning = Cloning(policy_of("tiny_vla", store.spec), store, torch.arange(4), ActionMode.ABSOLUTE)
     with pytest.raises(ValueError, match=r"rl\.freeze_perception=false"):
         cloning.encode()
-
-
-def test_cloning_makes_a_policy_act_alike_on_generated_and_recorded_pictures(
-    tiny_store: Stores, tmp_path: Path
-) -> None:
-    store = tiny_store(ARM_DELTAS)
-    demos, mode = store.select(["expert"]), ActionMode.ABSOLUTE
-    made = generated_frames(simulator_of("unet_small", store.spec), store, torch.arange(8), bf16=False)
-    made["frames"] = 255 - store.frames(made["row"])  # what any simulator makes, only more so
-
-    def apart(policy: TensorDictModuleBase, generated: bool, name: str) -> float:
-        cloning = Cloning(policy, store, demos, mode, made if generated else None)
-        train_imitation(
-            cloning, FitConfig(40, 16, lr=2e-3, warmup=1, bf16=False), tmp_path / name, fresh=False
-        )
-        observed = observe(store, made["row"])
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            one = policy(inputs_for(observed, policy))[CHUNK]
-            observed[IMAGE] = made["frames"]
-            return float((policy(inputs_for(observed, policy))[CHUNK] - one).abs().mean())
-
-    def fresh() -> TensorDictModuleBase:
-        policy = policy_of("chunk_gaussian", store.spec, mode)
-        train_imitation(Cloning(policy, store, demos, mode), QUICK, tmp_path / "fresh")
-        return policy
-
-    assert apart(fresh(), True, "with") < 0.7 * apart(fresh(), False, "without")

@@ -47,7 +47,7 @@ def test_a_text_world_that_never_says_done_is_told_with_what_to_change(
     tiny_data: Callable[[Embodiment], Path], tmp_path: Path
 ) -> None:
     words = ("judge=golden_goal", "task=lerobot", f"task.data=[{tiny_data(ARM_DELTAS)}]", "task.size=[32,32]")
-    cfg = config(*words, "task.chunk=4", "task.horizon=8", "launch.device=cpu")
+    cfg = config(*words, "judge.fallback=drop", "task.chunk=4", "task.horizon=8", "launch.device=cpu")
     cfg["judge"]["text_world"] = section(ending={"threshold": 1.0})  # nothing is more certain than that
     (tmp_path / DATASETS).write_text(json.dumps([str(tiny_data(ARM_DELTAS))]))
     settings = {"phase": "first"}
