@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from tqdm import tqdm
 
 from actors.factory import build_algorithm, build_policy, open_clips
 from actors.fleets.fleet import Fleet, FleetError
@@ -60,9 +61,8 @@ LEARNING = ("policy", "algorithm", "rl", "imitation", "microbatches")
 @stage(reads=(*WORLD, *LEARNING, "extra_starts.share"), place=Place.LEARNERS)
 @priced
 def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
-    """Reinforcement learning inside the simulator, or by recorded decisions alone where imagined ones weigh
-    nothing and so are not made; the role `starts`, if somebody plays it, holds first
-    frames that nothing more was recorded of.
+    """RL inside the simulator, or by recorded decisions alone where imagined ones weigh nothing; the role
+    `starts`, if somebody plays it, holds first frames that nothing more was recorded of.
 
     The role `known` says in which round the policy was deployed, whose true decisions are learned from and
     whose successes anchor it; without one demonstrations alone anchor it.
@@ -73,6 +73,8 @@ def rl(cfg: ConfigView, folder: Path, inputs: Inputs) -> dict[str, Any]:
         FleetError: if too many episodes are lost; also what to change, where the judge lost most of them.
     """
     ready = begin(cfg, inputs)
+    if ready.true.alone and leads():
+        tqdm.write("rl: imagined decisions weigh nothing and are not made; it learns from recorded ones")
     fleet = build_fleet(ready.recipe) if leads() and not ready.true.alone else None
     try:
         watch = true_success(cfg, ready.settings, inputs.weights("policy"))
@@ -122,10 +124,8 @@ def begin(cfg: ConfigView, inputs: Inputs) -> Imagination:
     prepare_process(cfg["seed"], cfg["threads"])
     store = open_store(cfg, inputs)
     policy = build_policy(cfg, inputs.weights("policy"))
-    lr = rl_rate(policy, cfg["rl"]["lr"])
-    settings = rl_options(
-        cfg, iterations=inputs.settings["iterations"], seed=cfg["seed"] * 100 + number, lr=lr
-    )
+    lr, iterations = rl_rate(policy, cfg["rl"]["lr"]), inputs.settings["iterations"]
+    settings = rl_options(cfg, iterations=iterations, seed=cfg["seed"] * 100 + number, lr=lr)
     anchor = Cloning(policy, store, successful_episodes(cfg, store, deployed), mode_of(cfg))
     if settings.freeze_perception:
         freeze_perception(policy)
@@ -152,14 +152,13 @@ def begin(cfg: ConfigView, inputs: Inputs) -> Imagination:
         later=settings.rewards_later,
     )
     starts = starts_of(cfg, *_begun(store, inside, settings.starts == "key"), len(extra))
+    recorded = decisions is not None and settings.recorded > 0
     if worth := worth_in(inputs):
         starts, mean = by_worth(starts, tasks_of_starts(cfg, store, inside, beyond), worth)
-        if decisions is not None and settings.recorded:
+        if recorded:
             settings = replace(settings, imagined=settings.imagined * mean)
         known["imagined_weight"] = settings.imagined
-    alone = 0
-    if decisions is not None and settings.recorded and not settings.imagined:
-        alone = settings.envs * imagined_chunks(cfg)
+    alone = settings.envs * imagined_chunks(cfg) if recorded and not settings.imagined else 0
     true = TrueExperience(anchor, decisions, alone)
     return Imagination(
         *(policy, algorithm, settings, recipe, starts, true, rollout, known), store, inside, beyond

@@ -158,7 +158,8 @@ def test_a_row_is_measured_by_the_judge_that_it_names(
         ["rewards=[golden_goal,golden_goal_full,rule]", *words, "judge.threshold=0.7", "variants=[x]"]
     )
     judges = {name: cfg["judge"] for name, cfg in plans[0].configs.items()}
-    assert judges["golden_goal"] == load_config(["judge=golden_goal"])["judge"]  # of the same class
+    chosen = load_config(["experiment=smoke", "judge=golden_goal"])["judge"]  # of the same class
+    assert judges["golden_goal"] == chosen
     assert judges["golden_goal_full"] == judges["rule"]
     assert judges["rule"] == load_config(["judge=golden_goal_full", "judge.threshold=0.7"])["judge"]
 
