@@ -15,6 +15,7 @@ from envs.ranges import Count
 from envs.simulators.replay import side_by_side
 from envs.simulators.tokens.text_world import TextWorld
 from envs.targets import ConfigError
+from learners.stages.simulator import last_rows
 from learners.stages.threshold import as_likely_as_not
 from learners.stages.tokenizer import train_tokenizer
 from learners.training.fit import FitConfig, fit
@@ -26,7 +27,7 @@ def shown(store: ClipStore, episodes: Tensor, rows: Tensor) -> Tensor:
     """
     if store.arrays["labelled"].any():
         return store.success(episodes, rows)
-    return (rows == (store.start + store.length - 1)[episodes][:, None]).float()
+    return (rows == last_rows(store, rows)).float()
 
 
 @dataclass(frozen=True)
@@ -92,9 +93,8 @@ def train_text_world(
         ConfigError: if all that are labelled failed, or an instruction of the store, whatever its split, is
             longer than its encoder takes.
     """
-    good = episodes
-    if store.arrays["labelled"].any():
-        good = episodes[[store.episodes[number]["success"] is True for number in episodes.tolist()]]
+    last = (store.start + store.length - 1)[episodes, None]
+    good = episodes[shown(store, episodes, last)[:, 0] > 0]
     if not len(good):
         raise ConfigError(
             "no episode to learn from is labelled a success (next.success), and where others are labelled a"
