@@ -43,6 +43,7 @@ def test_two_arms_by_poses_with_calibrated_cameras(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_two_arms_by_joints_inside_gesim(tmp_path: Path) -> None:
     joints = (
         "task=push",
@@ -56,6 +57,7 @@ def test_two_arms_by_joints_inside_gesim(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_one_arm_by_deltas_of_meta_world(tmp_path: Path) -> None:
     pytest.importorskip("metaworld", reason="make setup installs metaworld")
     loop(

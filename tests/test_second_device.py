@@ -83,6 +83,7 @@ def test_a_student_of_few_steps(
         ),
     ],
 )
+@pytest.mark.long
 def test_a_round_of_the_loop(
     choices: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -84,7 +84,7 @@ def test_a_lost_node_costs_no_job(recipe: Recipe, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(
     ("when", "number", "status"),
     [
-        ("starting", signal.SIGKILL, -9),
+        pytest.param("starting", signal.SIGKILL, -9, marks=pytest.mark.long),
         pytest.param("starting", signal.SIGTERM, 143, marks=pytest.mark.long),
         ("up", signal.SIGTERM, 143),
     ],

@@ -119,6 +119,7 @@ def test_restarted_service_is_found_again_and_a_lost_one_is_an_error(service: An
         JudgeClient("judge-test", OPTIONS)
 
 
+@pytest.mark.long
 def test_a_service_hosts_a_vision_language_model_and_passes_on_why_it_stops(
     service: Any, tmp_path: Path
 ) -> None:

@@ -127,6 +127,7 @@ def test_a_killed_host_is_replaced_and_its_job_run_again(cluster: None, recipe: 
         fleet.close()
 
 
+@pytest.mark.long
 def test_hosts_come_and_go_while_running(cluster: None, recipe: Recipe, tmp_path: Path) -> None:
     fleet = RayFleet(recipe, 1)
     try:
@@ -185,6 +186,7 @@ def test_a_job_that_ends_every_host_stops_the_run(cluster: None, recipe: Recipe)
         fleet.close()
 
 
+@pytest.mark.long
 def test_hosts_that_cannot_be_built_stop_the_run(cluster: None, recipe: Recipe) -> None:
     plain = recipe.plain() | {"data": ("/nowhere",)}
     fleet = RayFleet(Recipe(**plain), 1, patience=patience(recipe, rebuilds=2))

@@ -16,6 +16,7 @@ from envs.targets import TARGET, ConfigError, _within, target
 from pipeline.checks import faults
 from pipeline.config import CONFIGS, choices, groups, load_config, read_config
 from pipeline.loop import build_loop
+from tests.sampling import every, those
 
 
 @pytest.mark.parametrize(
@@ -196,10 +197,12 @@ NULLABLE = (
 
 
 WHOLE = "experiment=quickstart"
+CHOICES = [f"{group}={name}" for group in groups() for name in choices(group)]
+SAMPLED = (WHOLE, "experiment=bench4", "simulator=dit", "judge=learned", "task=tabletop", "launch=ray")
 SECTIONS = {"distiller": "distill"}  # of groups that fill a part of one
 
 
-@pytest.mark.parametrize("word", [f"{group}={name}" for group in groups() for name in choices(group)])
+@pytest.mark.parametrize("word", those(SAMPLED, CHOICES))
 def test_hundreds_of_wrong_values_are_all_found(word: str) -> None:
     """Every value of every choice in turn is replaced by values of other types and out of range; each is
     found and named. Experiments share most of theirs, which are tried once.
@@ -230,7 +233,7 @@ WORDS = [
 ]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", every(4, range(4)))
 def test_drawn_overrides_are_understood_or_refused(seed: int) -> None:
     """Whatever is typed is a config or a sentence, never another exception."""
     chance = random.Random(seed)

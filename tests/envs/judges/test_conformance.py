@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,6 +27,7 @@ from tests.embodiments import EMBODIMENTS, INSTRUCTIONS, world_spec
 from tests.envs.judges.chat_server import MODEL, hashing, serving
 from tests.envs.judges.tiny_vlm import save_tiny_vlm
 from tests.envs.nearing import nearing
+from tests.sampling import every
 from tests.sections import CONFIGS, offered, section
 
 EXAMPLES = CONFIGS.parent / "examples/configs"
@@ -109,7 +111,16 @@ JUDGES = {name: CONFIGS for name in offered("judge") if not name.endswith(FULL)}
 }
 
 
-@pytest.fixture(scope="module", params=JUDGES)
+# Every judge with some robots, every robot with some judges.
+for_each = pytest.mark.parametrize(
+    ("name", "spec"),
+    every(3, product(JUDGES, EMBODIMENTS.values())),
+    indirect=True,
+    ids=lambda value: getattr(value, "robot", value),
+)
+
+
+@pytest.fixture(scope="module")
 def name(request: pytest.FixtureRequest) -> str:
     """Of a judge."""
     return str(request.param)
@@ -124,7 +135,7 @@ def options(name: str) -> Iterator[dict[str, Any]]:
         yield options
 
 
-@pytest.fixture(params=EMBODIMENTS.values(), ids=EMBODIMENTS)
+@pytest.fixture
 def spec(request: pytest.FixtureRequest) -> WorldSpec:
     """What a world shows of a robot, at a size that is no power of two."""
     robot: Embodiment = request.param
@@ -158,6 +169,7 @@ def clips(judge: Judge, spec: WorldSpec, batch: int, frames: int) -> Clips:
     return video, video[:, 0], texts, (features,) if judge.reads_features else ()
 
 
+@for_each
 def test_judgements_are_probabilities_in_every_frame(judge: Judge, spec: WorldSpec) -> None:
     frames, first, texts, seen = clips(judge, spec, 3, 5)
     judgement = judge.score(frames, first, texts, *seen)
@@ -176,6 +188,7 @@ def rows(judgement: Judgement, at: slice) -> Judgement:
     return Judgement(*(value[at] for value in judgement))
 
 
+@for_each
 def test_a_judgement_does_not_depend_on_the_rest_of_the_batch(judge: Judge, spec: WorldSpec) -> None:
     frames, first, texts, seen = clips(judge, spec, 3, 4)
     together = judge.score(frames, first, texts, *seen)
@@ -193,6 +206,7 @@ def test_a_judgement_does_not_depend_on_the_rest_of_the_batch(judge: Judge, spec
     assert near(alone.success, together.success[1:2]) and near(alone.progress, together.progress[1:2])
 
 
+@for_each
 def test_every_weight_is_learned_or_at_least_used(name: str, judge: Judge, spec: WorldSpec) -> None:
     """What is trained gets a gradient from the loss; what is frozen changes the judgement when it changes."""
     frames, first, texts, seen = clips(judge, spec, 6, 1)
@@ -220,12 +234,14 @@ def test_every_weight_is_learned_or_at_least_used(name: str, judge: Judge, spec:
         value.copy_(kept)
 
 
+@for_each
 def test_what_is_submitted_is_fetched(judge: Judge, spec: WorldSpec) -> None:
     frames, first, texts, seen = clips(judge, spec, 2, 3)
     given = (frames, first, texts, *seen)
     assert torch.equal(judge.fetch(judge.submit(*given)).success, judge.score(*given).success)
 
 
+@for_each
 def test_first_frame_instruction_and_every_view_matter(name: str, judge: Judge, spec: WorldSpec) -> None:
     frames, first, texts, seen = clips(judge, spec, 2, 3)
     if isinstance(judge, GoldenGoalJudge):
@@ -242,6 +258,7 @@ def test_first_frame_instruction_and_every_view_matter(name: str, judge: Judge, 
         assert same(judge.score(other, first, texts, *seen), scores) == (beside or "frames" in ignored)
 
 
+@for_each
 def test_a_judge_that_reads_features_says_when_it_has_none(judge: Judge, spec: WorldSpec) -> None:
     frames, first, texts, seen = clips(judge, spec, 2, spec.chunk + 1)
     if not judge.reads_features:
@@ -251,6 +268,7 @@ def test_a_judge_that_reads_features_says_when_it_has_none(judge: Judge, spec: W
             judge.score(frames, first, texts, *given)
 
 
+@for_each
 def test_a_judge_of_nan_says_error(judge: Judge, spec: WorldSpec) -> None:
     numbers = [*judge.parameters(), *(value for value in judge.buffers() if value is not judge.threshold)]
     if not numbers:
@@ -273,6 +291,7 @@ def test_the_rule_has_no_weights_and_judges_each_episode_by_itself() -> None:
         assert same(judge.judgement(progress[at] > 0.7, progress[at]), rows(together, at))
 
 
+@for_each
 def test_streaks_run_across_chunks_and_break(judge: Judge) -> None:
     judge.hold = 3
     success = torch.tensor([[0.9, 0.9, 0.1, 0.9, 0.9, 0.9]])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from envs.physics.worker import Worker, WorkerSpec
 from envs.specs import CHUNK, LOST, STATE, ActionMode, Rewards, WorldSpec
 from envs.targets import ConfigError
 from tests.envs.physics.sections import task_section
+from tests.sampling import every
 from tests.suites.counting import Counting
 
 pytestmark = pytest.mark.slow
@@ -151,8 +153,7 @@ def test_evaluations_do_not_count_where_physics_crashes() -> None:
     env.close()
 
 
-@pytest.mark.parametrize("fault", ["raise", "exit"])
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize(("workers", "fault"), every(3, product((1, 2), ("raise", "exit"))))
 def test_an_error_of_the_suite_counts_like_a_crash_and_is_told(
     fault: str, workers: int, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -180,6 +181,7 @@ def test_a_worker_that_hangs_counts_like_one_that_died(
     pool.close()
 
 
+@pytest.mark.long
 def test_a_worker_that_is_slow_does_not_hang(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ from learners.rl.loop import train_rl
 from learners.rl.starts import Starts
 from learners.rl.watch import Watch
 from tests.embodiments import ARM_DELTAS, observations, world_spec
+from tests.sampling import every
 from tests.sections import offered, section
 
 RL = {
@@ -95,8 +97,7 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
     return [{k: v for k, v in row.items() if "/time/" not in k} for row in rows]
 
 
-@pytest.mark.parametrize("policy_name", POLICIES)
-@pytest.mark.parametrize("name", offered("algorithm"))
+@pytest.mark.parametrize(("name", "policy_name"), every(4, product(offered("algorithm"), POLICIES)))
 def test_trains_every_policy_and_repeats_itself(name: str, policy_name: str, tmp_path: Path) -> None:
     runs = []
     for number in range(2):
@@ -146,8 +147,7 @@ def learn(algorithm: Algorithm, data: TensorDict, steps: int = 40) -> list[float
     return losses
 
 
-@pytest.mark.parametrize("policy_name", POLICIES)
-@pytest.mark.parametrize("name", offered("algorithm"))
+@pytest.mark.parametrize(("name", "policy_name"), every(4, product(offered("algorithm"), POLICIES)))
 def test_loss_falls_and_good_chunks_get_likelier(name: str, policy_name: str) -> None:
     spec = world_spec(ARM_DELTAS)
     policy = policy_of(policy_name, spec)

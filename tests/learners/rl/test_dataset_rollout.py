@@ -15,6 +15,7 @@ from envs.specs import IMAGE, Rewards, Status
 from envs.targets import build
 from learners.rl.recorded.rollout import dataset_rollout
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS
+from tests.sampling import every
 from tests.sections import section
 
 Stores = Callable[[Embodiment], ClipStore]
@@ -152,7 +153,7 @@ def test_a_judge_that_reads_features_is_asked_of_whole_chunks(tiny_store: Stores
     assert torch.allclose(_total(rollout), torch.where(won, 1.0, steps / 10))
 
 
-@pytest.mark.parametrize("name", ["chunk_gaussian", "tiny_vla"])
+@pytest.mark.parametrize("name", every(2, ["chunk_gaussian", "tiny_vla"]))
 def test_a_warmed_up_critic_explains_returns(tiny_store: Stores, name: str) -> None:
     store = tiny_store(ARM_DELTAS)
     policy = _policy(store, name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ from learners.training.fit import FitConfig
 from tests.embodiments import ARM_DELTAS, ARM_JOINTS, BIMANUAL_POSES, EMBODIMENTS
 from tests.learners.models import POLICIES, policy_of
 from tests.moving_square import INSTRUCTION
+from tests.sampling import every
 
 Stores = Callable[[Embodiment], ClipStore]
 QUICK = FitConfig(steps=40, batch=16, lr=3e-3, warmup=5, bf16=False)
@@ -32,8 +34,11 @@ def modes(robot: Embodiment) -> ActionMode:
     return ActionMode.ABSOLUTE if robot.delta else ActionMode.RELATIVE
 
 
-@pytest.mark.parametrize("name", POLICIES)
-@pytest.mark.parametrize("robot", EMBODIMENTS.values(), ids=EMBODIMENTS)
+@pytest.mark.parametrize(
+    ("name", "robot"),
+    every(5, product(POLICIES, EMBODIMENTS.values())),
+    ids=lambda value: getattr(value, "robot", value),
+)
 def test_every_policy_learns_to_imitate(
     name: str, robot: Embodiment, tiny_store: Stores, tmp_path: Path
 ) -> None:

@@ -17,6 +17,7 @@ SMALL = (
 )
 
 
+@pytest.mark.long
 def test_success_is_counted_by_task_and_variant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     experts(load_config([*SMALL, f"runs={tmp_path}", "~task.variants.swapped"]))
     said = capsys.readouterr().out
@@ -37,6 +38,7 @@ def test_an_expert_that_fails_is_shown_with_its_seeds(tmp_path: Path) -> None:
     assert read_video(videos[0]).shape == (5, 3, 192, 192)
 
 
+@pytest.mark.long
 def test_episodes_that_crash_physics_are_said_to_be_dropped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

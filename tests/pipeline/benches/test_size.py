@@ -19,6 +19,7 @@ from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
 from tests.envs.simulators.clips import clip, first_of, future_of, moving_square
 from tests.envs.simulators.test_engines import ROBOTS, build_engine, section_of
 from tests.envs.simulators.test_text_world import TEXTS, section, world
+from tests.sampling import every
 from tests.sections import merged
 
 # One camera and seven numbers: what WPE's robots share.
@@ -34,6 +35,7 @@ ARM = Embodiment(
 )
 
 
+@pytest.mark.long
 def test_forcing_full_has_the_published_size_and_shapes() -> None:
     found = size_of(section_of("forcing_full"), WorldSpec(ARM, (256, 256), 9))
     assert found.trained == pytest.approx(609e6, rel=0.005)
@@ -74,7 +76,9 @@ def test_worlds_of_tokens_learn_and_generate_at_the_published_width() -> None:
         assert found.generating > pass_of_a_frame * 4  # a frame that is known, two passes, and what they made
 
 
-@pytest.mark.parametrize("name", ["forcing_small", "dit_small", "unet_small", "tokens_small", "gesim_tiny"])
+@pytest.mark.parametrize(
+    "name", every(2, ["forcing_small", "dit_small", "unet_small", "tokens_small", "gesim_tiny"])
+)
 def test_what_is_counted_without_numbers_is_what_is_computed_with_them(name: str) -> None:
     spec = world_spec(ROBOTS[BIMANUAL_POSES.robot], chunk=5)
     found = size_of(section_of(name), spec)

@@ -108,6 +108,7 @@ def test_a_student_meets_all_that_it_should_or_it_is_said_what_it_missed() -> No
     assert unknown.endswith("imagined less true success unknown and -4.0 points)")
 
 
+@pytest.mark.long
 def test_strides_reach_as_many_times_further(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = [*TINY, "simulator_fit.first.strides=[1,2]", f"runs={tmp_path}"]
     found = strides(load_config(words))

@@ -16,6 +16,7 @@ from unittest.mock import patch
 import pytest
 
 from pipeline.cli.main import COMMANDS, main
+from tests.sampling import every
 
 ROOT = Path(__file__).resolve().parents[3]
 Answer = subprocess.CompletedProcess[str]
@@ -62,7 +63,9 @@ def test_help_lists_the_commands() -> None:
     assert out.returncode == 0 and "doctor" in out.stdout and "controls" in out.stdout
 
 
-@pytest.mark.parametrize("words", [[], ["--help"], ["doctor", "--help"], ["stages", "experiment=smoke"]])
+@pytest.mark.parametrize(
+    "words", every(3, [[], ["--help"], ["doctor", "--help"], ["stages", "experiment=smoke"]])
+)
 def test_a_reader_that_goes_ends_a_command_without_a_word(words: list[str]) -> None:
     assert unread(*words) == (128 + signal.SIGPIPE, "")
 

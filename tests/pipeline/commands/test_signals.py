@@ -120,8 +120,9 @@ AT_ONCE = {"convert", "stages", "summary", "compare", "submit", "tasks", "config
 # The same code answers both, so one command is asked one way and the next the other; those whose processes
 # live longest are asked both ways.
 BOTH = ("run", "serve", "chaos")
+SAMPLED = ("run", "stage", "evaluate", "finetune", "serve", "bench")  # one of each sort of work
 CASES = [
-    pytest.param(name, number, marks=pytest.mark.long if name == "chaos soak" else ())
+    pytest.param(name, number, marks=() if name in SAMPLED else pytest.mark.long)
     for place, name in enumerate(LASTS)
     for asked, number in enumerate((signal.SIGINT, signal.SIGTERM))
     if name in BOTH or place % 2 == asked

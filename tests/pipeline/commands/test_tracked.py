@@ -20,6 +20,7 @@ from pipeline.commands.submit import entrypoint
 from pipeline.config import load_config
 from pipeline.loop import build_loop
 from tests.embodiments import ARM_DELTAS
+from tests.sampling import those
 
 # Stages that never end by themselves: there is no race between what they log and their end.
 ENDLESS = ("imitation.perception.steps=900000", "finetune.simulator.fit.steps=900000")
@@ -58,12 +59,10 @@ def finished_in_name_only(words: list[str], root: Path) -> None:
     write_manifest(loop.folder("report"), {"stage": "report", "result": {}})
 
 
-SAMPLED = ("finetune", "submit")  # the others learn in stages of the same graph
+SAMPLED = ("finetune",)  # the others learn in stages of the same graph
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name in SAMPLED else pytest.mark.long) for name in COMMANDS]
-)
+@pytest.mark.parametrize("name", those(SAMPLED, COMMANDS))
 def test_rows_come_while_a_stage_learns(
     name: str, tmp_path: Path, tiny_data: Callable[[Embodiment], Path]
 ) -> None:

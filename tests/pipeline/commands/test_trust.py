@@ -30,6 +30,7 @@ def test_a_run_that_has_not_come_so_far_is_told_so(tmp_path: Path) -> None:
         trust(cfg, tmp_path, 3, 10, 4, 1)
 
 
+@pytest.mark.long
 def test_an_interrupted_command_goes_on_and_tries_nothing_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

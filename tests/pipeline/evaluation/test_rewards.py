@@ -164,6 +164,7 @@ def test_a_row_is_measured_by_the_judge_that_it_names(
     assert judges["rule"] == load_config(["judge=golden_goal_full", "judge.threshold=0.7"])["judge"]
 
 
+@pytest.mark.long
 def test_without_physics_nobody_asks_it_unless_told_to(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dataset: Path
 ) -> None:

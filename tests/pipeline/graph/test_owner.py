@@ -72,6 +72,7 @@ def test_what_a_dead_owner_held_is_taken_over(
     assert not (tmp_path / ".owner.json").exists()
 
 
+@pytest.mark.long
 def test_two_commands_in_one_run_leave_one_good_run(tmp_path: Path) -> None:
     few = "collect.episodes={train: 4, held_out: 1, calibration: 1}"
     words = ["stage", "collect", "experiment=soak", f"runs={tmp_path}", "track=disabled", few]

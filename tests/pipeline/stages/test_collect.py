@@ -55,6 +55,7 @@ class Still(TensorDictModuleBase):
         return seen.set(CHUNK, torch.zeros(len(seen), self.chunk, 1))
 
 
+@pytest.mark.long
 def test_a_suite_that_is_there_once_is_played_by_one_object() -> None:
     cfg = load_config(["experiment=soak", "launch.workers=2", "task.horizon=4", "task.chunk=4"])
     cfg["task"] |= {"suite": {"_target_": f"{__name__}.Alone", "fault": ""}, "envs": 1}

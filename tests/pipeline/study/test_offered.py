@@ -14,6 +14,7 @@ from envs.targets import build
 from pipeline.acting import acting
 from pipeline.config import CONFIGS, choices
 from pipeline.study.plan import plan_study
+from tests.sampling import every, those
 
 COMMAND = re.compile(r"worldloop study((?: [\w.]+=[\w\[\],]+)*)")
 
@@ -33,6 +34,9 @@ ELSEWHERE = [
     ("experiment=metaworld5", "study=judges"),
 ]
 
+PLANNED = [(words,) for words in [(), *COMMANDS, *ELSEWHERE]]
+SAMPLED = [((),), (("experiment=bench4",),), (("experiment=worlds",),)]
+
 
 def test_every_file_says_how_its_study_is_run() -> None:
     assert all(command("study", name) is not None for name in choices("study"))
@@ -43,7 +47,9 @@ def test_every_file_says_how_its_study_is_run() -> None:
         assert bool(chosen or own) == (command("experiment", name) is not None), name
 
 
-@pytest.mark.parametrize("words", [(), *COMMANDS, *ELSEWHERE], ids=" ".join)
+@pytest.mark.parametrize(
+    "words", those(SAMPLED, [(words,) for words in [(), *COMMANDS, *ELSEWHERE]]), ids=" ".join
+)
 def test_every_row_can_be_built(words: tuple[str, ...], tmp_path: Path) -> None:
     study = plan_study([*words, f"runs={tmp_path}", "study.seeds=[0]"])
     assert {row.name for row in study.rows} == set(study.cfg["study"]["rows"])
@@ -54,7 +60,7 @@ def test_every_row_can_be_built(words: tuple[str, ...], tmp_path: Path) -> None:
             assert world.spec.chunk == cfg["task"]["chunk"], row.title
 
 
-@pytest.mark.parametrize("name", ["reward_curves", "worlds"])
+@pytest.mark.parametrize("name", every(2, ["worlds", "reward_curves"]))
 def test_no_engine_learns_views_that_nobody_looks_through(name: str, tmp_path: Path) -> None:
     study = plan_study([f"experiment={name}", f"runs={tmp_path}", "study.seeds=[0]"])
     assert {(row.cfg["cameras"], world_spec(row.cfg).views) for row in study.rows} == {("main", 1)}
