@@ -126,9 +126,9 @@ def test_students_gain_by_the_same_rl_as_their_teacher(root: Path) -> None:
 def test_students_stand_beside_a_baseline_and_a_teacher_of_as_few_steps(root: Path) -> None:
     words = ["study=students", "simulator=dit_small"]
     rows = {entry.name: entry.made.graph for entry in planned(root, words).rows}
-    control = rows.pop("without_imagined")  # the undistilled world, out of which nothing is learned
+    control = rows.pop("without_imagined")  # the teacher's world, out of which nothing is learned
     assert control.cfg["rl"]["imagined"] == 0.0
-    assert control.key("simulator-1") == rows["undistilled"].key("simulator-1")
+    assert control.key("simulator-1") == rows["teacher"].key("simulator-1")
     assert list(rows) == ["teacher", "undistilled", "four", "two", "one", "trajectory"]
     assert [name for name, graph in rows.items() if "student-1" not in graph.nodes] == list(rows)[:2]
     taken = {name: graph.cfg["simulator"]["denoising"]["steps"] for name, graph in rows.items()}
