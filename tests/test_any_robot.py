@@ -35,6 +35,7 @@ def robot_of(folder: Path) -> Embodiment:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_two_arms_by_poses_with_calibrated_cameras(tmp_path: Path) -> None:
     cameras = "task.suite.cameras=[head,hand_left,hand_right]"
     loop("rl", tmp_path, "task=push", cameras, "task.chunk=4", "task.horizon=12", "task.size=[48,48]")

@@ -53,8 +53,7 @@ def evaluate_policy(
     changes = variant_of(cfg, variant)
     if variant and world != "physics":
         raise ConfigError(f"variant={variant} is known in physics alone; leave world={world} out")
-    folder = graph.folder(weights) if weights in graph.nodes else Path(weights)
-    actor = build_policy(cfg, folder / WEIGHTS if weights else None)
+    actor = build_policy(cfg, _weights(graph, root, weights) if weights else None)
     env, seeds, tasks = _physics(cfg, changes) if world == "physics" else _imagined(cfg, graph)
     try:
         outcome = evaluate(env, actor, seeds, label=world)
@@ -76,6 +75,23 @@ def evaluate_policy(
     about = {"policy": weights or cfg["policy"]["_target_"], "world": world, "variant": variant}
     write_json(kept, {**about, **rate_entry(outcome.success[outcome.counted]), "each": each})
     return "\n".join([*lines, str(kept)])
+
+
+def _weights(graph: Graph, root: Path, name: str) -> Path:
+    """The file with the weights of a stage of the run, or of a folder.
+
+    Raises:
+        ConfigError: for a stage that has not been run with these options.
+    """
+    if name not in graph.nodes:
+        return Path(name) / WEIGHTS
+    file = graph.folder(name) / WEIGHTS
+    if not file.exists():
+        raise ConfigError(
+            f"policy={name}: {root} holds none of these options and this code yet (`worldloop stages` says"
+            f" why); first `worldloop stage {name}` with the same options"
+        )
+    return file
 
 
 def _slug(name: str) -> str:

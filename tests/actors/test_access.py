@@ -61,6 +61,7 @@ def test_a_token_is_asked_of_every_write(server: Running, monkeypatch: pytest.Mo
         ignorant.ask("/init", {})
 
 
+@pytest.mark.long
 def test_bound_sessions_end_with_their_connection_and_others_do_not(server: Running) -> None:
     bound, free = Stranger(server.url, bound=True), Stranger(server.url)
     time.sleep(3.0)

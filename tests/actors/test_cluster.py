@@ -86,7 +86,7 @@ def test_a_lost_node_costs_no_job(recipe: Recipe, monkeypatch: pytest.MonkeyPatc
     [
         pytest.param("starting", signal.SIGKILL, -9, marks=pytest.mark.long),
         pytest.param("starting", signal.SIGTERM, 143, marks=pytest.mark.long),
-        ("up", signal.SIGTERM, 143),
+        pytest.param("up", signal.SIGTERM, 143, marks=pytest.mark.long),
     ],
 )
 def test_an_ended_driver_leaves_no_ray_and_the_status_that_shells_expect(

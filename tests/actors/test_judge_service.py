@@ -107,6 +107,7 @@ def test_spent_budget_abstains(cfg: dict[str, Any], weights: str) -> None:
     assert server.counts["judged"] == 20 and server.counts["refused"] == 4
 
 
+@pytest.mark.long
 def test_restarted_service_is_found_again_and_a_lost_one_is_an_error(service: Any) -> None:
     client = JudgeClient("judge-test", replace(OPTIONS, deadline=60.0, retries=6, pause=1.0))
     ray.kill(service, no_restart=False)

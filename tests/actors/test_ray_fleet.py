@@ -25,6 +25,7 @@ from envs.targets import ConfigError, options
 from learners.rl.algorithm import RLConfig
 from learners.rl.loop import train_rl
 from learners.rl.starts import Starts
+from tests.sampling import those
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +75,7 @@ def equal(one: TensorDict, other: TensorDict) -> bool:
     ) == set(other.keys(True, True))
 
 
-@pytest.mark.parametrize("actors", [pytest.param(1, marks=pytest.mark.long), 3])
+@pytest.mark.parametrize("actors", those([2], [1, 2, 3]))
 def test_rollouts_and_learned_weights_are_the_same_bits_for_any_number_of_actors(
     cluster: None, recipe: Recipe, tmp_path: Path, actors: int
 ) -> None:
@@ -141,6 +142,7 @@ def test_hosts_come_and_go_while_running(cluster: None, recipe: Recipe, tmp_path
         fleet.close()
 
 
+@pytest.mark.long
 def test_async_keeps_lag_bounded_and_books_balanced(cluster: None, recipe: Recipe, tmp_path: Path) -> None:
     fleet = RayFleet(recipe, 2)
     try:
@@ -153,6 +155,7 @@ def test_async_keeps_lag_bounded_and_books_balanced(cluster: None, recipe: Recip
     assert stats["last"]["policy_lag_max"] <= 1
 
 
+@pytest.mark.long
 def test_a_job_that_raises_is_given_up_and_counted(cluster: None, recipe: Recipe, tmp_path: Path) -> None:
     fleet = RayFleet(recipe, 1, patience=patience(recipe, retries=0))
     try:

@@ -47,6 +47,7 @@ def test_the_bundles_pose_maps_are_the_golden_ones(shared: Path) -> None:
     assert names["head_joint2"] == pytest.approx(0.4363, abs=1e-3)
 
 
+@pytest.mark.long
 def test_a_bundle_comes_back_as_it_was(shared: Path, tmp_path: Path) -> None:
     """Head and waist joints too: the released closed loop feeds them to kinematics."""
     size = (384, 512)

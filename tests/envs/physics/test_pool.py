@@ -136,6 +136,7 @@ def test_only_the_slot_in_which_physics_keeps_crashing_is_lost() -> None:
     env.close()
 
 
+@pytest.mark.long
 def test_evaluations_do_not_count_where_physics_crashes() -> None:
     pool = TaskPool({**COUNTING, "fault": "exit"}, "count", 2, 4, 2)
     spec = WorldSpec(build_suite({**COUNTING}).embodiment, (4, 4), 2)
@@ -169,6 +170,7 @@ def test_an_error_of_the_suite_counts_like_a_crash_and_is_told(
     pool.close()
 
 
+@pytest.mark.long
 def test_a_worker_that_hangs_counts_like_one_that_died(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -195,6 +197,7 @@ def test_a_worker_that_is_slow_does_not_hang(
     pool.close()
 
 
+@pytest.mark.long
 def test_what_others_said_when_one_failed_is_no_answer_to_the_next_request() -> None:
     pool, still, odd = pool_of(4, 2, fault="raise"), np.zeros((2, 1)), np.full((2, 1), 2.0)
     pool.reset({slot: 10 * slot for slot in range(4)}, False)

@@ -244,6 +244,7 @@ def test_with_frozen_perception_no_picture_is_carried_or_encoded_again(name: str
     assert changed and not any(key.startswith("module.0.") for key in changed)
 
 
+@pytest.mark.long
 def test_looking_at_a_policy_changes_nothing_that_it_learns(tmp_path: Path) -> None:
     looked: list[int] = []
 
@@ -338,7 +339,7 @@ class Stop(Exception):
 
 @pytest.mark.parametrize(
     ("name", "policy_name"),
-    [*((name, "chunk_gaussian") for name in offered("algorithm")), ("ppo", "chunk_tokens")],
+    every(4, [("ppo", "chunk_tokens"), *((name, "chunk_gaussian") for name in offered("algorithm"))]),
 )
 def test_killed_and_resumed_rl_equals_the_uninterrupted(
     name: str, policy_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

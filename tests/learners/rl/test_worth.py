@@ -37,6 +37,7 @@ def test_what_moments_say_of_themselves_is_worth_nothing(moment: float) -> None:
     assert float(errors.mean()) == pytest.approx(float(values.std()), rel=0.4)
 
 
+@pytest.mark.long
 def test_what_actions_do_is_worth_what_is_true_of_it() -> None:
     for true in (0.3, 0.8):
         found = [correlation(returns(true, 0.0, seed)) for seed in range(20)]

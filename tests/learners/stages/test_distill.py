@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ from learners.training.optimisers import optimiser_state
 from tests.embodiments import ARM_DELTAS, BIMANUAL_POSES, world_spec
 from tests.learners.models import section_of, simulator_of, stepwise_engines, stepwise_pair
 from tests.moving_square import SIZE
+from tests.sampling import every
 from tests.sections import section
 
 Stores = Callable[[Embodiment], ClipStore]
@@ -88,8 +90,7 @@ def learned(student: Bell, options: FitConfig) -> Tensor:
     return torch.cat([chunk.latents for chunk in made])
 
 
-@pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize(("count", "name"), every(3, product((1, 2), METHODS)))
 def test_a_student_makes_what_the_teacher_makes(
     count: int, name: str, tiny_store: Stores, tmp_path: Path
 ) -> None:

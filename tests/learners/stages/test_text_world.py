@@ -28,6 +28,7 @@ from tests.moving_square import moving_square as square_episode
 Stores = Callable[[Embodiment], ClipStore]
 
 
+@pytest.mark.long
 def test_it_learns_from_successes_and_then_goes_where_they_go(tiny_store: Stores, tmp_path: Path) -> None:
     store, model = tiny_store(ARM_DELTAS), world(window=6, ending={"max_frames": 3})
     every = torch.arange(len(store))

@@ -118,6 +118,7 @@ def test_an_interrupted_fit_goes_on_to_the_same_metrics_weights_and_result(
     assert rows == whole[0] and torch.equal(weight, whole[1]) and loss == whole[2]
 
 
+@pytest.mark.long
 def test_a_command_ends_soon_and_leaves_a_checkpoint(tmp_path: Path) -> None:  # Ctrl-C: test_signals.py
     words = ["stage", "imitation", "experiment=soak", f"runs={tmp_path}", "track=disabled"]
     words += ["imitation.perception.steps=5000"]

@@ -8,6 +8,7 @@ from pipeline.benches.compiled import compiled
 from pipeline.config import load_config
 
 
+@pytest.mark.long
 def test_it_compares_training_and_sampling_three_ways(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["experiment=smoke", "task.size=[32,32]", "task.suite.cameras=[head]", "launch.device=cpu"]
     found = compiled(load_config([*words, "simulator_fit.first.fit.batch=2"]))

@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from pipeline.benches.learning import learn
 
 
+@pytest.mark.long
 def test_a_few_iterations_on_the_toy_task(tmp_path: Path) -> None:
     _, iterations, rate = learn(0, 3, tmp_path, envs=64)
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]

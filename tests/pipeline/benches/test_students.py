@@ -16,6 +16,7 @@ from pipeline.benches.distil import STUDENT, TEACHER, distil, reached
 from pipeline.benches.strides import strides
 from pipeline.config import load_config
 from tests.learners.models import stepwise_engines
+from tests.sampling import every
 
 TINY = (
     *("experiment=soak", "task.horizon=8", "policy.width=64", "track=disabled", "threads=1"),
@@ -57,7 +58,7 @@ def test_students_and_teacher_stand_in_one_table(
     assert distil(cfg) == found and "is finished, reused" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("engine", stepwise_engines())
+@pytest.mark.parametrize("engine", every(3, stepwise_engines()))
 def test_every_row_can_be_built_of_every_engine_before_any_work(engine: str, tmp_path: Path) -> None:
     words = [f"simulator={engine}", "task.chunk=5", "task.horizon=20", "task.suite.cameras=[head,hand_left]"]
     graph, rows, left = students.build_table(config_of("distil", words), tmp_path)
@@ -76,6 +77,7 @@ def test_every_row_can_be_built_of_every_engine_before_any_work(engine: str, tmp
 
 
 @pytest.mark.parametrize("bench", ["distil", "strides"])
+@pytest.mark.long
 def test_what_a_bench_says_of_its_own_task_is_not_said_of_another(bench: str) -> None:
     assert config_of(bench, [])["task"]["suite"]["cameras"] == ["head"]
     for words in (["task=lerobot", "task.data=[somewhere]"], ["task=metaworld"]):

@@ -49,6 +49,7 @@ def at_every_write(
 
 
 @pytest.mark.parametrize("kind", ["stop", pytest.param("full", marks=pytest.mark.long)])
+@pytest.mark.long
 def test_any_prefix_of_a_data_sets_writes_resumes_to_the_same_set(
     kind: Literal["stop", "full"], tmp_path: Path
 ) -> None:
@@ -135,7 +136,7 @@ def test_a_disk_that_is_really_full_is_told_and_work_goes_on_when_there_is_room(
     if not shutil.which("unshare") or subprocess.run([*own, "true"], capture_output=True).returncode:
         pytest.skip("no small disk can be mounted here (unshare --map-root-user --mount)")
     done = subprocess.run(
-        [*own, sys.executable, "-m", "tests.full_disk", str(tmp_path)],
+        [*own, sys.executable, "-m", "tests.pipeline.chaos.full_disk", str(tmp_path)],
         capture_output=True,
         text=True,
         cwd=Path(__file__).resolve().parents[3],

@@ -19,6 +19,7 @@ SMALL = ["experiment=smoke", "task=tabletop", "task.suite.cameras=[head]", "task
 FEW = ["evaluate.episodes=4", "evaluate.envs=4", "launch.workers=1", "task.horizon=4"]
 
 
+@pytest.mark.long
 def test_a_variant_is_tried_task_by_task(tmp_path: Path) -> None:
     cfg = load_config([*SMALL, *FEW, "task.name=[push,pull]"])
     plain, unseen = (evaluate_policy(cfg, tmp_path, variant=name) for name in ("", "out_of_domain"))
@@ -55,3 +56,8 @@ def test_a_variant_that_does_not_exist_is_told_before_anything_starts(tmp_path: 
         evaluate_policy(cfg, tmp_path, variant="out_of_domian")
     with pytest.raises(ConfigError, match=r"variant=swapped is known in physics alone"):
         evaluate_policy(cfg, tmp_path, world="imagined", variant="swapped")
+
+
+def test_a_policy_that_was_not_learned_yet_is_told_with_the_command_that_learns_it(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"policy=rl-1: .* holds none .*first `worldloop stage rl-1` with"):
+        evaluate_policy(load_config([*SMALL, *FEW]), tmp_path, "rl-1")

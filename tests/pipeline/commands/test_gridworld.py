@@ -70,6 +70,7 @@ def test_squares_move_by_the_action_and_stay_in_the_picture() -> None:
         suite(4)
 
 
+@pytest.mark.long
 def test_the_study_runs_and_goes_on_where_it_was(tmp_path: Path) -> None:
     cfg = load_config(TINY)
     told = variant(cfg, 3, "digits")

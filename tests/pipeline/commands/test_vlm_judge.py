@@ -138,6 +138,7 @@ def test_the_study_says_what_is_missing(words: list[str], tmp_path: Path) -> Non
         judge_study(load_config([f"runs={tmp_path}"]), tmp_path / "run", Selection.of({}))
 
 
+@pytest.mark.long
 def test_values_that_were_judged_stay_when_the_budget_or_patience_changes(
     words: list[str], server: ChatServer, tmp_path: Path
 ) -> None:

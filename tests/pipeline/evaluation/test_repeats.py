@@ -28,6 +28,7 @@ def without(folder: Path, column: str) -> None:
 
 
 @pytest.mark.parametrize("choice", [pytest.param("metaworld", marks=pytest.mark.long), "aloha"])
+@pytest.mark.long
 def test_masks_are_those_of_the_same_episode(choice: str, tmp_path: Path) -> None:
     cfg = load_config([*SMOKE, f"task={choice}", "task.horizon=8"])
     try:
@@ -62,6 +63,7 @@ def test_long_rollouts_go_on_after_success(tmp_path: Path) -> None:
     assert store.arrays["success"][rows].all()
 
 
+@pytest.mark.long
 def test_long_rollouts_that_are_recorded_stay_when_recording_is_interrupted(tmp_path: Path) -> None:
     laid_out, stop = tmp_path / "laid_out", tmp_path / "stop"
     laid_out.touch()

@@ -148,6 +148,7 @@ def test_the_command_compares_judges_on_recordings(tmp_path: Path) -> None:
         compare_rewards(cfg, tmp_path / "smoke", Plan({"rule": cfg}, 4, ("moon",)))
 
 
+@pytest.mark.long
 def test_a_row_is_measured_by_the_judge_that_it_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -185,6 +186,7 @@ def test_a_judge_that_cannot_be_asked_is_told_before_anything_runs(tmp_path: Pat
     assert not (tmp_path / "smoke/stages").exists()
 
 
+@pytest.mark.long
 def test_episodes_of_unseen_scenes(tmp_path: Path) -> None:
     cfg = load_config(["experiment=smoke", "task=tabletop", "task.name=push", "task.size=[32,32]"])
     graph = Graph(cfg, tmp_path)

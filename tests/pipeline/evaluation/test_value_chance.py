@@ -57,6 +57,7 @@ def test_repeats_that_are_alike_make_nobody_surer() -> None:
     assert by_chance([[one]]) == by_chance([[other]])
 
 
+@pytest.mark.long
 def test_intervals_hold_what_is_true_of_all_starts_far_more_often_than_not() -> None:
     true = [0.2, 0.3, 0.4, 0.5, 0.6, 0.7]
     held: dict[str, int] = {"bias_in": 0, "difference": 0, "pearson": 0}

@@ -169,6 +169,7 @@ def test_a_description_beside_the_code_is_part_of_the_key(tmp_path: Path, packag
     assert "envs/physics/tabletop/robot.xml" in code_of("envs.physics.tabletop.scene", {})
 
 
+@pytest.mark.long
 def test_modules_that_lie_beside_somebodys_own_are_part_of_the_key(tmp_path: Path, package: Path) -> None:
     folder = package.parent
     (folder / "theirs_alone.py").write_text(

@@ -89,6 +89,7 @@ def test_a_shard_that_is_spoiled_before_the_stage_ends_is_found(tmp_path: Path) 
     assert video.relative_to(tmp_path).as_posix() in sealed
 
 
+@pytest.mark.long
 def test_an_episode_that_crashes_physics_is_left_out_of_its_split(tmp_path: Path) -> None:
     cfg = load_config(["experiment=soak", "launch.workers=2"])
     cfg["task"] |= {"suite": {"_target_": "tests.suites.counting.Counting", "fault": "exit"}}
@@ -259,6 +260,7 @@ def test_tasks_are_those_that_physics_says_the_recorded_words_of() -> None:
     assert tasks_told(suite, ["recount"], told[:3]) == ["uncount", "count", "recount"]
 
 
+@pytest.mark.long
 def test_first_frames_have_the_task_whose_turn_it_was(tmp_path: Path) -> None:
     """A variant with other scenes says other words at a seed than the task does."""
     cfg = load_config(["experiment=soak", "launch.workers=1", "extra_starts.episodes=6"])

@@ -37,6 +37,7 @@ def test_a_judge_that_is_blind_to_several_instructions_is_an_alarm(
 
 
 @pytest.mark.parametrize("told", [True, pytest.param(False, marks=pytest.mark.long)])
+@pytest.mark.long
 def test_a_judge_that_cannot_tell_success_on_recorded_video_is_an_alarm(told: bool, tmp_path: Path) -> None:
     """Once success is what its pictures show, and once it is what a coin says."""
     data, settings = tmp_path / "data", {"phase": "first"}

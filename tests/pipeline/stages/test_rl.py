@@ -89,6 +89,7 @@ def test_what_weighs_nothing_is_not_imagined(tmp_path: Path, monkeypatch: pytest
     assert made["last_transitions"] == cfg["rl"]["envs"] * imagined_chunks(cfg)
 
 
+@pytest.mark.long
 def test_goals_that_hosts_imagine_are_counted(
     tiny_data: Callable[[Embodiment], Path], tmp_path: Path
 ) -> None:
@@ -108,6 +109,7 @@ def test_goals_that_hosts_imagine_are_counted(
     assert judged["goals_unfinished"] == judged["goals"] > 0
 
 
+@pytest.mark.long
 def test_in_physics_it_plays_as_many_episodes_as_are_deployed_and_not_whole_iterations(
     tmp_path: Path,
 ) -> None:

@@ -42,6 +42,7 @@ def recorded(folder: Path, short: set[int], *words: str) -> Any:
 
 
 @pytest.mark.parametrize("short", [{4, 6}, {4, 5, 6, 7}], ids=["all of a source", "all that are held out"])
+@pytest.mark.long
 def test_held_out_ones_are_not_replayed(
     short: set[int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

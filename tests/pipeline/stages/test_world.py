@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
 from safetensors.torch import load_file
 from torch import Tensor
@@ -47,6 +48,7 @@ def turned(episodes: Sequence[Episode], which: range) -> list[Episode]:
     ]
 
 
+@pytest.mark.long
 def test_worlds_that_say_done_learn_from_calibration_but_not_when_its_tasks_are_done(tmp_path: Path) -> None:
     some = [moving_square(ARM_DELTAS, seed, "expert" if seed % 2 else "random") for seed in range(9)]
     others = [moving_square(ARM_DELTAS, 50 + n) if n in CALIBRATION else one for n, one in enumerate(some)]

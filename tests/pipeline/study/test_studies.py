@@ -214,6 +214,7 @@ JUDGES = (
 )
 
 
+@pytest.mark.long
 def test_judges_are_shown_more_and_fewer_frames(root: Path) -> None:
     text = run_study(planned(root, JUDGES))
     assert "not run" not in text and "first and last" in text and "(2 frames)" in text

@@ -37,6 +37,7 @@ def told(asked: Asked) -> str:
     return "Something is gone.\nErrors: vanishing object" if "Errors:" in asked.text else "push the block"
 
 
+@pytest.mark.long
 def test_two_arms_in_physics_with_a_model_that_reads(tmp_path: Path) -> None:
     cfg = load_config([*SMOKE, *FORCING])
     data = scripted_set(cfg, tmp_path / "set", 4)

@@ -138,6 +138,7 @@ def test_a_judge_that_learns_nothing_is_asked_and_one_that_has_not_learned_is_no
     assert all(row["verdicts"]["generated"] for row in rows)
 
 
+@pytest.mark.long
 def test_why_there_is_no_distance_between_clips(
     tmp_path: Path, tiny_data: Callable[[Embodiment], Path]
 ) -> None:
@@ -165,6 +166,7 @@ class Own(Extractor):
 """
 
 
+@pytest.mark.long
 def test_extractors_of_one_name_and_different_code_are_told_apart(
     tmp_path: Path, tiny_data: Callable[[Embodiment], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -201,6 +203,7 @@ def test_a_contact_sheet_for_each_number_of_any_robot(
         sweep(load_config([*words, "sweep.episode=99"]), tmp_path / "run")
 
 
+@pytest.mark.long
 def test_contact_sheets_ask_no_judge(tmp_path: Path, tiny_data: Callable[[Embodiment], Path]) -> None:
     words = ["experiment=smoke", "track=disabled", "task=lerobot", f"task.data=[{tiny_data(ARM_DELTAS)}]"]
     words += ["task.size=[32,32]", "task.chunk=4", "task.horizon=8", "sweep.chunks=1", "sweep.levels=[1.0]"]

@@ -54,6 +54,7 @@ def test_imagined_and_recorded_decisions_by_lambda_and_task(tmp_path: Path) -> N
     assert text.count("(in use)") == 1 and "half signal" in text and text.count("| move the square") == 2
 
 
+@pytest.mark.long
 def test_what_is_kept_is_not_taken_again_and_is_the_same_if_it_is(tmp_path: Path) -> None:
     cfg, ready = begun(tmp_path)
     kept: dict[str, Tensors] = {}
@@ -88,6 +89,7 @@ class Own:
         return getattr(self.inner, name)
 
 
+@pytest.mark.long
 def test_somebody_elses_algorithm_keeps_the_advantages_that_it_gave(tmp_path: Path) -> None:
     cfg, ready = begun(tmp_path)
     found = measured(cfg, replace(ready, algorithm=Own(ready.algorithm)), 3, anew)

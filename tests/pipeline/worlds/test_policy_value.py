@@ -117,6 +117,7 @@ def test_without_physics_values_are_estimated_alone(
         policy_value(load_config([*words, "policy_value.noise=[]"]), tmp_path / "run")
 
 
+@pytest.mark.long
 def test_verdicts_of_another_goal_are_not_taken_for_this_one(
     tmp_path: Path, tiny_data: Callable[[Embodiment], Path]
 ) -> None:
@@ -153,6 +154,7 @@ def test_instructions_share_the_starts_and_many_are_one_group(
     assert {name: len(episodes) for name, episodes in found.items()} == groups
 
 
+@pytest.mark.long
 def test_goals_are_counted_though_nothing_is_imagined_again(
     tmp_path: Path, tiny_data: Callable[[Embodiment], Path]
 ) -> None:

@@ -80,6 +80,7 @@ def test_a_released_world_is_measured_and_known_by_its_files(
     assert first["overall"]["psnr"] != second["overall"]["psnr"]
 
 
+@pytest.mark.long
 def test_weights_of_ones_own_come_before_released_ones(tmp_path: Path, words: list[str]) -> None:
     root = tmp_path / "runs/smoke"
     bare = Subject.of(load_config([*words, "simulator.state_expert.checkpoint=null"]), root)

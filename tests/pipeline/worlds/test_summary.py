@@ -80,6 +80,7 @@ def test_what_was_measured_stands_on_one_page(
     assert "fidelity.json says is of other weights" in written(root, "summary.html").read_text()
 
 
+@pytest.mark.long
 def test_a_teacher_and_its_student_are_each_sampled_as_they_were_made(tmp_path: Path) -> None:
     root, few = tmp_path / "run", ["simulator=dit_small", "simulator.denoising.steps=4", "distill.steps=2"]
     words = ["experiment=soak", "track=disabled", "launch.workers=1", *few]

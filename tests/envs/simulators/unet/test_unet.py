@@ -22,6 +22,7 @@ def unet(size: tuple[int, int], **options: Any) -> Simulator:
     return made
 
 
+@pytest.mark.long
 def test_a_picture_twice_as_large_folded_twice_as_far_meets_the_same_blocks() -> None:
     """All views learn, to the last weight, and what lies between embedding and heads has the same places."""
     plain, fine = unet((32, 32)), unet((64, 64), fold=4)

@@ -78,6 +78,7 @@ def test_true_frames_are_judged_by_the_rule_of_imagined_ones(
         assert (1.0 if won else float(after[PROGRESS])) == pytest.approx(value)
 
 
+@pytest.mark.long
 def test_what_was_recorded_is_carried_out_again(tmp_path: Path) -> None:
     cfg = load_config(["experiment=smoke", "task.size=[32,32]"])
     spec = world_spec(cfg)

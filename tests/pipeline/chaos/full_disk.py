@@ -1,9 +1,9 @@
 """What writes data, caches, checkpoints and weights, on a small disk that is really full.
 
-`unshare -rm python -m tests.full_disk FOLDER` mounts a tmpfs of many sizes there, one after the other. At
-each, the work must end with the system's own error, and after room has been made the same work must go on to
-the end: nothing half-written stands in its way. Python's audit hooks (chaos/faults.py) do not see what
-libraries write by themselves, nor pages of a memory map; a real disk does.
+`unshare -rm python -m tests.pipeline.chaos.full_disk FOLDER` mounts a tmpfs of many sizes there, one after
+the other. At each, the work must end with the system's own error, and after room has been made the same work
+must go on to the end: nothing half-written stands in its way. Python's audit hooks (pipeline/chaos/faults.py)
+do not see what libraries write by themselves, nor pages of a memory map; a real disk does.
 """
 
 from __future__ import annotations
