@@ -106,9 +106,10 @@ def test_hosts_get_a_core_as_soon_as_the_learner_does(cluster: None) -> None:
 
 
 def test_a_killed_host_is_replaced_and_its_job_run_again(cluster: None, recipe: Recipe) -> None:
+    wanted = rollout(LocalFleet(build_host(recipe)), recipe)
     fleet = RayFleet(recipe, 2)
     try:
-        wanted = rollout(fleet, recipe)  # both are built now, or soon
+        rollout(fleet, recipe)  # both are built now, or soon
         deadline = time.monotonic() + 60
         while len(fleet.processes) < 2 and time.monotonic() < deadline:
             time.sleep(0.1)
