@@ -71,15 +71,12 @@ def test_a_student_of_few_steps(
     "choices",
     [
         (),
-        pytest.param(
-            (
-                "policy=chunk_tokens",
-                "algorithm=grpo",
-                "algorithm.group=2",
-                "simulator=dit_small",
-                "judge=embedding",
-            ),
-            marks=pytest.mark.long,
+        (
+            "policy=chunk_tokens",
+            "algorithm=grpo",
+            "algorithm.group=2",
+            "simulator=dit_small",
+            "judge=embedding",
         ),
     ],
 )

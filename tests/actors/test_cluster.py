@@ -84,11 +84,12 @@ def test_a_lost_node_costs_no_job(recipe: Recipe, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(
     ("when", "number", "status"),
     [
-        pytest.param("starting", signal.SIGKILL, -9, marks=pytest.mark.long),
-        pytest.param("starting", signal.SIGTERM, 143, marks=pytest.mark.long),
-        pytest.param("up", signal.SIGTERM, 143, marks=pytest.mark.long),
+        ("starting", signal.SIGKILL, -9),
+        ("starting", signal.SIGTERM, 143),
+        ("up", signal.SIGTERM, 143),
     ],
 )
+@pytest.mark.long
 def test_an_ended_driver_leaves_no_ray_and_the_status_that_shells_expect(
     when: str, number: int, status: int
 ) -> None:

@@ -48,7 +48,7 @@ def at_every_write(
     raise AssertionError
 
 
-@pytest.mark.parametrize("kind", ["stop", pytest.param("full", marks=pytest.mark.long)])
+@pytest.mark.parametrize("kind", ["stop", "full"])
 @pytest.mark.long
 def test_any_prefix_of_a_data_sets_writes_resumes_to_the_same_set(
     kind: Literal["stop", "full"], tmp_path: Path

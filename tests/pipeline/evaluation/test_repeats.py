@@ -27,7 +27,7 @@ def without(folder: Path, column: str) -> None:
     path.write_text(json.dumps(info))
 
 
-@pytest.mark.parametrize("choice", [pytest.param("metaworld", marks=pytest.mark.long), "aloha"])
+@pytest.mark.parametrize("choice", ["metaworld", "aloha"])
 @pytest.mark.long
 def test_masks_are_those_of_the_same_episode(choice: str, tmp_path: Path) -> None:
     cfg = load_config([*SMOKE, f"task={choice}", "task.horizon=8"])

@@ -36,7 +36,7 @@ def test_a_judge_that_is_blind_to_several_instructions_is_an_alarm(
     assert (said in made.get("alarm", "")) == blind
 
 
-@pytest.mark.parametrize("told", [True, pytest.param(False, marks=pytest.mark.long)])
+@pytest.mark.parametrize("told", [True, False])
 @pytest.mark.long
 def test_a_judge_that_cannot_tell_success_on_recorded_video_is_an_alarm(told: bool, tmp_path: Path) -> None:
     """Once success is what its pictures show, and once it is what a coin says."""

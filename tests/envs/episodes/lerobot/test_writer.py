@@ -163,7 +163,6 @@ from envs.episodes import LeRobotWriter
 from envs.episodes.formats.lerobot import writer as lerobot_writer
 from tests.embodiments import BIMANUAL_POSES as robot
 from tests.moving_square import SIZE, moving_square
-from tests.sampling import every
 writer = LeRobotWriter(Path({str(root)!r}), robot.at(SIZE))
 if {point!r} != "meta/episodes":
     writer.write([moving_square(robot, seed) for seed in range(2)])
